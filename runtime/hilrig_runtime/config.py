@@ -1,0 +1,237 @@
+"""A lab's configuration: `lab.toml`, validated, every mistake named with its place.
+
+This is the edge where people type, so it is pydantic, and units are those that people use where the name says so
+(`step_ms`, `timeout_ms`); all else is SI. With no file there is one rig with the defaults below.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hilrig_runtime.errors import InputError
+from hilrig_schemas.topics import NAME_PATTERN, RESERVED_RIG_NAMES
+
+Name = Annotated[str, Field(pattern=rf"^{NAME_PATTERN}$")]
+Port = Annotated[int, Field(ge=1, le=65535)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Vector4 = tuple[Number, Number, Number, Number]
+
+
+class Section(BaseModel):
+    """Base of every table of the file: unknown keys are mistakes, values are fixed once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ArmConfig(Section):
+    """The arm's parameters (docs/model.md); defaults are the paper's and the decisions made where it is silent."""
+
+    l1_m: Positive = 0.139
+    """Height of the arm's plane above the base plane, m."""
+    l2_m: Positive = 0.300
+    """Length of link 1, m."""
+    l3_m: Positive = 0.300
+    """Length of link 2, m."""
+    masses_kg: tuple[Positive, Positive, Positive] = (1.0, 1.0, 0.5)
+    """m1, m2 at the distal ends of the links, m3 of the quill, kg."""
+    j4_kgm2: Positive = 0.005
+    """Inertia of joint 4 about its axis, kg·m²."""
+    friction: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (2.0, 2.0, 5.0, 0.05)
+    """Viscous friction b1…b4; N·m·s, N·m·s, N·s/m, N·m·s."""
+    lower_limits: Vector4 = (-133.0, -153.0, 0.0, -360.0)
+    """Lower stops; degrees, degrees, mm, degrees."""
+    upper_limits: Vector4 = (133.0, 153.0, 200.0, 360.0)
+    """Upper stops; degrees, degrees, mm, degrees."""
+    start_position: Vector4 = (0.0, 0.0, 0.0, 0.0)
+    """Where the arm is when the simulation starts or is reset; degrees, degrees, mm, degrees."""
+    external_force_z_n: Number = 0.0
+    """f_z, constant wrench of the environment on the tool, world z up, N."""
+    external_torque_z_nm: Number = 0.0
+    """n_z, the same about world z, N·m."""
+
+
+class SimConfig(Section):
+    """How the plant is stepped."""
+
+    step_ms: Annotated[float, Field(ge=0.5, le=1000)] = 20.0
+    """Length of a step, ms."""
+    substeps: Annotated[int, Field(ge=1, le=100)] = 1
+    """Integration steps in one step of the loop."""
+    integrator: Literal["rkf45", "rk4", "euler"] = "rkf45"
+    command_timeout_ms: NotNegative = 600.0
+    """With no command for so long the effort goes to zero; 0: never."""
+
+    @property
+    def step_ns(self) -> int:
+        """Length of a step, ns."""
+        return round(self.step_ms * 1e6)
+
+    @property
+    def command_timeout_ns(self) -> int:
+        """See `command_timeout_ms`, ns."""
+        return round(self.command_timeout_ms * 1e6)
+
+
+class EdgeConfig(Section):
+    """The Modbus side."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 opens the rigs to the network."""
+    first_port: Port = 5020
+    """Port of the first rig; the others follow, unless a rig names its own."""
+    watchdog_ms: NotNegative = 1000.0
+    """With the controller silent for so long the torque goes to zero; 0: never."""
+    lease_timeout_ms: Positive = 5000.0
+    """A controller silent for so long loses the rig to whoever writes next."""
+    session_grace_ms: NotNegative = 5000.0
+    """A session goes on when its controller is back within so long."""
+    repeat_ms: Positive = 200.0
+    """How often the standing command is repeated to the simulation."""
+
+
+class RecorderConfig(Section):
+    """Where recordings go."""
+
+    folder: Path = Path("recordings")
+    """Recordings are `<folder>/<lab>/<rig>/<session>.mcap`."""
+    preroll_s: NotNegative = 2.0
+    """What a recording holds from before its session's start, s."""
+    queue_entries: Annotated[int, Field(ge=1)] = 200_000
+    """Messages that may wait for the disk; more are dropped and counted."""
+
+
+class BusConfig(Section):
+    """How the services find each other."""
+
+    topology: Literal["mesh", "router"] = "mesh"
+    """mesh: services on one host, linked directly; router: everyone is a client of `router`."""
+    host: str = "127.0.0.1"
+    """mesh: address on which the services listen for each other."""
+    first_port: Port = 7447
+    """mesh: port of the simulation; the edge and the recorder take the next two."""
+    router: str = "tcp/127.0.0.1:7447"
+    """router: endpoint of the zenoh router."""
+    express: bool | None = None
+    """Send each control message at once instead of batching; default: when there are at most 16 rigs."""
+
+
+class RigSettings(Section):
+    """One rig: what differs from the lab's defaults."""
+
+    name: Name = "rig1"
+    port: Port | None = None
+    """Modbus TCP port; default: the next free one from `edge.first_port`."""
+    arm: ArmConfig = ArmConfig()
+
+    @model_validator(mode="after")
+    def _no_reserved_name(self) -> "RigSettings":
+        if self.name in RESERVED_RIG_NAMES:
+            raise ValueError(f"{self.name!r} is a reserved name: call the rig otherwise")
+        return self
+
+
+class LabConfig(Section):
+    """A whole lab, as `lab.toml` describes it."""
+
+    name: Name = "lab"
+    sim: SimConfig = SimConfig()
+    edge: EdgeConfig = EdgeConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    bus: BusConfig = BusConfig()
+    rigs: Annotated[tuple[RigSettings, ...], Field(min_length=1)] = (RigSettings(),)
+
+    @model_validator(mode="after")
+    def _rigs_are_distinct(self) -> "LabConfig":
+        names = [rig.name for rig in self.rigs]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two rigs are called {name!r}: names must be distinct")
+        ports = list(self.ports.values())
+        for rig, port in self.ports.items():
+            if ports.count(port) > 1:
+                raise ValueError(f"rig {rig!r}: port {port} is taken by another rig: ports must be distinct")
+            if port > 65535:
+                raise ValueError(f"rig {rig!r}: no port is left for it above {self.edge.first_port}")
+        return self
+
+    @property
+    def ports(self) -> dict[str, int]:
+        """Modbus port of each rig: its own, or the next that nobody names from `edge.first_port` on."""
+        named = {rig.port for rig in self.rigs if rig.port is not None}
+        ports: dict[str, int] = {}
+        candidate = self.edge.first_port
+        for rig in self.rigs:
+            if rig.port is not None:
+                ports[rig.name] = rig.port
+                continue
+            while candidate in named:
+                candidate += 1
+            ports[rig.name] = candidate
+            candidate += 1
+        return ports
+
+    @property
+    def express(self) -> bool:
+        """Whether control messages are sent one by one."""
+        return len(self.rigs) <= 16 if self.bus.express is None else self.bus.express
+
+    def rig(self, name: str) -> RigSettings:
+        """The rig of that name.
+
+        Raises:
+            InputError: there is none.
+        """
+        for rig in self.rigs:
+            if rig.name == name:
+                return rig
+        raise InputError(f"no rig is called {name!r}; this lab has {', '.join(r.name for r in self.rigs)}")
+
+
+def load_lab(path: Path | None) -> LabConfig:
+    """Read a lab's file, or give the defaults where there is none.
+
+    Raises:
+        InputError: the file can't be read, is no TOML, or says something that is no lab; every mistake is named.
+    """
+    return LabConfig() if path is None else parse_lab(read_lab_text(path), str(path))
+
+
+def read_lab_text(path: Path) -> str:
+    """The text of a lab's file.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise InputError(f"{path}: can't be read: {reason}") from error
+
+
+def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
+    """Understand the text of a lab's file; `where` names it in messages.
+
+    Raises:
+        InputError: as `load_lab`.
+    """
+    try:
+        return LabConfig.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where}: no valid TOML: {error}") from error
+    except ValidationError as error:
+        raise InputError("\n".join(f"{where}: {_sentence(mistake)}" for mistake in error.errors())) from error
+
+
+def _sentence(mistake: Any) -> str:
+    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"]).lstrip(".")
+    if mistake["type"] == "extra_forbidden":
+        return f"{place}: unknown key"
+    if mistake["type"] == "value_error":
+        return f"{place}: {mistake['ctx']['error']}" if place else str(mistake["ctx"]["error"])
+    expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return f"{place}: expected {expected}, found {mistake['input']!r}"

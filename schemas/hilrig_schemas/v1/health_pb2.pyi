@@ -1,0 +1,63 @@
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from typing import ClassVar as _ClassVar, Optional as _Optional
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Health(_message.Message):
+    __slots__ = ("service", "instance", "incarnation", "wall_ns", "uptime_ns", "cpu_ns", "resident_bytes", "rigs", "ticks", "overruns", "missed_steps", "lateness_p50_ns", "lateness_p99_ns", "lateness_max_ns", "received_hz", "published_hz", "lost_transport", "lost_recorder", "queue_depth", "queue_capacity", "connections", "requests", "malformed", "refused", "recordings", "bytes_written", "trouble")
+    SERVICE_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    INCARNATION_FIELD_NUMBER: _ClassVar[int]
+    WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_NS_FIELD_NUMBER: _ClassVar[int]
+    CPU_NS_FIELD_NUMBER: _ClassVar[int]
+    RESIDENT_BYTES_FIELD_NUMBER: _ClassVar[int]
+    RIGS_FIELD_NUMBER: _ClassVar[int]
+    TICKS_FIELD_NUMBER: _ClassVar[int]
+    OVERRUNS_FIELD_NUMBER: _ClassVar[int]
+    MISSED_STEPS_FIELD_NUMBER: _ClassVar[int]
+    LATENESS_P50_NS_FIELD_NUMBER: _ClassVar[int]
+    LATENESS_P99_NS_FIELD_NUMBER: _ClassVar[int]
+    LATENESS_MAX_NS_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_HZ_FIELD_NUMBER: _ClassVar[int]
+    PUBLISHED_HZ_FIELD_NUMBER: _ClassVar[int]
+    LOST_TRANSPORT_FIELD_NUMBER: _ClassVar[int]
+    LOST_RECORDER_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_CAPACITY_FIELD_NUMBER: _ClassVar[int]
+    CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
+    REQUESTS_FIELD_NUMBER: _ClassVar[int]
+    MALFORMED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    RECORDINGS_FIELD_NUMBER: _ClassVar[int]
+    BYTES_WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    TROUBLE_FIELD_NUMBER: _ClassVar[int]
+    service: str
+    instance: str
+    incarnation: int
+    wall_ns: int
+    uptime_ns: int
+    cpu_ns: int
+    resident_bytes: int
+    rigs: int
+    ticks: int
+    overruns: int
+    missed_steps: int
+    lateness_p50_ns: int
+    lateness_p99_ns: int
+    lateness_max_ns: int
+    received_hz: float
+    published_hz: float
+    lost_transport: int
+    lost_recorder: int
+    queue_depth: int
+    queue_capacity: int
+    connections: int
+    requests: int
+    malformed: int
+    refused: int
+    recordings: int
+    bytes_written: int
+    trouble: str
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., cpu_ns: _Optional[int] = ..., resident_bytes: _Optional[int] = ..., rigs: _Optional[int] = ..., ticks: _Optional[int] = ..., overruns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., lateness_p50_ns: _Optional[int] = ..., lateness_p99_ns: _Optional[int] = ..., lateness_max_ns: _Optional[int] = ..., received_hz: _Optional[float] = ..., published_hz: _Optional[float] = ..., lost_transport: _Optional[int] = ..., lost_recorder: _Optional[int] = ..., queue_depth: _Optional[int] = ..., queue_capacity: _Optional[int] = ..., connections: _Optional[int] = ..., requests: _Optional[int] = ..., malformed: _Optional[int] = ..., refused: _Optional[int] = ..., recordings: _Optional[int] = ..., bytes_written: _Optional[int] = ..., trouble: _Optional[str] = ...) -> None: ...
