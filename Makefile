@@ -1,0 +1,38 @@
+# Every target makes the .venv that it needs; system parts come by apt where that is possible (root on Debian).
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: help demo test check gen bench system clean
+.DEFAULT_GOAL := help
+
+help: ## what there is
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1|/' | awk -F'|' '{printf "  make %-8s %s\n", $$1, $$2}'
+
+.venv/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+system: ## the system parts that tests and benchmarks use (apt, as root)
+	@sh tests/system-packages.sh
+
+demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
+	$(BIN)/hilrig demo
+
+test: .venv/ready system check ## everything that CI runs
+	$(BIN)/pytest
+
+check: .venv/ready ## format, lint, types, floors
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/mypy
+
+gen: .venv/ready ## generated code and tables, from their sources
+	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
+
+bench: .venv/ready system ## every benchmark; writes the tables of docs/performance.md
+	$(BIN)/python bench/run_all.py
+
+clean: ## everything that was built or installed here
+	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis dist

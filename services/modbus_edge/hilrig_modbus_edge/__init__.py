@@ -1,0 +1,1 @@
+"""The Modbus edge: controllers on one side, the bus on the other."""

@@ -1,0 +1,1 @@
+"""The recorder: log streams in, one MCAP file a session out."""

@@ -1,0 +1,1 @@
+"""The plant: a virtual SCARA arm, stepped in real time."""

@@ -1,0 +1,1 @@
+"""The `hilrig` command: parses, wires and starts the others, nothing else."""
