@@ -1,0 +1,69 @@
+"""A recording stream: the bytes of everything that a service published or observed, in batches.
+
+Recording is complete rather than early: entries are collected as they come and leave together, at most
+`FLUSH_PERIOD_NS` later, on the service's own log topic, where the recorder alone listens. So it costs the control
+path one list entry a message.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from hilrig_schemas import LogBatch, OpenSession
+
+from hilrig_runtime.bus import Publisher
+
+FLUSH_PERIOD_NS: Final = 20_000_000
+SESSIONS_PERIOD_NS: Final = 500_000_000
+"""How often a service that keeps sessions states them all, ns."""
+
+Entry = tuple[str, int, int, bytes]
+"""Key, sequence of the sender on that key, time of publication (ns, wall clock), encoded message."""
+
+
+class LogStream:
+    """Collects entries from any thread, and sends them as `LogBatch` from the thread that calls `flush`."""
+
+    def __init__(self, publisher: Publisher, source: str, incarnation: int) -> None:
+        self._publisher = publisher
+        self._source = source
+        self._incarnation = incarnation
+        self._sequence = 0
+        self._entries: list[Entry] = []
+        self._sessions: tuple[OpenSession, ...] | None = None
+        self._sessions_due_ns = 0
+        self._flush_due_ns = 0
+
+    def append(self, key: str, sequence: int, publish_wall_ns: int, payload: bytes) -> None:
+        """Add one message as it stood on the bus; cheap, and safe from any thread."""
+        self._entries.append((key, sequence, publish_wall_ns, payload))
+
+    def set_sessions(self, sessions: Sequence[OpenSession]) -> None:
+        """State the sessions that this service keeps; said at once, and again twice a second."""
+        self._sessions = tuple(sessions)
+        self._sessions_due_ns = 0
+
+    def flush_if_due(self, now_ns: int) -> None:
+        """Send what has come in, at most every `FLUSH_PERIOD_NS`; `now_ns` is of the monotonic clock."""
+        if now_ns >= self._flush_due_ns:
+            self._flush_due_ns = now_ns + FLUSH_PERIOD_NS
+            self.flush(now_ns)
+
+    def flush(self, now_ns: int) -> None:
+        """Send what has come in now."""
+        # Cut at a fixed length: another thread may append meanwhile.
+        entries = self._entries
+        count = len(entries)
+        sessions_due = self._sessions is not None and now_ns >= self._sessions_due_ns
+        if not count and not sessions_due:
+            return
+        self._sequence += 1
+        batch = LogBatch(source=self._source, incarnation=self._incarnation, sequence=self._sequence)
+        add = batch.entries.add
+        for key, sequence, publish_wall_ns, payload in entries[:count]:
+            add(key=key, sequence=sequence, publish_wall_ns=publish_wall_ns, payload=payload)
+        del entries[:count]
+        if self._sessions is not None and sessions_due:
+            self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS
+            batch.sessions.extend(self._sessions)
+            batch.complete_sessions = True
+        self._publisher.put(batch.SerializeToString())

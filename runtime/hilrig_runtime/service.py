@@ -1,0 +1,162 @@
+"""One object that owns a process's life: its bus, log stream, health and the wish to stop.
+
+A service is a function `run(service)` that returns when `service.stopping` is set; everything that it declared is
+closed afterwards, in reverse order. Sending and receiving go through typed ends made here: `sender` encodes once and
+gives the same bytes to the bus and to the log stream; `latest` keeps the newest value of each rig.
+"""
+
+import threading
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Generic, NamedTuple, Self, TypeVar
+
+from google.protobuf.message import Message
+from hilrig_schemas import Event
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, Traffic, alive_key, parse_rig_key
+
+from hilrig_runtime.bus import Bus, Publisher
+from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.health import Counters, HealthReporter
+from hilrig_runtime.logstream import LogStream
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+class Arrival(NamedTuple):
+    """A message as it came in."""
+
+    payload: bytes
+    arrived_ns: int
+    """Monotonic clock of this process, ns."""
+
+
+class LatestValues:
+    """The newest message of each rig on one topic: older ones are of no use to control."""
+
+    def __init__(self, clock: Clock, counters: Counters) -> None:
+        self._by_rig: dict[str, Arrival] = {}
+        self._rig_of_key: dict[str, str] = {}
+        self._monotonic_ns = clock.monotonic_ns
+        self._counters = counters
+
+    def get(self, rig: str) -> Arrival | None:
+        """The newest message of `rig`; None: none has come. The same object is returned until the next comes."""
+        return self._by_rig.get(rig)
+
+    def rigs(self) -> list[str]:
+        """Rigs of which something has come."""
+        return list(self._by_rig)
+
+    def on_message(self, key: str, payload: bytes) -> None:
+        """Keep a message; called by the bus."""
+        arrived_ns = self._monotonic_ns()
+        rig = self._rig_of_key.get(key)
+        if rig is None:
+            rig = self._rig_of_key[key] = parse_rig_key(key).rig
+        self._by_rig[rig] = Arrival(payload, arrived_ns)
+        self._counters.received += 1
+
+
+class Sender(Generic[MessageT]):
+    """Sends the messages of one rig on one topic, on the bus and on the log stream."""
+
+    def __init__(self, key: str, publisher: Publisher | None, log: LogStream, clock: Clock, counters: Counters) -> None:
+        self.key = key
+        self._put = None if publisher is None else publisher.put
+        self._append = log.append
+        self._wall_ns = clock.wall_ns
+        self._counters = counters
+        self._sequence = 0
+
+    def send(self, message: MessageT) -> None:
+        """Encode once; publish, and record the same bytes."""
+        payload = message.SerializeToString()
+        wall_ns = self._wall_ns()
+        if self._put is not None:
+            self._put(payload)
+        self._sequence += 1
+        self._counters.published += 1
+        self._append(self.key, self._sequence, wall_ns, payload)
+
+    def repeat(self, message: MessageT) -> None:
+        """Publish without recording: a repetition for those who wait to hear that it still holds."""
+        if self._put is not None:
+            self._put(message.SerializeToString())
+
+
+class Service:
+    """What a running service has; use it as a context manager."""
+
+    def __init__(
+        self, name: str, lab: LabConfig, bus: Bus, *, instance: str = "1", clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        self.name = name
+        self.instance = instance
+        self.source = f"{name}/{instance}"
+        self.lab = lab
+        self.bus = bus
+        self.clock = clock
+        self.incarnation = clock.wall_ns()
+        self.stopping = threading.Event()
+        self._closing = ExitStack()
+        self._closing.callback(bus.close)
+        self._event_senders: dict[str, Sender[Event]] = {}
+        log_publisher = self._closing.enter_context(bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic))
+        self.log = LogStream(log_publisher, self.source, self.incarnation)
+        health_publisher = self._closing.enter_context(
+            bus.publisher(HEALTH.key(lab.name, name, instance), HEALTH.traffic)
+        )
+        self.health = HealthReporter(health_publisher, name, instance, self.incarnation, clock)
+        self.counters = self.health.counters
+        self._closing.enter_context(bus.announce(alive_key(lab.name, name, instance)))
+
+    def sender(self, topic: RigTopic[MessageT], rig: str, *, on_bus: bool = True) -> Sender[MessageT]:
+        """An end that sends on a rig's topic; with `on_bus=False` its messages go on the record alone."""
+        key = topic.key(self.lab.name, rig)
+        publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic)) if on_bus else None
+        return Sender(key, publisher, self.log, self.clock, self.counters)
+
+    def latest(self, topic: RigTopic[MessageT], rig: str = "*") -> LatestValues:
+        """The newest messages on a topic, of every rig or of one."""
+        values = LatestValues(self.clock, self.counters)
+        self._closing.enter_context(self.bus.subscribe(topic.key(self.lab.name, rig), values.on_message))
+        return values
+
+    def emit(self, event: Event) -> None:
+        """Send and record an event; source and time are filled in."""
+        event.source = self.source
+        event.wall_ns = self.clock.wall_ns()
+        # Events of the service as a whole are told under the name of the service's topic-less rig.
+        rig = event.rig or self.name
+        sender = self._event_senders.get(rig)
+        if sender is None:
+            sender = self._event_senders[rig] = self.sender(EVENT, rig)
+        sender.send(event)
+
+    def beat(self, now_ns: int) -> None:
+        """Once a tick: send the log batch and the health report when they are due; monotonic clock, ns."""
+        self.log.flush_if_due(now_ns)
+        self.health.report_if_due(now_ns)
+
+    def stop(self) -> None:
+        """Wish the service to end; safe from any thread and from a signal handler."""
+        self.stopping.set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Send what is left on the log stream, then close everything in reverse order; a second call does nothing."""
+        with self._closing.pop_all():
+            now_ns = self.clock.monotonic_ns()
+            self.log.flush(now_ns)
+            self.health.report(now_ns)
+
+
+__all__ = ["Arrival", "LatestValues", "Sender", "Service", "Traffic"]

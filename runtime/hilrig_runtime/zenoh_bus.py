@@ -1,0 +1,224 @@
+"""The bus between processes, over zenoh.
+
+Scouting and gossip are off and endpoints explicit, so that who talks to whom is what the configuration says. In the
+mesh each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of them:
+every reader is linked to every writer, with no hop between and no other program needed. With a router everyone is
+its client.
+"""
+
+import json
+import logging
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+import zenoh.ext
+from hilrig_schemas.topics import Traffic
+
+from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.config import BusConfig
+from hilrig_runtime.errors import HilrigError, OperationError
+
+MESH_ORDER: Final = ("sim", "edge", "recorder")
+
+RECORDING_CACHE_BATCHES: Final = 500
+"""What a log stream can repeat after an outage: 10 s at 50 batches a second."""
+_HEARTBEAT_S: Final = 0.25
+_PRIORITIES: Final = {
+    Traffic.CONTROL: zenoh.Priority.REAL_TIME,
+    Traffic.RECORDING: zenoh.Priority.DATA_LOW,
+    Traffic.REPORT: zenoh.Priority.BACKGROUND,
+}
+
+logger = logging.getLogger(__name__)
+
+
+def mesh_endpoint(bus: BusConfig, service: str) -> str:
+    """Where a service listens for the others in the mesh."""
+    return f"tcp/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
+
+
+def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
+    """The zenoh configuration of `service`: one of `MESH_ORDER`, or any other name for a tool."""
+    listen: list[str] = []
+    if bus.topology == "router":
+        mode, connect = "client", [bus.router]
+    else:
+        mode = "peer"
+        earlier = MESH_ORDER.index(service) if service in MESH_ORDER else len(MESH_ORDER)
+        connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
+        if service in MESH_ORDER:
+            listen = [mesh_endpoint(bus, service)]
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        # A client waits for its router as long as it takes: services may start in any order.
+        "connect/timeout_ms": -1 if mode == "client" else 0,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Implicit shared memory can lose data, and a batch is larger than its threshold.
+        "transport/shared_memory/enabled": False,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class _Declared(Handle):
+    def __init__(self, item: Any, *more: Any) -> None:
+        self._items = [item, *more]
+
+    def close(self) -> None:
+        while self._items:
+            self._items.pop().undeclare()
+
+
+class _ZenohPublisher(Publisher):
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+        # The instance's put is zenoh's own: no frame of ours on the control path.
+        self.put = publisher.put  # type: ignore[method-assign]
+
+    def put(self, payload: bytes) -> None:
+        """See `Publisher.put`."""
+        self._publisher.put(payload)
+
+    def close(self) -> None:
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            publisher.undeclare()
+
+
+class ZenohBus(Bus):
+    """See `hilrig_runtime.bus.Bus`. Raises `OperationError` where the session can't be opened."""
+
+    def __init__(self, bus: BusConfig, service: str, *, express: bool = True) -> None:
+        self._express = express
+        try:
+            self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service))
+        except zenoh.ZError as error:
+            raise OperationError(_why_not_open(bus, service, error)) from error
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The zenoh session underneath."""
+        if self._session is None:
+            raise OperationError("the bus is closed")
+        return self._session
+
+    def publisher(self, key: str, traffic: Traffic) -> Publisher:
+        """See `Bus.publisher`."""
+        if traffic is Traffic.RECORDING:
+            return _ZenohPublisher(
+                zenoh.ext.declare_advanced_publisher(
+                    self.session,
+                    key,
+                    # Dropped rather than waited for: the control path must not feel a slow recorder, and the cache
+                    # gives back what was dropped.
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=_PRIORITIES[traffic],
+                    cache=zenoh.ext.CacheConfig(RECORDING_CACHE_BATCHES),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                        heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S
+                    ),
+                    publisher_detection=True,
+                )
+            )
+        return _ZenohPublisher(
+            self.session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=_PRIORITIES[traffic],
+                express=self._express and traffic is Traffic.CONTROL,
+            )
+        )
+
+    def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
+        """See `Bus.subscribe`."""
+        return _Declared(self.session.declare_subscriber(key_expr, _deliver(on_message)))
+
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:
+        """See `Bus.subscribe_recording`."""
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session,
+            key_expr,
+            _deliver(on_message),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=RECORDING_CACHE_BATCHES),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+        losses = subscriber.sample_miss_listener(lambda miss: on_loss(miss.nb))
+        return _Declared(subscriber, losses)
+
+    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+        """See `Bus.serve`."""
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                try:
+                    query.reply(key, answer(b"" if query.payload is None else query.payload.to_bytes()))
+                except HilrigError as error:
+                    query.reply_err(str(error).encode())
+                except Exception:
+                    logger.exception("answering a question on %s failed", key)
+                    query.reply_err(b"the service failed to answer; its log says why")
+
+        return _Declared(self.session.declare_queryable(key, reply))
+
+    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        """See `Bus.ask`."""
+        answers = []
+        for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
+            if reply.ok is not None:
+                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                text = reply.err.payload.to_bytes().decode(errors="replace")
+                # zenoh answers a question that nobody answered in time with an error of its own.
+                if text.lower() != "timeout":
+                    answers.append(Answer(key_expr, b"", text))
+        return answers
+
+    def announce(self, key: str) -> Handle:
+        """See `Bus.announce`."""
+        return _Declared(self.session.liveliness().declare_token(key))
+
+    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
+        """See `Bus.watch`."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            on_alive(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return _Declared(self.session.liveliness().declare_subscriber(key_expr, on_sample, history=True))
+
+    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
+        """See `Bus.alive`."""
+        replies = self.session.liveliness().get(key_expr, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def close(self) -> None:
+        """Close the session: a process that ends with one open can hang."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
+    def on_sample(sample: zenoh.Sample) -> None:
+        on_message(str(sample.key_expr), sample.payload.to_bytes())
+
+    return on_sample
+
+
+def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
+    if bus.topology == "router":
+        return f"no zenoh router answers at {bus.router} (bus.router): {error}"
+    if service not in MESH_ORDER:
+        return f"can't join the bus: {error}"
+    endpoint = mesh_endpoint(bus, service)
+    return (
+        f"can't listen on {endpoint} for the bus: is another hilrig running here? "
+        f"Choose another bus.first_port in lab.toml ({error})"
+    )
