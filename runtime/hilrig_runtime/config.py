@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from hilrig_schemas.topics import NAME_PATTERN, RESERVED_RIG_NAMES
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.errors import InputError
 
@@ -143,6 +143,12 @@ class LabConfig(Section):
     recorder: RecorderConfig = RecorderConfig()
     bus: BusConfig = BusConfig()
     rigs: Annotated[tuple[RigSettings, ...], Field(min_length=1)] = (RigSettings(),)
+    _source: str = PrivateAttr("")
+
+    @property
+    def source(self) -> str:
+        """The text that it was read from; empty: these are defaults, or it was made by a program."""
+        return self._source
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
@@ -220,11 +226,13 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
         InputError: as `load_lab`.
     """
     try:
-        return LabConfig.model_validate(tomllib.loads(text))
+        lab = LabConfig.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: no valid TOML: {error}") from error
     except ValidationError as error:
         raise InputError("\n".join(f"{where}: {_sentence(mistake)}" for mistake in error.errors())) from error
+    lab._source = text
+    return lab
 
 
 def _sentence(mistake: Any) -> str:

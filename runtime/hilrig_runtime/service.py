@@ -1,6 +1,7 @@
 """One object that owns a process's life: its bus, log stream, health and the wish to stop.
 
-A service is a function `run(service)` that returns when `service.stopping` is set; everything that it declared is
+A service is a function `run(service)` that calls `service.ready()` once it does its work, and returns when
+`service.stopping` is set; everything that it declared is
 closed afterwards, in reverse order. Sending and receiving go through typed ends made here: `sender` encodes once and
 gives the same bytes to the bus and to the log stream; `latest` keeps the newest value of each rig.
 """
@@ -12,9 +13,9 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 from google.protobuf.message import Message
 from hilrig_schemas import Event
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, Traffic, alive_key, parse_rig_key
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, alive_key, parse_rig_key
 
-from hilrig_runtime.bus import Bus, Publisher
+from hilrig_runtime.bus import Bus, Handle, Publisher
 from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.health import Counters, HealthReporter
@@ -109,7 +110,13 @@ class Service:
         )
         self.health = HealthReporter(health_publisher, name, instance, self.incarnation, clock)
         self.counters = self.health.counters
-        self._closing.enter_context(bus.announce(alive_key(lab.name, name, instance)))
+        self._token: Handle | None = None
+
+    def ready(self) -> None:
+        """Say that the service does its work now: its liveliness token appears; a second call does nothing."""
+        if self._token is None:
+            token = self.bus.announce(alive_key(self.lab.name, self.name, self.instance))
+            self._token = self._closing.enter_context(token)
 
     def sender(self, topic: RigTopic[MessageT], rig: str, *, on_bus: bool = True) -> Sender[MessageT]:
         """An end that sends on a rig's topic; with `on_bus=False` its messages go on the record alone."""
@@ -157,6 +164,3 @@ class Service:
             now_ns = self.clock.monotonic_ns()
             self.log.flush(now_ns)
             self.health.report(now_ns)
-
-
-__all__ = ["Arrival", "LatestValues", "Sender", "Service", "Traffic"]
