@@ -1,0 +1,38 @@
+"""`hilrig check`: is this a lab, and which one?"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+
+def check(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[LAB.TOML]", help="The lab's file; without: the defaults.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Read a lab's file, name every mistake, and print what it describes."""
+    from hilrig_sim.model import check_stable
+    from rich.console import Console
+    from rich.table import Table
+
+    from hilrig_runtime.config import load_lab
+
+    lab = load_lab(file)
+    for rig in lab.rigs:
+        check_stable(lab.sim, rig)
+    if as_json:
+        print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports}))
+        return
+    table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is good", title_justify="left")
+    for column in ("rig", "Modbus TCP", "step", "integrator"):
+        table.add_column(column)
+    for rig in lab.rigs:
+        address = f"{lab.edge.host}:{lab.ports[rig.name]}"
+        substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
+        table.add_row(rig.name, address, f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
+    Console().print(table)

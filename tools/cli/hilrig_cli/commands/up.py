@@ -1,0 +1,48 @@
+"""`hilrig up`: the whole lab on this host, with nothing else installed."""
+
+import subprocess
+import sys
+import threading
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import Config
+
+
+def up(
+    config: Config = None,
+    view: Annotated[bool, typer.Option("--view", help="Open the live view of the first rig in rerun.")] = False,
+) -> None:
+    """Start simulation, Modbus edge and recorder here, print each rig's Modbus address, and run until Ctrl-C.
+
+    A service that dies is restarted. Ctrl-C or SIGTERM ends everything in order: torques to zero, recordings finished.
+    """
+    from hilrig_cli.lab import POLL_S, running_lab
+    from hilrig_cli.supervisor import own_process_group
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.lifecycle import stop_on_signals
+
+    lab = load_lab(config)
+    stopping = threading.Event()
+    stop_on_signals(stopping)
+
+    def say(line: str) -> None:
+        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+    with running_lab(lab, config, say, stopping) as supervisor:
+        if not stopping.is_set():
+            for rig in lab.rigs:
+                print(f"{rig.name}: Modbus TCP at {lab.edge.host}:{lab.ports[rig.name]}, step {lab.sim.step_ms:g} ms")
+            print(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
+            print("running; Ctrl-C ends it", flush=True)
+        viewer = None
+        if view and not stopping.is_set():
+            command = [sys.executable, "-m", "hilrig_cli", "live", lab.rigs[0].name]
+            command += ["--config", str(config)] if config is not None else []
+            viewer = subprocess.Popen(command, **own_process_group())
+        while not stopping.wait(POLL_S):
+            supervisor.poll()
+        if viewer is not None:
+            viewer.terminate()
+    print("ended", flush=True)

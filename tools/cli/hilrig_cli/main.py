@@ -1,0 +1,56 @@
+"""`hilrig`: every command, each in a module of its own under `commands`.
+
+A command's module imports what does the work inside its function, so that `hilrig --help` is quick and a machine
+that has one service's parts only can run that service.
+"""
+
+import sys
+
+import typer
+
+from hilrig_cli.commands import check, demo, services, up
+from hilrig_runtime.lifecycle import run_main
+
+app = typer.Typer(
+    name="hilrig",
+    help="A hardware-in-the-loop rig for robot control: a virtual SCARA arm over Modbus TCP, recorded and replayed.",
+    epilog="Exit codes: 0 done, 1 the answer is no, 2 wrong usage or input, 3 an operation failed.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+RUN = "Run a lab"
+SERVICES = "Services, one by one"
+REVIEW = "Review what was recorded"
+
+app.command(rich_help_panel=RUN)(up.up)
+app.command(rich_help_panel=RUN)(demo.demo)
+app.command(rich_help_panel=RUN)(check.check)
+app.command(rich_help_panel=SERVICES)(services.sim)
+app.command(rich_help_panel=SERVICES)(services.edge)
+app.command(rich_help_panel=SERVICES)(services.recorder)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"hilrig {version('hilrig')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    pass
+
+
+def main() -> int:
+    """Entry point of the `hilrig` command; gives the exit code."""
+    return run_main(app)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
