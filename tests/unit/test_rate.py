@@ -1,0 +1,72 @@
+"""The loop's rate: one grid of deadlines, lateness as data, no burst after a stall."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilrig_runtime.clock import ManualClock
+from hilrig_runtime.rate import Rate
+
+PERIOD = 20_000_000
+
+
+def test_deadlines_lie_on_one_grid_whatever_the_work_takes() -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    first = rate.wait().deadline_ns
+    for number in range(1, 50):
+        clock.advance(number * 300_000)
+        tick = rate.wait()
+        assert tick.deadline_ns == first + number * PERIOD
+        assert tick.missed_steps == 0
+
+
+def test_a_late_tick_keeps_its_deadline_and_tells_its_lateness() -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    first = rate.wait().deadline_ns
+    clock.advance(PERIOD + 7_000_000)
+    tick = rate.wait()
+    assert (tick.deadline_ns, tick.lateness_ns, tick.missed_steps) == (first + PERIOD, 7_000_000, 0)
+
+
+def test_after_a_stall_whole_periods_are_given_up_and_counted() -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    first = rate.wait().deadline_ns
+    clock.advance(5 * PERIOD + 3_000_000)
+    stalled = rate.wait()
+    assert (stalled.missed_steps, stalled.lateness_ns) == (4, 3_000_000)
+    assert stalled.deadline_ns == first + 5 * PERIOD
+    after = rate.wait()
+    assert (after.missed_steps, after.lateness_ns) == (0, 0)
+    assert clock.monotonic_ns() == first + 6 * PERIOD, "the next tick comes a whole period later, not in a burst"
+
+
+@given(st.lists(st.integers(min_value=0, max_value=10 * PERIOD), max_size=50))
+def test_every_deadline_is_either_ticked_or_counted_as_missed(work: list[int]) -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    first = rate.wait().deadline_ns
+    accounted = 0
+    for duration in work:
+        clock.advance(duration)
+        tick = rate.wait()
+        accounted += 1 + tick.missed_steps
+        assert tick.deadline_ns == first + accounted * PERIOD
+        assert 0 <= tick.lateness_ns < PERIOD
+        assert clock.monotonic_ns() >= tick.deadline_ns
+
+
+def test_sleeping_through_deadlines_counts_too() -> None:
+    class Oversleeping(ManualClock):
+        def sleep_until_ns(self, deadline_ns: int) -> None:
+            super().sleep_until_ns(deadline_ns + 2 * PERIOD + 1)
+
+    tick = Rate(PERIOD, Oversleeping()).wait()
+    assert (tick.missed_steps, tick.lateness_ns) == (2, 1)
+
+
+def test_a_period_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="a period must be positive, found 0 ns"):
+        Rate(0)

@@ -1,0 +1,98 @@
+"""A service's typed ends: what is sent is recorded byte for byte, and only the newest value is kept."""
+
+from hilrig_runtime.clock import ManualClock
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.service import Service
+from hilrig_schemas import Event, Health, JointState, LogBatch
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, STATE, alive_key
+
+
+def make_service(hub: MemoryHub, clock: ManualClock, name: str = "sim") -> Service:
+    return Service(name, LabConfig(), MemoryBus(hub), clock=clock)
+
+
+def test_what_is_sent_is_on_the_bus_and_on_the_record_with_the_same_bytes() -> None:
+    hub, clock = MemoryHub(), ManualClock()
+    seen: list[bytes] = []
+    batches: list[bytes] = []
+    witness = MemoryBus(hub)
+    witness.subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
+    witness.subscribe(LOG.key("lab", "*", "*"), lambda _, payload: batches.append(payload))
+    with make_service(hub, clock) as service:
+        sender = service.sender(STATE, "rig1")
+        for step in (1, 2):
+            sender.send(JointState(rig="rig1", step=step))
+        service.beat(clock.monotonic_ns())
+    entries = LogBatch.FromString(batches[0]).entries
+    assert [entry.payload for entry in entries] == seen
+    assert [entry.sequence for entry in entries] == [1, 2]
+    assert {entry.publish_wall_ns for entry in entries} == {clock.wall_ns()}
+
+
+def test_a_repetition_is_heard_but_not_recorded() -> None:
+    hub = MemoryHub()
+    seen: list[bytes] = []
+    MemoryBus(hub).subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
+    with make_service(hub, ManualClock()) as service:
+        service.sender(STATE, "rig1").repeat(JointState(step=1))
+    assert len(seen) == 1
+    assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).entries]
+
+
+def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:
+    hub, clock = MemoryHub(), ManualClock()
+    with make_service(hub, clock, "edge") as edge, make_service(hub, clock, "sim") as sim:
+        latest = edge.latest(STATE)
+        assert latest.get("rig1") is None
+        sender = sim.sender(STATE, "rig1")
+        for step in (1, 2):
+            clock.advance(1_000)
+            sender.send(JointState(step=step))
+        arrival = latest.get("rig1")
+        assert arrival is not None
+        assert STATE.decode(arrival.payload).step == 2
+        assert arrival.arrived_ns == clock.monotonic_ns()
+        assert edge.counters.received == 2
+
+
+def test_an_event_carries_its_source_and_time() -> None:
+    hub, clock = MemoryHub(), ManualClock()
+    seen: list[Event] = []
+    MemoryBus(hub).subscribe(EVENT.key("lab", "rig1"), lambda _, payload: seen.append(EVENT.decode(payload)))
+    with make_service(hub, clock) as service:
+        service.emit(Event(rig="rig1", kind=Event.OVERRUN, text="late"))
+    assert (seen[0].source, seen[0].wall_ns, seen[0].text) == ("sim/1", clock.wall_ns(), "late")
+
+
+def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> None:
+    hub = MemoryHub()
+    witness = MemoryBus(hub)
+    service = make_service(hub, ManualClock())
+    latest = service.latest(STATE)
+    assert witness.alive(alive_key("lab", "*", "*")) == []
+    service.ready()
+    service.ready()
+    assert witness.alive(alive_key("lab", "*", "*")) == [alive_key("lab", "sim", "1")]
+    service.close()
+    service.close()
+    assert witness.alive(alive_key("lab", "*", "*")) == []
+    witness.publisher(STATE.key("lab", "rig1"), STATE.traffic).put(b"")
+    assert latest.get("rig1") is None
+    assert hub.subscribers == []
+
+
+def test_health_comes_once_a_second_with_what_was_counted() -> None:
+    hub, clock = MemoryHub(), ManualClock()
+    seen: list[Health] = []
+    MemoryBus(hub).subscribe(HEALTH.key("lab", "*", "*"), lambda _, payload: seen.append(HEALTH.decode(payload)))
+    with make_service(hub, clock) as service:
+        service.counters.requests = 3
+        service.counters.latenesses_ns += range(101)
+        for _ in range(30):
+            clock.advance(100_000_000)
+            service.beat(clock.monotonic_ns())
+        assert [health.requests for health in seen] == [3, 3, 3]
+        assert (seen[0].lateness_p50_ns, seen[0].lateness_p99_ns, seen[0].lateness_max_ns) == (50, 99, 100)
+        assert seen[1].lateness_max_ns == 0
+        assert (seen[0].service, seen[0].instance, seen[0].incarnation) == ("sim", "1", service.incarnation)
