@@ -1,0 +1,162 @@
+"""How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?
+
+A C controller on libmodbus polls as fast as it can against the whole lab (simulation, edge and recorder as
+processes, as `hilrig up` starts them), at steps of 20, 5 and 1 ms. In the same run, on the same machine: a message
+that goes from one Python process to another over zenoh and back, and the same C controller against the least Modbus
+server that libmodbus makes. Latency is what `hilrig latency` finds in the recording.
+"""
+
+import json
+import multiprocessing
+import multiprocessing.connection
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import harness
+from harness import Report, build_c, percentile, progress
+
+from hilrig_cli.demo import free_port
+from hilrig_cli.lab import running_lab
+from hilrig_runtime.config import BusConfig, load_lab
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas.topics import STATE, Traffic
+
+QUESTION = "How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?"
+STEPS_MS = (20.0, 5.0, 1.0)
+
+
+def measure(report: Report, quick: bool) -> None:
+    client = build_c("loop_client.c")
+    echo = build_c("modbus_echo_server.c")
+    runs, seconds = (1, 5.0) if quick else (3, 20.0)
+
+    progress("bare Modbus round trip")
+    bare_modbus = [modbus_round_trip(client, echo, 2.0) for _ in range(runs)]
+    read_p50 = report.add("bare Modbus", "read p50", median(bare_modbus, "read_us", "p50"), "µs")
+    report.add("bare Modbus", "read p99", median(bare_modbus, "read_us", "p99"), "µs")
+    progress("bare zenoh round trip")
+    zenoh_p50, zenoh_p99 = zenoh_round_trip(50 if quick else 250)
+    report.add("bare zenoh, 50 Hz", "round trip p50", zenoh_p50, "µs")
+    report.add("bare zenoh, 50 Hz", "round trip p99", zenoh_p99, "µs")
+
+    for step_ms in STEPS_MS:
+        measured = []
+        for number in range(runs):
+            progress(f"the rig at a step of {step_ms:g} ms, run {number + 1} of {runs}")
+            measured.append(rig_loop(client, step_ms, seconds))
+        add_loop(report, step_ms, measured)
+        if step_ms == STEPS_MS[0]:
+            reads = [client_figures for _, client_figures in measured]
+            ours = report.add("rig, 20 ms", "Modbus read p50", median(reads, "read_us", "p50"), "µs")
+            report.add("rig, 20 ms", "Modbus read against bare Modbus", ours / read_p50, "ratio")
+
+
+def add_loop(report: Report, step_ms: float, measured: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    case = f"rig, {step_ms:g} ms"
+    latencies = [latency for latency, _ in measured]
+    loop = {key: statistics.median(one["loop_ms"][key] for one in latencies) for key in ("p50", "p99", "p999", "max")}
+    for key, value in loop.items():
+        report.add(case, f"loop {key}", value, "ms")
+    for stage in latencies[0]["stages_ms"]:
+        report.add(
+            case, f"stage {stage} p50", statistics.median(one["stages_ms"][stage]["p50"] for one in latencies), "ms"
+        )
+    report.add(case, "samples", statistics.median(one["samples"] for one in latencies), "count")
+    report.add(case, "lost", max(sum(one["lost"].values()) for one in latencies), "count")
+    report.add(case, "Modbus cycles", statistics.median(figures["cycles_per_s"] for _, figures in measured), "1/s")
+    if step_ms == 20:
+        report.bar("20 ms step: loop p50 in steps", loop["p50"] / step_ms, "<=", 1.005)
+        report.bar("20 ms step: loop p99.9 in steps", loop["p999"] / step_ms, "<=", 1.05)
+    elif step_ms == 5:
+        report.bar("5 ms step: loop p99.9 in steps", loop["p999"] / step_ms, "<=", 1.2)
+    else:
+        report.bar("1 ms step: loop p50 in steps", loop["p50"] / step_ms, "<=", 1.05)
+        report.bar("1 ms step: loop p99 in steps", loop["p99"] / step_ms, "<=", 2.0)
+
+
+def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
+    return statistics.median(run[group][key] for run in runs)
+
+
+def rig_loop(client: Path, step_ms: float, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Latency report of one session against the whole lab, and the controller's own figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = Path(folder) / "lab.toml"
+        port, bus_port = free_port(5020), free_port(7447, 3)
+        config.write_text(
+            f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
+            f'[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = "{folder}"\n'
+        )
+        lab = load_lab(config)
+        with running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event()):
+            figures = run_client(client, port, seconds)
+        (recording,) = Path(folder).rglob("*.mcap")
+        command = [sys.executable, "-m", "hilrig_cli", "latency", str(recording), "--json"]
+        output = subprocess.run(command, stdout=subprocess.PIPE, timeout=120).stdout
+        return json.loads(output), figures
+
+
+def run_client(client: Path, port: int, seconds: float) -> dict[str, Any]:
+    command = [str(client), "127.0.0.1", str(port), str(seconds), "0"]
+    output = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=seconds + 30).stdout
+    figures: dict[str, Any] = json.loads(output)
+    return figures
+
+
+def modbus_round_trip(client: Path, server: Path, seconds: float) -> dict[str, Any]:
+    port = free_port(5920)
+    with subprocess.Popen([str(server), str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdout.readline()
+        figures = run_client(client, port, seconds)
+        process.stdin.close()
+    return figures
+
+
+def zenoh_round_trip(rounds: int) -> tuple[float, float]:
+    """p50 and p99 of a message to another process and back over zenoh, sent every 20 ms, µs."""
+    config = BusConfig(first_port=free_port(7547, 3))
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=echo_over_zenoh, args=(config, theirs), daemon=True)
+    process.start()
+    ours.recv()
+    times_us = []
+    with ZenohBus(config, "edge") as bus:
+        back = threading.Event()
+        bus.subscribe(STATE.key("bench", "pong"), lambda *_: back.set())
+        ping = bus.publisher(STATE.key("bench", "ping"), Traffic.CONTROL)
+        payload = bytes(150)
+        while not back.is_set():
+            ping.put(payload)
+            back.wait(0.1)
+        time.sleep(0.3)
+        for _ in range(rounds):
+            time.sleep(0.02)
+            back.clear()
+            begin = time.perf_counter_ns()
+            ping.put(payload)
+            if back.wait(1.0):
+                times_us.append((time.perf_counter_ns() - begin) / 1e3)
+    ours.send(None)
+    process.join(10)
+    return percentile(times_us, 0.5), percentile(times_us, 0.99)
+
+
+def echo_over_zenoh(config: BusConfig, until: multiprocessing.connection.Connection) -> None:
+    with ZenohBus(config, "sim") as bus:
+        pong = bus.publisher(STATE.key("bench", "pong"), Traffic.CONTROL)
+        bus.subscribe(STATE.key("bench", "ping"), lambda _, payload: pong.put(payload))
+        until.send(None)
+        until.recv()
+
+
+if __name__ == "__main__":
+    sys.exit(harness.run(measure, QUESTION))
