@@ -98,7 +98,7 @@ def rig_loop(client: Path, step_ms: float, seconds: float) -> tuple[dict[str, An
             figures = run_client(client, port, seconds)
         (recording,) = Path(folder).rglob("*.mcap")
         command = [sys.executable, "-m", "hilrig_cli", "latency", str(recording), "--json"]
-        output = subprocess.run(command, stdout=subprocess.PIPE, timeout=120).stdout
+        output = subprocess.run(command, check=False, stdout=subprocess.PIPE, timeout=120).stdout
         return json.loads(output), figures
 
 

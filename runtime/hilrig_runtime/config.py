@@ -8,10 +8,10 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from hilrig_schemas.topics import NAME_PATTERN, RESERVED_RIG_NAMES
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.errors import InputError
+from hilrig_schemas.topics import NAME_PATTERN, RESERVED_RIG_NAMES
 
 Name = Annotated[str, Field(pattern=rf"^{NAME_PATTERN}$")]
 Port = Annotated[int, Field(ge=1, le=65535)]

@@ -6,11 +6,10 @@ import time
 from dataclasses import dataclass, field
 from typing import Final
 
-from hilrig_schemas import Health
-
 from hilrig_runtime.bus import Publisher
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.rate import Tick
+from hilrig_schemas import Health
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
 

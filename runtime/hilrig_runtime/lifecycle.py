@@ -14,14 +14,16 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
+from hilrig_runtime.bus import Bus
 from hilrig_runtime.clock import sharpen_timers
 from hilrig_runtime.config import LabConfig
-from hilrig_runtime.errors import HilrigError
+from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
+ROUTER_RETRY_S: Final = 0.5
 
 logger = logging.getLogger(__name__)
 
@@ -49,12 +51,30 @@ def run_service(
     if stop_with_parent:
         stop_with_stdin(stopping)
     end_when_closing_hangs(stopping, close_timeout_s)
-    with Service(name, lab, ZenohBus(lab.bus, name, express=lab.express), instance=instance) as service:
-        service.stopping = stopping
+    bus = _open_bus(lab, name, stopping)
+    if bus is None:
+        return
+    with Service(name, lab, bus, instance=instance, stopping=stopping) as service:
         gc.collect()
         gc.freeze()
         logger.info("running as %s", service.source)
         run(service)
+
+
+def _open_bus(lab: LabConfig, name: str, stopping: threading.Event) -> Bus | None:
+    """Join the bus; a service waits for its router, for the two may start in any order. None: told to stop first."""
+    waiting = False
+    while not stopping.is_set():
+        try:
+            return ZenohBus(lab.bus, name, express=lab.express)
+        except OperationError as error:
+            if lab.bus.topology != "router":
+                raise
+            if not waiting:
+                logger.warning("waiting: %s", error)
+            waiting = True
+            stopping.wait(ROUTER_RETRY_S)
+    return None
 
 
 def stop_on_signals(stopping: threading.Event) -> None:

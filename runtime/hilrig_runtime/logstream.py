@@ -8,9 +8,8 @@ path one list entry a message.
 from collections.abc import Sequence
 from typing import Final
 
-from hilrig_schemas import LogBatch, OpenSession
-
 from hilrig_runtime.bus import Publisher
+from hilrig_schemas import LogBatch, OpenSession
 
 FLUSH_PERIOD_NS: Final = 20_000_000
 SESSIONS_PERIOD_NS: Final = 500_000_000

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from hilrig_schemas.topics import Traffic
-
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.errors import HilrigError
+from hilrig_schemas.topics import Traffic
 
 T = TypeVar("T")
 

@@ -12,14 +12,14 @@ from types import TracebackType
 from typing import Generic, NamedTuple, Self, TypeVar
 
 from google.protobuf.message import Message
-from hilrig_schemas import Event
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, alive_key, parse_rig_key
 
 from hilrig_runtime.bus import Bus, Handle, Publisher
 from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.health import Counters, HealthReporter
 from hilrig_runtime.logstream import LogStream
+from hilrig_schemas import Event
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, alive_key, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -90,7 +90,14 @@ class Service:
     """What a running service has; use it as a context manager."""
 
     def __init__(
-        self, name: str, lab: LabConfig, bus: Bus, *, instance: str = "1", clock: Clock = SYSTEM_CLOCK
+        self,
+        name: str,
+        lab: LabConfig,
+        bus: Bus,
+        *,
+        instance: str = "1",
+        clock: Clock = SYSTEM_CLOCK,
+        stopping: threading.Event | None = None,
     ) -> None:
         self.name = name
         self.instance = instance
@@ -99,7 +106,7 @@ class Service:
         self.bus = bus
         self.clock = clock
         self.incarnation = clock.wall_ns()
-        self.stopping = threading.Event()
+        self.stopping = stopping or threading.Event()
         self._closing = ExitStack()
         self._closing.callback(bus.close)
         self._event_senders: dict[str, Sender[Event]] = {}

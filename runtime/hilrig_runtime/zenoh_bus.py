@@ -13,11 +13,11 @@ from typing import Any, Final
 
 import zenoh
 import zenoh.ext
-from hilrig_schemas.topics import Traffic
 
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_schemas.topics import Traffic
 
 MESH_ORDER: Final = ("sim", "edge", "recorder")
 
@@ -53,9 +53,10 @@ def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
         "mode": mode,
         "listen/endpoints": listen,
         "connect/endpoints": connect,
-        # A client waits for its router as long as it takes: services may start in any order.
-        "connect/timeout_ms": -1 if mode == "client" else 0,
-        "connect/exit_on_failure": False,
+        # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
+        # between tries; a peer connects whenever the others come up.
+        "connect/timeout_ms": 500 if mode == "client" else 0,
+        "connect/exit_on_failure": mode == "client",
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -214,7 +215,7 @@ def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
 
 def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
     if bus.topology == "router":
-        return f"no zenoh router answers at {bus.router} (bus.router): {error}"
+        return f"no zenoh router answers at {bus.router} (bus.router in lab.toml)"
     if service not in MESH_ORDER:
         return f"can't join the bus: {error}"
     endpoint = mesh_endpoint(bus, service)
