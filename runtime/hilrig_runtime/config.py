@@ -8,23 +8,12 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.errors import InputError
-from hilrig_schemas.topics import NAME_PATTERN, RESERVED_RIG_NAMES
-
-Name = Annotated[str, Field(pattern=rf"^{NAME_PATTERN}$")]
-Port = Annotated[int, Field(ge=1, le=65535)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Vector4 = tuple[Number, Number, Number, Number]
-
-
-class Section(BaseModel):
-    """Base of every table of the file: unknown keys are mistakes, values are fixed once read."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+from hilrig_runtime.scene_config import SceneConfig
+from hilrig_runtime.sections import Name, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
 
 class ArmConfig(Section):
@@ -126,6 +115,8 @@ class RigSettings(Section):
     port: Port | None = None
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
     arm: ArmConfig = ArmConfig()
+    scene: SceneConfig | None = None
+    """Its own scene; default: the lab's."""
 
     @model_validator(mode="after")
     def _no_reserved_name(self) -> "RigSettings":
@@ -142,6 +133,7 @@ class LabConfig(Section):
     edge: EdgeConfig = EdgeConfig()
     recorder: RecorderConfig = RecorderConfig()
     bus: BusConfig = BusConfig()
+    scene: SceneConfig = SceneConfig()
     rigs: Annotated[tuple[RigSettings, ...], Field(min_length=1)] = (RigSettings(),)
     _source: str = PrivateAttr("")
 
@@ -184,6 +176,10 @@ class LabConfig(Section):
     def express(self) -> bool:
         """Whether control messages are sent one by one."""
         return len(self.rigs) <= 16 if self.bus.express is None else self.bus.express
+
+    def scene_of(self, rig: RigSettings) -> SceneConfig:
+        """The scene around a rig: its own, or the lab's."""
+        return self.scene if rig.scene is None else rig.scene
 
     def rig(self, name: str) -> RigSettings:
         """The rig of that name.
