@@ -1,0 +1,115 @@
+"""Several hosts on one machine: network namespaces on one bridge, names resolving as on a compose network.
+
+Needs root and iproute2. Everything is taken down when the context is left, and every process that was started in it
+is ended by its id.
+"""
+
+import os
+import shutil
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import pytest
+
+
+def require_namespaces() -> None:
+    """Skip a test, with the reason, where namespaces can't be had."""
+    if shutil.which("ip") is None:
+        pytest.skip("needs `ip` (Debian's package iproute2)")
+    if os.name != "posix" or os.geteuid() != 0:
+        pytest.skip("needs root, for network namespaces")
+    probe = subprocess.run(["ip", "netns", "add", f"hr{os.getpid()}probe"], check=False, capture_output=True, text=True)
+    if probe.returncode:
+        pytest.skip(f"network namespaces can't be made here: {probe.stderr.strip()}")
+    subprocess.run(["ip", "netns", "delete", f"hr{os.getpid()}probe"], check=True)
+
+
+class Network:
+    """Hosts by name, each in a namespace of its own, all on one bridge; use it as a context manager."""
+
+    def __init__(self, hosts: list[str]) -> None:
+        self._prefix = f"hr{os.getpid()}"
+        self._addresses = {host: f"10.77.0.{number}" for number, host in enumerate(hosts, start=10)}
+        self._closing = ExitStack()
+
+    def address(self, host: str) -> str:
+        """IP address of a host."""
+        return self._addresses[host]
+
+    def popen(self, host: str, command: list[str], **options: Any) -> subprocess.Popen[Any]:
+        """Start a process on a host; it is ended with the network, if it has not ended before."""
+        process = subprocess.Popen(["ip", "netns", "exec", self._namespace(host), *command], **options)
+        self._closing.callback(_end, process)
+        return process
+
+    def run(self, host: str, command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
+        """Run a command on a host to its end."""
+        return subprocess.run(["ip", "netns", "exec", self._namespace(host), *command], check=True, **options)
+
+    def set_link(self, host: str, up: bool) -> None:
+        """Plug a host's cable in or out."""
+        _ip("-n", self._switch, "link", "set", self._port(host), "up" if up else "down")
+
+    def __enter__(self) -> Self:
+        try:
+            self._build()
+        except BaseException:
+            self._closing.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.close()
+
+    def _build(self) -> None:
+        self._add_namespace(self._switch)
+        _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
+        _ip("-n", self._switch, "link", "set", "bridge", "up")
+        names = "127.0.0.1 localhost\n" + "".join(f"{address} {host}\n" for host, address in self._addresses.items())
+        for host, address in self._addresses.items():
+            namespace, port = self._namespace(host), self._port(host)
+            self._add_namespace(namespace)
+            # `ip netns exec` shows a namespace's processes this file as /etc/hosts.
+            etc = Path("/etc/netns") / namespace
+            etc.mkdir(parents=True)
+            self._closing.callback(shutil.rmtree, etc, ignore_errors=True)
+            (etc / "hosts").write_text(names)
+            _ip("-n", self._switch, "link", "add", port, "type", "veth", "peer", "name", "eth0", "netns", namespace)
+            _ip("-n", self._switch, "link", "set", port, "master", "bridge", "up")
+            _ip("-n", namespace, "addr", "add", f"{address}/24", "dev", "eth0")
+            _ip("-n", namespace, "link", "set", "eth0", "up")
+            _ip("-n", namespace, "link", "set", "lo", "up")
+
+    @property
+    def _switch(self) -> str:
+        return f"{self._prefix}-switch"
+
+    def _namespace(self, host: str) -> str:
+        return f"{self._prefix}-{host}"
+
+    def _port(self, host: str) -> str:
+        # Interface names have at most 15 characters.
+        return f"p{list(self._addresses).index(host)}"
+
+    def _add_namespace(self, name: str) -> None:
+        _ip("netns", "add", name)
+        self._closing.callback(subprocess.run, ["ip", "netns", "delete", name], check=False)
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+def _end(process: subprocess.Popen[Any]) -> None:
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

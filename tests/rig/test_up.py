@@ -1,0 +1,161 @@
+"""`hilrig up` as a lab uses it: foreign controllers move the arm, and whatever dies, the lab goes on or ends well."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pymodbus.client import ModbusTcpClient
+
+from clients import build_c_client, mbpoll_read, mbpoll_write, require_mbpoll
+from hilrig_replay.run import open_run
+from labs import RunningLab, free_ports, hilrig, write_lab
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[RunningLab]:
+    with RunningLab(write_lab(tmp_path, extra="edge.session_grace_ms = 200")) as running:
+        yield running
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_mbpoll_turns_joint_1_reads_it_back_and_friction_stops_it(lab: RunningLab) -> None:
+    require_mbpoll()
+    start = mbpoll_read(lab.port, register=5, count=4)
+    assert start == [0, 0, 0, 0] or start[:2] == [0, 0]
+    mbpoll_write(lab.port, register=1, value=1500)
+    turned = eventually(lambda: (now := mbpoll_read(lab.port, 5, 4))[0] > start[0] + 200 and now, timeout_s=5)
+    mbpoll_write(lab.port, register=1, value=0)
+
+    def stands() -> bool:
+        first = mbpoll_read(lab.port, 5, 4)[0]
+        time.sleep(0.1)
+        return mbpoll_read(lab.port, 5, 4)[0] == first >= turned[0]
+
+    eventually(stands, timeout_s=5)
+
+
+def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
+    require_mbpoll()
+    mbpoll_write(lab.port, register=1, value=1, kind="coil")
+    assert mbpoll_read(lab.port, 1, 1, kind="coil") == [1]
+    mbpoll_write(lab.port, register=1, value=0, kind="coil")
+    assert mbpoll_read(lab.port, 1, 1, kind="coil") == [0]
+    eventually(lambda: lab.recordings, timeout_s=15)
+    lab.stop()
+    magnet = open_run(lab.recordings[0]).states.magnet
+    assert magnet.any()
+    assert not magnet[-1]
+
+
+def test_a_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
+    client = build_c_client()
+    output = subprocess.run(
+        [client, "127.0.0.1", str(lab.port), "2", "5"], check=True, capture_output=True, text=True, timeout=30
+    ).stdout
+    assert '"cycles"' in output
+    lab.stop()
+    report = hilrig("latency", lab.recordings[0], "--json")
+    assert report.returncode in (0, 1), report.stderr
+    assert '"samples"' in report.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_everything_in_three_seconds_with_a_readable_file(
+    lab: RunningLab, number: signal.Signals
+) -> None:
+    with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
+        client.write_registers(0, [500, 0, -4905, 0])
+        eventually(lambda: client.read_holding_registers(4, count=4).registers[0] > 0)
+        children = lab.service_pids()
+        assert len(children) == 3
+        begin = time.monotonic()
+        code = lab.stop(number)
+        took = time.monotonic() - begin
+    assert code == 0, lab.output()
+    assert took < 3.0
+    assert not any(alive(pid) for pid in children)
+    (recording,) = lab.recordings
+    run = open_run(recording)
+    assert run.states.step.size > 0
+    assert not list(lab.lab.recorder.folder.rglob("*.part"))
+
+
+def test_a_killed_sim_is_restarted_and_the_loop_goes_on(lab: RunningLab) -> None:
+    with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
+
+        def angle(torque: int) -> int:
+            assert not client.write_registers(0, [torque, 0, -4905, 0]).isError()
+            return int(client.read_holding_registers(4, count=4).registers[0])
+
+        eventually(lambda: angle(1000) > 500, every_s=0.02)
+        os.kill(lab.service_pid("sim"), signal.SIGKILL)
+        # The new simulation begins at its start pose, and obeys again.
+        eventually(lambda: angle(1000) < 100, every_s=0.02)
+        eventually(lambda: angle(1000) > 500, every_s=0.02)
+    assert "sim was killed by signal 9; restarting it" in lab.output()
+    assert "sim is started again" in lab.output()
+    assert lab.stop() == 0
+
+
+@pytest.mark.parametrize("name", ["edge", "recorder"])
+def test_any_other_service_is_restarted_too(lab: RunningLab, name: str) -> None:
+    before = lab.service_pid(name)
+    os.kill(before, signal.SIGKILL)
+
+    def back() -> bool:
+        try:
+            return lab.service_pid(name) != before
+        except LookupError:
+            return False
+
+    eventually(back)
+
+    def answers() -> bool:
+        with ModbusTcpClient("127.0.0.1", port=lab.port, timeout=1, retries=0) as client:
+            return client.connected and not client.read_holding_registers(4, count=4).isError()
+
+    eventually(answers, timeout_s=20, every_s=0.1)
+
+
+def test_services_end_when_up_itself_is_killed(lab: RunningLab) -> None:
+    children = lab.service_pids()
+    lab.process.kill()
+    lab.process.wait()
+    eventually(lambda: not any(alive(pid) for pid in children))
+
+
+def test_a_modbus_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
+    with RunningLab(write_lab(tmp_path)) as first:
+        second = tmp_path / "second.toml"
+        text = first.config.read_text().replace(
+            f"first_port = {first.lab.bus.first_port}", f"first_port = {free_ports(3)}"
+        )
+        second.write_text(text)
+        done = hilrig("up", "--config", second, timeout_s=60)
+    assert done.returncode == 3
+    assert "Traceback" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if f"127.0.0.1:{first.port}" in line]
+    assert "rig1" in line
+    assert "port" in line
+
+
+def test_a_second_lab_on_the_same_bus_ports_is_one_clear_line(tmp_path: Path) -> None:
+    with RunningLab(write_lab(tmp_path)) as first:
+        done = hilrig("up", "--config", first.config, timeout_s=60)
+    assert done.returncode == 3
+    assert "Traceback" not in done.stderr
+    assert "is another hilrig running here?" in done.stderr
