@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import Field, IPvAnyNetwork, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.scene_config import SceneConfig
@@ -65,6 +65,21 @@ class SimConfig(Section):
         return round(self.command_timeout_ms * 1e6)
 
 
+class TlsConfig(Section):
+    """Modbus/TCP Security: each rig listens on a second port, with certificates on both sides (`hilrig certs`)."""
+
+    certificate: Path
+    """The edge's certificate with its chain, PEM."""
+    key: Path
+    """The certificate's private key, PEM."""
+    authority: Path
+    """Who signs the clients' certificates, PEM."""
+    first_port: Port = 802
+    """Port of the first rig; the others follow."""
+    no_role: Literal["operator", "observer", "refuse"] = "observer"
+    """What a client whose certificate names no role may do: write, read only, or nothing."""
+
+
 class EdgeConfig(Section):
     """The Modbus side."""
 
@@ -72,14 +87,36 @@ class EdgeConfig(Section):
     """Address to listen on; 0.0.0.0 opens the rigs to the network."""
     first_port: Port = 5020
     """Port of the first rig; the others follow, unless a rig names its own."""
-    watchdog_ms: NotNegative = 1000.0
-    """With the controller silent for so long the torque goes to zero; 0: never."""
+    watchdog_ms: Annotated[float, Field(ge=0, le=65535)] = 1000.0
+    """With the controller not writing for so long the torque goes to zero; 0: never."""
+    watchdog_min_ms: Annotated[float, Field(ge=1, le=65535)] = 100.0
+    """The shortest time-out that a controller may set by register."""
+    watchdog_max_ms: Annotated[float, Field(ge=1, le=65535)] = 10_000.0
+    """The longest."""
     lease_timeout_ms: Positive = 5000.0
     """A controller silent for so long loses the rig to whoever writes next."""
     session_grace_ms: NotNegative = 5000.0
     """A session goes on when its controller is back within so long."""
     repeat_ms: Positive = 200.0
     """How often the standing command is repeated to the simulation."""
+    max_connections: Annotated[int, Field(ge=1)] = 32
+    """Connections that a rig takes."""
+    max_connections_per_host: Annotated[int, Field(ge=1)] = 16
+    """Connections that a rig takes from one host."""
+    idle_timeout_s: NotNegative = 60.0
+    """A connection without a request for so long is closed; 0: never."""
+    plain: bool = True
+    """Listen without TLS; false leaves the rigs to clients with a certificate."""
+    tls: TlsConfig | None = None
+    """Listen with TLS too."""
+
+    @model_validator(mode="after")
+    def _bounds_hold(self) -> "EdgeConfig":
+        if self.watchdog_min_ms > self.watchdog_max_ms:
+            raise ValueError(f"watchdog_min_ms {self.watchdog_min_ms:g} is above watchdog_max_ms")
+        if not self.plain and self.tls is None:
+            raise ValueError("plain is false and there is no [edge.tls]: nobody could connect")
+        return self
 
 
 class RecorderConfig(Section):
@@ -114,6 +151,8 @@ class RigSettings(Section):
     name: Name = "rig1"
     port: Port | None = None
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
+    allow: tuple[IPvAnyNetwork, ...] = ()
+    """Networks whose hosts may connect, as "192.168.7.0/24"; none named: all."""
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None
     """Its own scene; default: the lab's."""
