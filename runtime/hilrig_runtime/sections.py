@@ -18,4 +18,4 @@ Vector4 = tuple[Number, Number, Number, Number]
 class Section(BaseModel):
     """Base of every table of the file: unknown keys are mistakes, values are fixed once read."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)

@@ -13,6 +13,9 @@ def check(
     file: Annotated[
         Path | None, typer.Argument(metavar="[LAB.TOML]", help="The lab's file; without: the defaults.")
     ] = None,
+    template: Annotated[
+        bool, typer.Option("--template", help="Print a lab's file with every key explained and its default, instead.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Read a lab's file, name every mistake, and print what it describes."""
@@ -21,7 +24,11 @@ def check(
     from rich.table import Table
 
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.template import lab_template
 
+    if template:
+        print(lab_template(), end="")
+        return
     lab = load_lab(file)
     for rig in lab.rigs:
         check_stable(lab.sim, rig)

@@ -1,0 +1,40 @@
+"""The explained `lab.toml` and the page made of it say what the models say."""
+
+import runpy
+import tomllib
+from pathlib import Path
+
+from hilrig_runtime.config import LabConfig, parse_lab
+from hilrig_runtime.sections import Section
+from hilrig_runtime.template import lab_template
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_the_template_is_a_lab_with_the_defaults() -> None:
+    assert parse_lab(lab_template()).model_dump() == LabConfig().model_dump()
+
+
+def test_every_key_stands_in_it() -> None:
+    keys = {line.removeprefix("# ").partition(" =")[0] for line in lab_template().splitlines() if " =" in line}
+
+    def check(section: Section) -> None:
+        for name in type(section).model_fields:
+            value = getattr(section, name)
+            if isinstance(value, Section):
+                check(value)
+            elif isinstance(value, tuple) and value and isinstance(value[0], Section):
+                check(value[0])
+            else:
+                assert name in keys
+
+    check(LabConfig())
+
+
+def test_the_page_is_fresh_and_its_examples_are_labs() -> None:
+    text = (DOCS / "configuration.md").read_text()
+    assert text == runpy.run_path(str(DOCS / "make_configuration.py"))["page"](), "run `make gen` and commit the result"
+    examples = [block.partition("```")[0] for block in text.split("```toml\n")[1:]]
+    assert len(examples) == 2
+    assert [rig.name for rig in parse_lab(examples[1]).rigs] == ["left", "right"]
+    assert tomllib.loads(examples[0])
