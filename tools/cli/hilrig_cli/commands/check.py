@@ -19,12 +19,12 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Read a lab's file, name every mistake, and print what it describes."""
-    from hilrig_sim.model import check_stable
     from rich.console import Console
     from rich.table import Table
 
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.template import lab_template
+    from hilrig_sim.model import check_stable
 
     if template:
         print(lab_template(), end="")

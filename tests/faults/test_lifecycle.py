@@ -1,0 +1,95 @@
+"""How a process ends: in order on the first signal, at once on the second, with its parent, and when closing hangs."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from labs import free_ports
+from waiting import eventually
+
+SERVICE = """
+import sys, threading, time
+from hilrig_runtime.config import BusConfig, LabConfig
+from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.lifecycle import run_main, run_service
+
+def orderly(service):
+    service.ready()
+    print("ready", flush=True)
+    service.stopping.wait()
+    print("closing", flush=True)
+
+def stubborn(service):
+    service.ready()
+    print("ready", flush=True)
+    while True:
+        time.sleep(0.1)
+
+def failing(service):
+    raise InputError("lab.toml: sim.step: unknown key")
+
+def main():
+    lab = LabConfig(bus=BusConfig(first_port={port}))
+    run_service("sim", {run}, lab, stop_with_parent={parent}, close_timeout_s={timeout})
+    print("ended", flush=True)
+
+sys.exit(run_main(main))
+"""
+
+
+def start(
+    tmp_path: Path, run: str, *, parent: bool = False, timeout: float = 5.0, ready: bool = True
+) -> subprocess.Popen[str]:
+    script = tmp_path / "service.py"
+    script.write_text(textwrap.dedent(SERVICE).format(run=run, parent=parent, timeout=timeout, port=free_ports(3)))
+    process = subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    if ready:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    process = start(tmp_path, "orderly")
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=10)
+    assert output == "closing\nended\n"
+    assert process.returncode == 0
+
+
+def test_the_second_signal_forces(tmp_path: Path) -> None:
+    process = start(tmp_path, "stubborn", timeout=60)
+    process.terminate()
+    eventually(lambda: process.poll() is not None or process.terminate())
+    assert process.wait() == 128 + signal.SIGTERM
+    process.communicate()
+
+
+def test_a_process_whose_closing_hangs_ends_all_the_same(tmp_path: Path) -> None:
+    process = start(tmp_path, "stubborn", timeout=0.3)
+    process.terminate()
+    _, errors = process.communicate(timeout=10)
+    assert "closing took too long" in errors
+    assert process.returncode == 3
+
+
+def test_a_service_ends_with_its_parent(tmp_path: Path) -> None:
+    process = start(tmp_path, "orderly", parent=True)
+    output, _ = process.communicate(timeout=10)
+    assert output == "closing\nended\n"
+    assert process.returncode == 0
+
+
+def test_an_error_is_one_line_and_its_exit_code(tmp_path: Path) -> None:
+    process = start(tmp_path, "failing", ready=False)
+    output, errors = process.communicate(timeout=20)
+    assert output == ""
+    assert "hilrig: error: lab.toml: sim.step: unknown key\n" in errors
+    assert "Traceback" not in errors
+    assert process.returncode == 2
