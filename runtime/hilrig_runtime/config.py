@@ -128,6 +128,16 @@ class RecorderConfig(Section):
     """What a recording holds from before its session's start, s."""
     queue_entries: Annotated[int, Field(ge=1)] = 200_000
     """Messages that may wait for the disk; more are dropped and counted."""
+    rotate_mib: Annotated[int, Field(ge=0)] = 1024
+    """A session goes on in a next file when its file is this large, MiB; 0: never."""
+    rotate_min: NotNegative = 0.0
+    """The same when it is this old, min; 0: never."""
+    keep_days: NotNegative = 0.0
+    """Recordings older than this are deleted, but never a rig's last, days; 0: none."""
+    keep_gib: NotNegative = 0.0
+    """The oldest are deleted when all are larger than this, but never a rig's last, GiB; 0: none."""
+    min_free_mib: Annotated[int, Field(ge=0)] = 64
+    """With less space free on the disk recordings end, MiB."""
 
 
 class BusConfig(Section):

@@ -1,0 +1,360 @@
+"""The shelf of recordings: where each session's file stands, what is written into it besides messages, and how it ends.
+
+`<folder>/<lab>/<rig>/<session>.mcap`; when a session needs another file (the recorder was restarted, the file grew
+too large, the disk was full for a while) the next is `<session>.2.mcap`, and its metadata names the one before.
+"""
+
+import errno
+import platform
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from hilrig_recorder.channels import SCHEMA_VERSION
+from hilrig_recorder.disk import Disk
+from hilrig_recorder.recover import read_tail
+from hilrig_recorder.sessions import SECOND_NS, Recording, Sink
+from hilrig_recorder.writer import RunWriter, part_path
+from hilrig_runtime.clock import Clock
+from hilrig_runtime.config import RecorderConfig
+from hilrig_schemas import Event, RigConfig
+
+CHUNK_NS: Final = SECOND_NS
+"""A chunk is written at the latest when its first message is so old."""
+LOSS_NOTES: Final = 1000
+"""Places of losses noted in a file; all are counted in its summary."""
+_FREE_SPACE_PERIOD_NS: Final = SECOND_NS
+_MIB: Final = 1024 * 1024
+
+
+@dataclass(slots=True, eq=False)
+class _File:
+    recording: Recording
+    writer: RunWriter
+    number: int
+    opened_ns: int
+    configurations: set[int] = field(default_factory=set)
+    sources: set[tuple[str, int]] = field(default_factory=set)
+    notes: int = 0
+    failure: OSError | None = None
+
+
+def machine() -> str:
+    """This machine, for people: system, processor, Python."""
+    return f"{platform.system()} {platform.release()} {platform.machine()}, Python {platform.python_version()}"
+
+
+def iso(wall_ns: int) -> str:
+    """A wall clock time for people, UTC."""
+    return datetime.fromtimestamp(wall_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+class Files:
+    """The recordings' files; used from the recorder's thread alone. Implements `sessions.Shelf`."""
+
+    def __init__(
+        self,
+        lab: str,
+        config: RecorderConfig,
+        clock: Clock,
+        disk: Disk,
+        *,
+        source: str,
+        tell: Callable[[Event], None],
+        ask_config: Callable[[str], None],
+        give_up: Callable[[Recording], None],
+    ) -> None:
+        self.folder = config.folder / lab
+        self._lab = lab
+        self._config = config
+        self._clock = clock
+        self._disk = disk
+        self._identity = source
+        self._tell = tell
+        self._ask_config = ask_config
+        self._give_up = give_up
+        self._files: dict[Recording, _File] = {}
+        self._trouble: dict[str, str] = {}
+        self._space_due_ns = 0
+        self._full = False
+        self._bytes_closed = 0
+
+    @property
+    def trouble(self) -> str:
+        """What the operator should know now; empty: nothing."""
+        return "; ".join(self._trouble.values())
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes in files since the start."""
+        return self._bytes_closed + sum(file.writer.size for file in self._files.values())
+
+    # -- Shelf ------------------------------------------------------------------------------------------------------
+
+    def open(self, recording: Recording) -> Sink | None:
+        """See `Shelf.open`."""
+        folder = self.folder / recording.rig
+        number, previous = self._next_number(folder, recording.session)
+        if previous is not None:
+            tail = read_tail(previous if previous.exists() else part_path(previous))
+            if tail.end == "ended":
+                return None
+            recording.seen = tail.keys
+        if self._full:
+            return None
+        return self._open_file(recording, folder, number, previous)
+
+    def close(self, recording: Recording, end: str, reason: str) -> None:
+        """See `Shelf.close`."""
+        file = self._files.pop(recording, None)
+        if file is not None:
+            self._finish(file, end, reason)
+
+    def lost(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
+        """See `Shelf.lost`."""
+        file = self._files.get(recording)
+        if file is None or file.notes >= LOSS_NOTES:
+            return
+        file.notes += 1
+        note = {
+            "source": source,
+            "key": key,
+            "transport": str(transport),
+            "recorder": str(recorder),
+            "log_time": str(self._clock.wall_ns()),
+        }
+        self._note(file, "hilrig.loss", note)
+
+    def source(self, recording: Recording, source: str, incarnation: int) -> None:
+        """See `Shelf.source`."""
+        file = self._files.get(recording)
+        if file is None or (source, incarnation) in file.sources:
+            return
+        file.sources.add((source, incarnation))
+        self._note(file, "hilrig.source", {"source": source, "incarnation": str(incarnation)})
+        self._ask_config(recording.rig)
+
+    def refuse(self, what: str) -> None:
+        """See `Shelf.refuse`."""
+        self._tell(Event(severity=Event.WARNING, text=f"not recorded: {what}"))
+
+    # -- from the shell ---------------------------------------------------------------------------------------------
+
+    def configure(self, config: RigConfig) -> None:
+        """Put a rig's configuration into its open files; the same one only once."""
+        for file in self._files.values():
+            if file.recording.rig == config.rig and config.incarnation not in file.configurations:
+                file.configurations.add(config.incarnation)
+                self._write_config(file, config)
+
+    def unconfigured(self) -> set[str]:
+        """Rigs with an open file that has no configuration yet."""
+        return {file.recording.rig for file in self._files.values() if not file.configurations}
+
+    def fail(self, writer: RunWriter, error: OSError) -> None:
+        """End the file of `writer`, which the disk let down."""
+        for file in self._files.values():
+            if file.writer is writer:
+                self._on_failure(file, error)
+
+    def tick(self, now_ns: int) -> None:
+        """Write chunks that are old enough, begin next files, and end those that failed; some times a second."""
+        wall_ns = self._clock.wall_ns()
+        self._watch_space(now_ns)
+        for file in list(self._files.values()):
+            since_ns = file.writer.pending_since_ns
+            if file.failure is None and since_ns and not 0 <= wall_ns - since_ns < CHUNK_NS:
+                try:
+                    file.writer.close_chunk()
+                except OSError as error:
+                    self._on_failure(file, error)
+            if file.failure is not None:
+                self._end_failed(file, file.failure)
+            elif self._full:
+                self._end_failed(file, OSError(errno.ENOSPC, "the disk is nearly full"))
+            elif self._is_due(file, now_ns):
+                self._rotate(file)
+
+    def forget_trouble(self, about: str) -> None:
+        """A trouble is over."""
+        self._trouble.pop(about, None)
+
+    # -- files ------------------------------------------------------------------------------------------------------
+
+    def _next_number(self, folder: Path, session: str) -> tuple[int, Path | None]:
+        number, previous = 1, None
+        while True:
+            path = folder / file_name(session, number)
+            if not path.exists() and not part_path(path).exists():
+                return number, previous
+            number, previous = number + 1, path
+
+    def _open_file(self, recording: Recording, folder: Path, number: int, previous: Path | None) -> RunWriter | None:
+        file: _File | None = None
+
+        def on_failure(error: OSError) -> None:
+            if file is not None:
+                self._on_failure(file, error)
+
+        path = folder / file_name(recording.session, number)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            writer = RunWriter(path, on_failure=on_failure)
+        except OSError as error:
+            self._report(recording, f"{path}: can't be recorded: {error.strerror}")
+            return None
+        file = _File(recording, writer, number, self._clock.monotonic_ns())
+        self._files[recording] = file
+        self._disk.follow(writer)
+        self._note(
+            file,
+            "hilrig.session",
+            {
+                "session": recording.session,
+                "rig": recording.rig,
+                "lab": self._lab,
+                "controller": recording.controller,
+                "keeper": recording.keeper,
+                "start": iso(recording.start_wall_ns),
+                "start_wall_ns": str(recording.start_wall_ns),
+                "software_version": version("hilrig"),
+                "schema_version": SCHEMA_VERSION,
+                "machine": machine(),
+                "recorder": self._identity,
+                "part": str(number),
+                "previous": previous.name if previous is not None else "",
+            },
+        )
+        self._ask_config(recording.rig)
+        self.forget_trouble(recording.rig)
+        return writer
+
+    def _write_config(self, file: _File, config: RigConfig) -> None:
+        values = {
+            "rig": config.rig,
+            "incarnation": str(config.incarnation),
+            "step_ns": str(config.step_ns),
+            "parameters_json": config.parameters_json,
+            "software_version": config.software_version,
+            "machine": config.machine,
+        }
+        self._note(file, "hilrig.config", values)
+        wall_ns = self._clock.wall_ns()
+        lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were in force.\n"
+        attachments = (
+            ("lab.toml", "application/toml", lab_toml),
+            (f"{config.rig}.urdf", "application/xml", config.urdf),
+        )
+        try:
+            for name, media_type, text in attachments:
+                file.writer.add_attachment(name, media_type, text.encode(), log_time=wall_ns)
+        except OSError as error:
+            self._on_failure(file, error)
+
+    def _note(self, file: _File, name: str, values: Mapping[str, str]) -> None:
+        try:
+            file.writer.add_metadata(name, values)
+        except OSError as error:
+            self._on_failure(file, error)
+
+    def _is_due(self, file: _File, now_ns: int) -> bool:
+        config = self._config
+        too_large = config.rotate_mib and file.writer.size >= config.rotate_mib * _MIB
+        too_long = config.rotate_min and now_ns - file.opened_ns >= config.rotate_min * 60 * SECOND_NS
+        return bool(too_large or too_long) and file.recording.end_wall_ns is None
+
+    def _rotate(self, file: _File) -> None:
+        recording = file.recording
+        folder = self.folder / recording.rig
+        number, previous = self._next_number(folder, recording.session)
+        writer = self._open_file(recording, folder, number, previous)
+        if writer is None:
+            # The old file goes on; the trouble was told.
+            self._files[recording] = file
+            file.opened_ns = self._clock.monotonic_ns()
+            return
+        recording.add = writer.add
+        self._finish(file, "continued", f"the session goes on in {writer.path.name}")
+        recording.tally = type(recording.tally)()
+        for source, incarnation in file.sources:
+            self.source(recording, source, incarnation)
+
+    def _finish(self, file: _File, end: str, reason: str) -> None:
+        writer, recording = file.writer, file.recording
+
+        def last_words() -> dict[str, dict[str, str]]:
+            tally = {name: str(value) for name, value in asdict(recording.tally).items()}
+            tally["lost_recorder"] = str(recording.tally.lost_recorder + writer.given_up)
+            return {
+                "hilrig.summary": {
+                    "end": end,
+                    "reason": reason,
+                    "end_wall_ns": str(recording.end_wall_ns or self._clock.wall_ns()),
+                    **tally,
+                    "messages": str(writer.message_count),
+                }
+            }
+
+        self._bytes_closed += writer.size
+        try:
+            writer.finish(last_words)
+        except OSError as error:
+            self._report(recording, f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}")
+            self._disk.abandon(writer)
+        else:
+            self._disk.publish(writer)
+
+    # -- trouble ----------------------------------------------------------------------------------------------------
+
+    def _on_failure(self, file: _File, error: OSError) -> None:
+        if file.failure is not None:
+            return
+        file.failure = error
+        recording = file.recording
+
+        def lose(channel_id: int, log_time: int, record: bytes) -> None:  # noqa: ARG001
+            recording.tally.lost_recorder += 1
+
+        recording.add = lose
+
+    def _end_failed(self, file: _File, error: OSError) -> None:
+        recording = file.recording
+        del self._files[recording]
+        end = "disk full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "write failed"
+        reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
+        self._finish(file, end, reason)
+        self._report(recording, reason)
+        self._give_up(recording)
+
+    def _report(self, recording: Recording, text: str) -> None:
+        if self._trouble.get(recording.rig) != text:
+            self._trouble[recording.rig] = text
+            event = Event(rig=recording.rig, session=recording.session, severity=Event.ERROR, text=text)
+            self._tell(event)
+
+    def _watch_space(self, now_ns: int) -> None:
+        if now_ns < self._space_due_ns:
+            return
+        self._space_due_ns = now_ns + _FREE_SPACE_PERIOD_NS
+        try:
+            free = shutil.disk_usage(self.folder).free
+        except OSError:
+            return
+        was_full, self._full = self._full, free < self._config.min_free_mib * _MIB
+        if self._full and not was_full:
+            text = (
+                f"{self.folder}: only {free // _MIB} MiB are free, {self._config.min_free_mib} are kept: no recording"
+            )
+            self._trouble[""] = text
+            self._tell(Event(severity=Event.ERROR, text=text))
+        elif was_full and not self._full:
+            self.forget_trouble("")
+
+
+def file_name(session: str, number: int) -> str:
+    """Name of a session's file; `number` counts from 1."""
+    return f"{session}.mcap" if number == 1 else f"{session}.{number}.mcap"

@@ -1,0 +1,273 @@
+"""Making a whole file of one that is not: every whole chunk is kept, indexed anew, and what is missing is stated.
+
+The original is not touched before the new file is safe on the disk under its name.
+"""
+
+import contextlib
+import mmap
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+
+from hilrig_recorder.scan import Chunk, Damage, DamagedError, Message, is_whole, open_chunk, scan
+from hilrig_recorder.writer import LIBRARY, PART_SUFFIX, RunWriter, lock_file
+from hilrig_runtime.errors import InputError, OperationError
+
+RECOVERING_SUFFIX: Final = ".recovering"
+TAIL_NS: Final = 15_000_000_000
+"""How far back from its end a file's messages are looked at when the next file of its session begins."""
+
+
+@dataclass(slots=True)
+class Recovery:
+    """What was saved, and what was not."""
+
+    source: Path
+    path: Path | None = None
+    """The new file; None: there was nothing to do, for the file is whole."""
+    messages: int = 0
+    chunks: int = 0
+    attachments: int = 0
+    metadata: int = 0
+    damaged_chunks: int = 0
+    """Chunks that are there but not whole."""
+    damaged_bytes: int = 0
+    """Bytes of the original that hold nothing whole: the torn end, and damage in between."""
+    orphans: int = 0
+    """Messages whose channel is not known any more."""
+    reasons: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """The end of a recording, whole or not."""
+
+    end: str
+    """How it ended, as its summary says; empty: it has none."""
+    keys: set[tuple[int, int, int]]
+    """Channel, sequence and publish time of its last messages."""
+    session: dict[str, str]
+    """What `hilrig.session` says of it."""
+
+
+def map_file(path: Path) -> memoryview:
+    """A file's bytes, without reading them all into memory.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                return memoryview(b"")
+            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise InputError(f"{path}: can't be read: {error.strerror}") from error
+
+
+def read_tail(path: Path) -> Tail:
+    """What the next file of a session must know of the one before.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    end, session = "", {}
+    chunks: list[Chunk] = []
+    keys: set[tuple[int, int, int]] = set()
+    for _, item in scan(map_file(path)):
+        if isinstance(item, Metadata):
+            if item.name == "hilrig.summary":
+                end = item.metadata.get("end", "")
+            elif item.name == "hilrig.session":
+                session = item.metadata
+        elif isinstance(item, Chunk):
+            chunks.append(item)
+    horizon = max((chunk.last_ns for chunk in chunks), default=0) - TAIL_NS
+    for chunk in chunks:
+        if chunk.last_ns >= horizon:
+            with contextlib.suppress(DamagedError):
+                for message in open_chunk(chunk):
+                    if isinstance(message, Message):
+                        keys.add((message.channel_id, message.sequence, message.publish_time))
+    return Tail(end, keys, session)
+
+
+def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: True) -> Recovery:
+    """Make a whole file at `path` of `source`, which stays as it is.
+
+    Args:
+        source: any MCAP file, also one that hilrig did not write; a whole one is left alone.
+        path: the new file; it must not exist.
+        go_on: asked between chunks; when it says no, what was made so far is removed.
+
+    Raises:
+        InputError: `source` can't be read, holds nothing of an MCAP file, or is being written just now.
+        OperationError: the new file can't be written, or `go_on` said no.
+    """
+    _refuse_open(source)
+    recovery = Recovery(source)
+    view = map_file(source)
+    if is_whole(view):
+        return recovery
+    if path.exists():
+        raise OperationError(f"{path}: exists; choose another name for what is recovered from {source.name}")
+    part = path.with_name(path.name + RECOVERING_SUFFIX)
+    part.unlink(missing_ok=True)
+    try:
+        _Copy(view, recovery).write(path, part, go_on)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OperationError(f"{path}: can't be written: {error.strerror}") from error
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    recovery.path = path
+    return recovery
+
+
+def _refuse_open(source: Path) -> None:
+    try:
+        with source.open("r+b") as file:
+            if not lock_file(file.fileno()):
+                raise InputError(f"{source}: is being written just now by a recorder")
+    except PermissionError:
+        # What can't be written can be read all the same, and nobody writes it.
+        return
+    except OSError as error:
+        raise InputError(f"{source}: can't be read: {error.strerror}") from error
+
+
+class _Copy:
+    def __init__(self, view: memoryview, recovery: Recovery) -> None:
+        self._view = view
+        self._recovery = recovery
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._declared: set[int] = set()
+        self._notes = {"lost_transport": 0, "lost_recorder": 0}
+        self._has_summary = False
+        self._last_ns = 0
+
+    def write(self, path: Path, part: Path, go_on: Callable[[], bool]) -> None:
+        header = next((item for _, item in scan(self._view[: 1 << 16]) if isinstance(item, Header)), None)
+        if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
+            raise InputError(f"{self._recovery.source}: holds nothing of an MCAP file")
+        ours = header is not None and header.library == LIBRARY
+        writer = RunWriter(
+            path,
+            part=part,
+            schemas=(),
+            channels=(),
+            profile=header.profile if header else "",
+            library=header.library if header else LIBRARY,
+        )
+        try:
+            self._copy(writer, ours, go_on)
+            writer.finish(lambda: self._last_words(ours))
+            if writer.given_up:
+                raise OperationError(f"{path}: can't be written: no space is left for it")
+            writer.publish()
+        except BaseException:
+            writer.discard()
+            raise
+
+    def _copy(self, writer: RunWriter, ours: bool, go_on: Callable[[], bool]) -> None:
+        recovery = self._recovery
+        for _, item in scan(self._view):
+            if isinstance(item, Chunk):
+                if not go_on():
+                    raise OperationError(f"{recovery.source}: recovering was interrupted; the file is as it was")
+                self._copy_chunk(writer, item)
+            elif isinstance(item, Message):
+                # A file of chunks has no messages beside them: that is a damaged record which looks like one.
+                if ours or recovery.chunks:
+                    recovery.damaged_bytes += len(item.record)
+                else:
+                    self._copy_message(writer, item)
+            elif isinstance(item, Damage):
+                recovery.damaged_bytes += item.length
+                recovery.reasons.append(f"{item.length} bytes at {item.offset}: {item.reason}")
+            elif isinstance(item, Schema | Channel):
+                self._declare(writer, item)
+            elif isinstance(item, Metadata):
+                self._copy_metadata(writer, item)
+            elif isinstance(item, Attachment):
+                recovery.attachments += 1
+                writer.add_attachment(
+                    item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
+                )
+
+    def _copy_chunk(self, writer: RunWriter, chunk: Chunk) -> None:
+        try:
+            for item in open_chunk(chunk):
+                if isinstance(item, Message):
+                    self._copy_message(writer, item)
+                else:
+                    self._declare(writer, item)
+        except DamagedError as damage:
+            self._recovery.damaged_chunks += 1
+            self._recovery.damaged_bytes += len(chunk.data)
+            self._recovery.reasons.append(f"chunk at {chunk.offset}: {damage}")
+            return
+        self._recovery.chunks += 1
+
+    def _copy_message(self, writer: RunWriter, message: Message) -> None:
+        if message.channel_id not in self._declared:
+            self._recovery.orphans += 1
+            return
+        writer.add(message.channel_id, message.log_time, message.record)
+        self._recovery.messages += 1
+        self._last_ns = max(self._last_ns, message.log_time)
+
+    def _declare(self, writer: RunWriter, item: Schema | Channel) -> None:
+        if isinstance(item, Schema):
+            if item.id not in self._schemas:
+                self._schemas[item.id] = item
+                writer.add_schema(item)
+            return
+        if item.id in self._declared or (item.schema_id and item.schema_id not in self._schemas):
+            return
+        self._declared.add(item.id)
+        writer.add_channel(item)
+
+    def _copy_metadata(self, writer: RunWriter, item: Metadata) -> None:
+        self._recovery.metadata += 1
+        self._has_summary |= item.name == "hilrig.summary"
+        if item.name == "hilrig.loss":
+            for name in self._notes:
+                self._notes[name] += int(item.metadata.get(name.removeprefix("lost_"), "0"))
+        writer.add_metadata(item.name, item.metadata)
+
+    def _last_words(self, ours: bool) -> dict[str, dict[str, str]]:
+        recovery = self._recovery
+        words = {
+            "hilrig.recovery": {
+                "from": recovery.source.name,
+                "messages": str(recovery.messages),
+                "chunks": str(recovery.chunks),
+                "damaged_chunks": str(recovery.damaged_chunks),
+                "damaged_bytes": str(recovery.damaged_bytes),
+                "orphans": str(recovery.orphans),
+                "software_version": version("hilrig"),
+            }
+        }
+        if ours and not self._has_summary:
+            words["hilrig.summary"] = {
+                "end": "recovered",
+                "reason": "the recorder did not finish this file; its last second may be missing",
+                "end_wall_ns": str(self._last_ns),
+                "messages": str(recovery.messages),
+                **{name: str(count) for name, count in self._notes.items()},
+            }
+        return words
+
+
+def recovered_path(source: Path) -> Path:
+    """Where what is recovered from a file goes: a `.part` gets its name, any other keeps its own beside it."""
+    if source.name.endswith(PART_SUFFIX):
+        return source.with_name(source.name.removesuffix(PART_SUFFIX))
+    return source.with_name(f"{source.stem}.recovered{source.suffix or '.mcap'}")
