@@ -7,6 +7,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+
 from labs import free_ports
 from waiting import eventually
 
