@@ -291,7 +291,7 @@ class Files:
             tally["lost_recorder"] = str(recording.tally.lost_recorder + writer.given_up)
             return {
                 "hilrig.summary": {
-                    "end": end,
+                    "ended": end,
                     "reason": reason,
                     "end_wall_ns": str(recording.end_wall_ns or self._clock.wall_ns()),
                     **tally,

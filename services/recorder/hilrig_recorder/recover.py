@@ -81,7 +81,7 @@ def read_tail(path: Path) -> Tail:
     for _, item in scan(map_file(path)):
         if isinstance(item, Metadata):
             if item.name == "hilrig.summary":
-                end = item.metadata.get("end", "")
+                end = item.metadata.get("ended", "")
             elif item.name == "hilrig.session":
                 session = item.metadata
         elif isinstance(item, Chunk):
@@ -257,7 +257,7 @@ class _Copy:
         }
         if ours and not self._has_summary:
             words["hilrig.summary"] = {
-                "end": "recovered",
+                "ended": "recovered",
                 "reason": "the recorder did not finish this file; its last second may be missing",
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),

@@ -1,0 +1,151 @@
+"""The recorder as a service, on a bus within this process: what other services sent is what the files hold."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from hilrig_recorder.service import run
+from hilrig_runtime.clock import SYSTEM_CLOCK
+from hilrig_runtime.config import LabConfig, RecorderConfig
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.service import Service
+from hilrig_schemas import RigConfig
+from hilrig_schemas.topics import CONFIG, LOG, Traffic
+from log_streams import FakeSource
+from waiting import eventually
+
+SESSION = "20260101T000000Z-rig1-abcd"
+
+
+class Lab:
+    """A recorder in a thread, and fake services that send to it."""
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        self.folder = folder
+        self.hub = MemoryHub()
+        self.bus = MemoryBus(self.hub)
+        self.config = LabConfig(recorder=RecorderConfig(folder=folder, **settings))
+
+    def send(self, source: FakeSource, *arguments: object) -> None:
+        service, instance = source.name.split("/")
+        publisher = self.bus.publisher(LOG.key("lab", service, instance), Traffic.RECORDING)
+        publisher.put(source.batch(*arguments).SerializeToString())
+
+    @contextmanager
+    def recorder(self, during: Callable[[Service], None] = lambda service: None) -> Iterator[Service]:
+        with Service("recorder", self.config, MemoryBus(self.hub)) as service:
+            errors: list[BaseException] = []
+
+            def body() -> None:
+                try:
+                    run(service)
+                except BaseException as error:  # handed to the test's thread
+                    errors.append(error)
+
+            thread = threading.Thread(target=body)
+            thread.start()
+            try:
+                eventually(lambda: errors or self.hub.tokens)
+                yield service
+            finally:
+                service.stop()
+                thread.join(10)
+            assert not thread.is_alive()
+            if errors:
+                raise errors[0]
+
+    def recordings(self) -> list[Path]:
+        return sorted(self.folder.rglob("*.mcap"))
+
+
+def metadata(path: Path) -> dict[str, dict[str, str]]:
+    with path.open("rb") as stream:
+        return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+
+
+def payloads(path: Path) -> list[tuple[str, int, int, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, message.sequence, message.publish_time, message.data)
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages()
+        ]
+
+
+def sent(*sources: FakeSource) -> list[tuple[str, int, int, bytes]]:
+    return [
+        (f"/{message.key.rpartition('/')[2]}", message.sequence, message.publish_ns, message.payload)
+        for source in sources
+        for message in source.sent
+    ]
+
+
+def now() -> int:
+    return SYSTEM_CLOCK.wall_ns()
+
+
+def test_a_session_becomes_a_file_with_every_byte_that_was_sent(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    config = RigConfig(rig="rig1", incarnation=1, step_ns=20_000_000, urdf="<robot/>", lab_toml="name = 'lab'\n")
+    lab.bus.serve(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
+    sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
+    with lab.recorder():
+        sim.state("rig1", now())
+        lab.send(sim)
+        edge.start("rig1", SESSION, now())
+        lab.send(edge)
+        part = tmp_path / "lab" / "rig1" / f"{SESSION}.mcap.part"
+        eventually(part.exists)
+        for _ in range(100):
+            sim.state("rig1", now(), SESSION)
+            edge.command("rig1", now(), SESSION)
+            lab.send(sim)
+            lab.send(edge)
+        edge.end("rig1", SESSION, now())
+        lab.send(edge)
+        sim.state("rig1", now())
+        lab.send(sim)
+        [path] = eventually(lab.recordings)
+        assert not part.exists()
+    assert sorted(payloads(path)) == sorted(sent(sim, edge))
+    found = metadata(path)
+    assert found["hilrig.session"]["session"] == SESSION
+    assert found["hilrig.session"]["controller"] == "192.0.2.7:40001"
+    assert found["hilrig.config"]["step_ns"] == "20000000"
+    assert found["hilrig.summary"]["ended"] == "ended"
+    assert found["hilrig.summary"]["reason"] == "the controller left"
+    assert found["hilrig.summary"]["lost_transport"] == found["hilrig.summary"]["lost_recorder"] == "0"
+    assert found["hilrig.summary"]["messages"] == "204"
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+        assert attachments == {"lab.toml": b"name = 'lab'\n", "rig1.urdf": b"<robot/>"}
+        steps = [state.step for _, _, _, state in reader.iter_decoded_messages(topics=["/state"])]
+        assert steps == list(range(1, 103))
+
+
+def test_a_recorder_that_is_stopped_finishes_its_files(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
+    with lab.recorder():
+        edge.start("rig1", SESSION, now())
+        sim.state("rig1", now(), SESSION)
+        lab.send(edge)
+        lab.send(sim)
+        eventually(lambda: list(tmp_path.rglob("*.part")))
+    [path] = lab.recordings()
+    assert metadata(path)["hilrig.summary"]["ended"] == "recorder stopped"
+    assert sorted(payloads(path)) == sorted(sent(sim, edge))
+
+
+def test_a_folder_that_cannot_be_written_is_named_at_the_start(tmp_path: Path) -> None:
+    folder = tmp_path / "file"
+    folder.write_text("in the way")
+    with pytest.raises(OperationError, match=r"file/lab: recordings can't be written there: Not a directory"):
+        with Lab(folder).recorder():
+            pass
