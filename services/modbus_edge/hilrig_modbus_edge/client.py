@@ -1,6 +1,6 @@
 """A connected controller as a device sees it: who it is, what it may do, and what it was last shown."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 
@@ -40,9 +40,6 @@ class Client:
     served: Served | None = None
     basis: Served | None = None
     """What it had been shown when its newest bytes came: they can't have been written knowing more."""
-    refusals: int = 0
-    """Writes refused since the last event about it."""
-    refusal_told_ns: int | None = field(default=None)
 
     def heard(self, now_ns: int) -> None:
         """Bytes came from it."""

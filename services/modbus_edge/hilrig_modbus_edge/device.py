@@ -18,6 +18,7 @@ from hilrig_modbus_edge.image import StateImage
 from hilrig_modbus_edge.lease import Lease
 from hilrig_modbus_edge.registers import Status, Table
 from hilrig_modbus_edge.session import Session, session_id
+from hilrig_modbus_edge.throttle import Throttle
 from hilrig_modbus_edge.watchdog import Watchdog, WatchdogState
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import EdgeConfig
@@ -107,6 +108,7 @@ class Device:
         self._outlet = outlet
         self._newest_state = newest_state
         self._state = StateImage()
+        self._throttle = Throttle(REFUSAL_PERIOD_NS)
         self._letters = random.SystemRandom() if letters is None else letters
         self._session_count = 0
         self._torque = bytearray(8)
@@ -136,6 +138,11 @@ class Device:
         # What a host was shown stays the basis of its next connection: a chain of one-shot commands is one loop.
         if len(self._hosts) > HOSTS_KEPT:
             self._hosts = {address: host for address, host in self._hosts.items() if host.connections}
+
+    def connection_refused(self, address: str, reason: str, times: int) -> None:
+        """A controller was not let in, `times` times since this was last said."""
+        text = f"{address} may not connect to {self.rig}: {reason}{_times(times)}"
+        self._emit(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason)
 
     def connections_of(self, host: str) -> int:
         """How many connections a host has."""
@@ -266,6 +273,11 @@ class Device:
         """Say the first word: no torque."""
         self._send_own_command()
 
+    @property
+    def has_state(self) -> bool:
+        """Whether a state has come, so that positions can be read."""
+        return self._look().arrival is not None
+
     def look(self) -> None:
         """See the newest state without showing it to anyone, so that what is said of the last one stays true."""
         self._look()
@@ -298,7 +310,7 @@ class Device:
             if not self.lease.take(client):
                 self._refuse(client, now_ns, "another controller holds the rig", ExcCodes.DEVICE_BUSY)
             self._open_session(client)
-            self._emit(Event.LEASE_GRANTED, Event.INFO, f"{client.address} holds {self.rig}", client)
+            self._emit(Event.LEASE_GRANTED, Event.INFO, f"{client.address} holds {self.rig}", client.address)
             self._last_writer = client.address
         was_watching = self.watchdog.fed_ns is not None
         if self.watchdog.feed(now_ns):
@@ -316,14 +328,10 @@ class Device:
             self._outlet.watch(deadline_ns)
 
     def _refuse(self, client: Client, now_ns: int, reason: str, code: ExcCodes) -> None:
-        client.refusals += 1
-        told_ns = client.refusal_told_ns
-        if told_ns is None or now_ns - told_ns >= REFUSAL_PERIOD_NS:
-            more = f" ({client.refusals} times)" if client.refusals > 1 else ""
-            client.refusals = 0
-            client.refusal_told_ns = now_ns
-            text = f"{client.address} may not write to {self.rig}: {reason}{more}"
-            self._emit(Event.LEASE_REFUSED, Event.WARNING, text, client, reason)
+        times = self._throttle.count(client, now_ns)
+        if times:
+            text = f"{client.address} may not write to {self.rig}: {reason}{_times(times)}"
+            self._emit(Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason)
         raise ModbusError(code)
 
     def _lose_lease(self, reason: str) -> None:
@@ -334,7 +342,9 @@ class Device:
             self.session.gone_ns = self._monotonic_ns()
         if not any(self._torque):
             self.watchdog.rest()
-        self._emit(Event.LEASE_LOST, Event.INFO, f"{holder.address} holds {self.rig} no more: {reason}", holder, reason)
+        self._emit(
+            Event.LEASE_LOST, Event.INFO, f"{holder.address} holds {self.rig} no more: {reason}", holder.address, reason
+        )
 
     def _open_session(self, client: Client) -> None:
         if self.session is not None and self.session.host == client.host.address:
@@ -490,11 +500,15 @@ class Device:
         session = "" if self.session is None else self.session.id
         return Event(rig=self.rig, session=session, kind=kind, severity=severity, text=text, step=self._state.step)
 
-    def _emit(self, kind: Event.Kind, severity: Event.Severity, text: str, client: Client, reason: str = "") -> None:
+    def _emit(self, kind: Event.Kind, severity: Event.Severity, text: str, controller: str, reason: str = "") -> None:
         event = self._event(kind, severity, text)
-        event.controller_data.controller = client.address
+        event.controller_data.controller = controller
         event.controller_data.reason = reason
         holder = self.lease.holder
-        if holder is not None and holder is not client:
+        if holder is not None and holder.address != controller:
             event.controller_data.holder = holder.address
         self._outlet.emit(event)
+
+
+def _times(count: int) -> str:
+    return f" ({count} times)" if count > 1 else ""

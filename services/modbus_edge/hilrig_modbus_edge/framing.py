@@ -35,7 +35,7 @@ class Split(NamedTuple):
     """Why the stream can't be trusted behind these requests, for people; empty: it can."""
 
 
-def split(data: bytes) -> Split:
+def split(data: bytes | bytearray) -> Split:
     """Take the complete requests out of `data`, in order."""
     requests: list[Request] = []
     start, size = 0, len(data)
@@ -46,7 +46,7 @@ def split(data: bytes) -> Split:
             break
         if end > size:
             return Split(requests, start, "")
-        requests.append(Request(transaction, unit, data[start + 7 : end]))
+        requests.append(Request(transaction, unit, bytes(data[start + 7 : end])))
         start = end
     return Split(requests, start, _malformed(data[start : start + 6]))
 
@@ -56,7 +56,7 @@ def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
     return HEADER.pack(transaction, 0, len(pdu) + 1, unit) + pdu
 
 
-def _malformed(header: bytes) -> str:
+def _malformed(header: bytes | bytearray) -> str:
     # Said as soon as the bytes are there: a sender that is out of step must not be waited for.
     if len(header) >= 4 and header[2:4] != b"\0\0":
         return f"protocol {int.from_bytes(header[2:4], 'big')} in the header; Modbus is 0"

@@ -1,0 +1,164 @@
+"""Between the devices and the bus: the edge service, on one asyncio loop that alone touches devices.
+
+States come on the bus's thread, which only keeps the newest of each rig; a device takes it when it is read. Commands
+and events leave at once. A tick every 20 ms does what can wait that long.
+"""
+
+import asyncio
+from functools import partial
+from typing import Final
+
+from hilrig_modbus_edge import traffic
+from hilrig_modbus_edge.device import Device, DeviceSettings
+from hilrig_modbus_edge.server import Limits, RigServer, bind
+from hilrig_runtime.rate import Tick
+from hilrig_runtime.service import Service
+from hilrig_schemas import Event, topics
+
+TICK_NS: Final = 20_000_000
+TRAFFIC_PERIOD_NS: Final = 200_000_000
+FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
+"""How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
+
+
+def run(service: Service) -> None:
+    """Serve Modbus until the service is told to stop.
+
+    Raises:
+        OperationError: a rig's address can't be had.
+    """
+    asyncio.run(Edge(service).run())
+
+
+class _Wire:
+    """A device's outlet: to the bus, to the log stream, and to the loop's timers."""
+
+    def __init__(self, edge: "Edge", rig: str) -> None:
+        service = edge.service
+        commands = service.sender(topics.COMMAND, rig)
+        self.send_command = commands.send
+        self.repeat_command = commands.repeat
+        self.traffic = service.sender(topics.TRAFFIC, rig, on_bus=False)
+        self._edge = edge
+        self._timer: asyncio.TimerHandle | None = None
+        self.device: Device
+
+    def emit(self, event: Event) -> None:
+        self._edge.service.emit(event)
+
+    def sessions_changed(self) -> None:
+        self._edge.state_sessions()
+
+    def watch(self, deadline_ns: int) -> None:
+        loop = asyncio.get_running_loop()
+        if self._timer is not None:
+            self._timer.cancel()
+        delay_ns = deadline_ns - self._edge.service.clock.monotonic_ns()
+        self._timer = loop.call_later(max(0, delay_ns) * 1e-9, self._on_deadline)
+
+    def _on_deadline(self) -> None:
+        self._timer = None
+        self.device.check(self._edge.service.clock.monotonic_ns())
+        # Writes that came meanwhile moved the deadline; they do not move the timer, for they are many.
+        deadline_ns = self.device.watchdog.deadline_ns
+        if deadline_ns is not None:
+            self.watch(deadline_ns)
+
+
+class Edge:
+    """All rigs of a lab."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        lab = service.lab
+        states = service.latest(topics.STATE)
+        settings = DeviceSettings.of(lab.edge)
+        self._wires: dict[str, _Wire] = {}
+        self._servers: list[RigServer] = []
+        for rig in lab.rigs:
+            wire = _Wire(self, rig.name)
+            wire.device = Device(rig.name, settings, service.clock, wire, partial(states.get, rig.name))
+            self._wires[rig.name] = wire
+            limits = Limits(
+                lab.edge.max_connections,
+                lab.edge.max_connections_per_host,
+                round(lab.edge.idle_timeout_s * 1e9),
+                rig.allow,
+            )
+            self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
+        service.counters.rigs = len(lab.rigs)
+        self._traffic_due_ns = 0
+
+    async def run(self) -> None:
+        """Listen, serve, and close in order."""
+        service, lab = self.service, self.service.lab
+        # Sockets listen before the first state is there: whoever connects early is served as soon as it can be done.
+        sockets = [bind(rig.name, lab.edge.host, lab.ports[rig.name]) for rig in lab.rigs]
+        self.state_sessions()
+        for server in self._servers:
+            server.device.begin()
+        try:
+            await self._first_states()
+            for server, listening in zip(self._servers, sockets, strict=True):
+                await server.listen(listening)
+            service.ready()
+            await self._tick()
+        finally:
+            self._close()
+            for listening in sockets:
+                listening.close()
+
+    def state_sessions(self) -> None:
+        """Tell the log stream which sessions are open."""
+        open_sessions = [wire.device.session for wire in self._wires.values() if wire.device.session is not None]
+        self.service.log.set_sessions([session.as_message() for session in open_sessions])
+
+    async def _first_states(self) -> None:
+        clock, stopping = self.service.clock, self.service.stopping
+        deadline_ns = clock.monotonic_ns() + FIRST_STATE_TIMEOUT_NS
+        while clock.monotonic_ns() < deadline_ns and not stopping.is_set():
+            if all(wire.device.has_state for wire in self._wires.values()):
+                return
+            self.service.beat(clock.monotonic_ns())
+            await asyncio.sleep(TICK_NS * 1e-9)
+
+    async def _tick(self) -> None:
+        service, counters = self.service, self.service.counters
+        monotonic_ns = service.clock.monotonic_ns
+        deadline_ns = monotonic_ns() + TICK_NS
+        while not service.stopping.is_set():
+            await asyncio.sleep((deadline_ns - monotonic_ns()) * 1e-9)
+            now_ns = monotonic_ns()
+            missed = max(0, (now_ns - deadline_ns) // TICK_NS)
+            counters.count_tick(Tick(deadline_ns, max(0, now_ns - deadline_ns), missed), TICK_NS)
+            deadline_ns += (missed + 1) * TICK_NS
+            self._do_due(now_ns)
+
+    def _do_due(self, now_ns: int) -> None:
+        for server in self._servers:
+            server.device.check(now_ns)
+            if server.connections:
+                server.device.look()
+                server.close_idle(now_ns)
+        traffic_due = now_ns >= self._traffic_due_ns
+        if traffic_due:
+            self._traffic_due_ns = now_ns + TRAFFIC_PERIOD_NS
+        for server in self._servers:
+            if server.notes and (traffic_due or len(server.notes) >= traffic.MOST):
+                self._send_traffic(server, now_ns)
+        self.service.beat(now_ns)
+
+    def _send_traffic(self, server: RigServer, now_ns: int) -> None:
+        notes, server.notes = server.notes, []
+        rig = server.device.rig
+        message = traffic.batch(rig, notes, now_ns, self.service.clock.wall_ns())
+        self._wires[rig].traffic.send(message)
+
+    def _close(self) -> None:
+        now_ns = self.service.clock.monotonic_ns()
+        for server in self._servers:
+            server.device.shut("the edge stops")
+            server.close("the edge stops")
+            if server.notes:
+                self._send_traffic(server, now_ns)
+        self.state_sessions()

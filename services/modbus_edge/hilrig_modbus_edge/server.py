@@ -1,0 +1,256 @@
+"""Sockets: one listener a rig, one protocol object a connection, every request answered in order.
+
+pymodbus's own server answers only the first of several requests in one segment and has no limits, so this one takes
+the bytes itself. A connection handles a few requests and then lets its neighbours have their turn; one that does not
+read its answers is not read from either.
+"""
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from ipaddress import IPv4Network, IPv6Network, ip_address
+from typing import Final
+
+from pymodbus.constants import ExcCodes
+
+from hilrig_modbus_edge.client import Client
+from hilrig_modbus_edge.device import Device
+from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, Request, split
+from hilrig_modbus_edge.pdu import answer, exception
+from hilrig_modbus_edge.registers import UNIT_IDS
+from hilrig_modbus_edge.throttle import Throttle
+from hilrig_modbus_edge.traffic import Note
+from hilrig_runtime.clock import Clock
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.health import Counters
+
+BUFFER_BYTES: Final = 2048
+"""What a connection reads at once: several of the longest requests, and few enough to be soon done with."""
+SLICE: Final = 16
+"""Requests of one connection before the others have their turn; the TCP guide's limit of transactions, too."""
+BACKLOG: Final = 128
+REFUSAL_PERIOD_NS: Final = 1_000_000_000
+_TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Who may connect, and how many."""
+
+    connections: int = 32
+    connections_per_host: int = 16
+    idle_ns: int = 60_000_000_000
+    """A connection without a request for so long is closed, ns; 0: never."""
+    allow: tuple[IPv4Network | IPv6Network, ...] = ()
+    """Networks that may connect; none: all."""
+
+
+class RigServer:
+    """The connections of one rig."""
+
+    def __init__(self, device: Device, limits: Limits, clock: Clock, counters: Counters) -> None:
+        self.device = device
+        self.limits = limits
+        self.counters = counters
+        self.notes: list[Note] = []
+        """Requests since they were last taken."""
+        self.connections: set[Connection] = set()
+        self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
+        self._throttle = Throttle(REFUSAL_PERIOD_NS)
+        self._servers: list[asyncio.Server] = []
+
+    async def listen(self, listening: socket.socket) -> None:
+        """Take connections from a socket that listens; what has connected already is served now."""
+        loop = asyncio.get_running_loop()
+        self._servers.append(await loop.create_server(lambda: Connection(self), sock=listening, backlog=BACKLOG))
+
+    def why_refused(self, host: str) -> str:
+        """Why a host may not connect now, for people; empty: it may."""
+        limits = self.limits
+        if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
+            return "its address is not in the rig's networks (allow in lab.toml)"
+        if len(self.connections) >= limits.connections:
+            return f"the rig has {limits.connections} connections already (edge.max_connections)"
+        if self.device.connections_of(host) >= limits.connections_per_host:
+            return f"its host has {limits.connections_per_host} connections already (edge.max_connections_per_host)"
+        return ""
+
+    def refuse(self, host: str, port: int, reason: str) -> None:
+        """Say that a connection was refused, once in a while."""
+        self.counters.refused += 1
+        times = self._throttle.count((host, reason), self.monotonic_ns())
+        if times:
+            self.device.connection_refused(f"{host}:{port}", reason, times)
+
+    def close_idle(self, now_ns: int) -> None:
+        """Close the connections that have asked for nothing for too long; ns, monotonic clock."""
+        if not self.limits.idle_ns:
+            return
+        for connection in list(self.connections):
+            if now_ns - connection.client.last_request_ns >= self.limits.idle_ns:
+                connection.close(f"idle for {self.limits.idle_ns / 1e9:g} s")
+
+    def close(self, reason: str) -> None:
+        """Stop listening and close every connection."""
+        for server in self._servers:
+            server.close()
+        for connection in list(self.connections):
+            connection.close(reason)
+
+
+class Connection(asyncio.BufferedProtocol):
+    """One controller's connection."""
+
+    client: Client
+    _transport: asyncio.Transport
+
+    def __init__(self, server: RigServer) -> None:
+        self._server = server
+        self._device = server.device
+        self._monotonic_ns = server.monotonic_ns
+        self._buffer = bytearray(BUFFER_BYTES)
+        self._view = memoryview(self._buffer)
+        self._filled = 0
+        self._waiting: list[Request] = []
+        self._arrived_ns = 0
+        self._malformed = ""
+        self._blocked = False
+        self._reason = ""
+
+    # -- called by asyncio
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """See `asyncio.BaseProtocol`."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        peer = transport.get_extra_info("peername")
+        # A peer that is gone already has no name.
+        host, port = peer[:2] if peer else ("", 0)
+        reason = self._server.why_refused(host) if peer else "gone"
+        if reason:
+            if peer:
+                self._server.refuse(host, port, reason)
+            transport.abort()
+            return
+        keep_alive(transport.get_extra_info("socket"))
+        self.client = self._device.connect(host, port)
+        self._server.connections.add(self)
+        self._server.counters.connections += 1
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """See `asyncio.BaseProtocol`."""
+        if self not in self._server.connections:
+            return
+        self._server.connections.remove(self)
+        self._server.counters.connections -= 1
+        broken = f"the connection broke: {exc}" if exc else "it closed the connection"
+        self._device.disconnect(self.client, self._reason or broken)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
+        """See `asyncio.BufferedProtocol`."""
+        return self._view[self._filled :]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """See `asyncio.BufferedProtocol`."""
+        now_ns = self._monotonic_ns()
+        filled = self._filled + nbytes
+        requests, used, malformed = split(self._buffer[:filled])
+        self._filled = filled - used
+        if self._filled:
+            self._buffer[: self._filled] = self._buffer[used:filled]
+        if requests:
+            self.client.heard(now_ns)
+        if len(requests) <= SLICE:
+            self._answer(requests, now_ns)
+            if malformed:
+                self._close_malformed(malformed)
+            return
+        self._waiting = requests
+        self._arrived_ns = now_ns
+        self._malformed = malformed
+        self._transport.pause_reading()
+        self._go_on()
+
+    def pause_writing(self) -> None:
+        """See `asyncio.BaseProtocol`."""
+        self._blocked = True
+        self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """See `asyncio.BaseProtocol`."""
+        self._blocked = False
+        self._go_on()
+
+    # -- inside
+
+    def close(self, reason: str) -> None:
+        """Close the connection and say why."""
+        self._reason = reason
+        self._transport.abort()
+
+    def _go_on(self) -> None:
+        if self._blocked or self._transport.is_closing():
+            return
+        if not self._waiting:
+            self._transport.resume_reading()
+            return
+        turn, self._waiting = self._waiting[:SLICE], self._waiting[SLICE:]
+        self._answer(turn, self._arrived_ns)
+        if not self._waiting and self._malformed:
+            self._close_malformed(self._malformed)
+        else:
+            asyncio.get_running_loop().call_soon(self._go_on)
+
+    def _answer(self, requests: list[Request], arrived_ns: int) -> None:
+        if not requests:
+            return
+        server, device, client = self._server, self._device, self.client
+        note = server.notes.append
+        answers = []
+        for transaction, unit, pdu in requests:
+            known = unit in UNIT_IDS
+            reply = answer(device, client, pdu, arrived_ns) if known else exception(pdu[0], _TARGET_SILENT)
+            answers.append(HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply)
+            note(Note(pdu, arrived_ns, self._monotonic_ns(), reply[1] if reply[0] & 0x80 else 0, client.address))
+        server.counters.requests += len(requests)
+        self._transport.write(b"".join(answers))
+
+    def _close_malformed(self, why: str) -> None:
+        self._server.counters.malformed += 1
+        logger.warning("rig %s: %s sent no Modbus: %s", self._device.rig, self.client.address, why)
+        self._reason = f"it sent no Modbus: {why}"
+        # Not aborted: the answers to what was good before go out.
+        self._transport.close()
+
+
+def bind(rig: str, host: str, port: int) -> socket.socket:
+    """A socket that listens for a rig's controllers.
+
+    Raises:
+        OperationError: the address can't be had; it names the rig, the address, and what to do.
+    """
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address[:2], family=family, backlog=BACKLOG)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OperationError(
+            f"rig {rig!r} can't listen on {host}:{port}: {reason}; stop what listens there, or choose another "
+            f"edge.first_port, or a port for the rig, in lab.toml"
+        ) from error
+
+
+def keep_alive(connected: socket.socket) -> None:
+    """Let the system find out within some 10 s that a peer is gone without a word."""
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    # The names that a system does not have it does not need: macOS says TCP_KEEPALIVE for TCP_KEEPIDLE.
+    for name, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPALIVE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
+        if hasattr(socket, name):
+            connected.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+assert BUFFER_BYTES > MAX_FRAME
