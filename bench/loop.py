@@ -21,7 +21,7 @@ from typing import Any
 import harness
 from harness import Report, build_c, percentile, progress
 
-from hilrig_cli.demo import free_port
+from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import running_lab
 from hilrig_runtime.config import BusConfig, load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
@@ -88,7 +88,7 @@ def rig_loop(client: Path, step_ms: float, seconds: float) -> tuple[dict[str, An
     """Latency report of one session against the whole lab, and the controller's own figures."""
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "lab.toml"
-        port, bus_port = free_port(5020), free_port(7447, 3)
+        port, bus_port = free_ports(5020), free_ports(7447, 3)
         config.write_text(
             f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
             f'[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = "{folder}"\n'
@@ -110,7 +110,7 @@ def run_client(client: Path, port: int, seconds: float) -> dict[str, Any]:
 
 
 def modbus_round_trip(client: Path, server: Path, seconds: float) -> dict[str, Any]:
-    port = free_port(5920)
+    port = free_ports(5920)
     with subprocess.Popen([str(server), str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -122,7 +122,7 @@ def modbus_round_trip(client: Path, server: Path, seconds: float) -> dict[str, A
 
 def zenoh_round_trip(rounds: int) -> tuple[float, float]:
     """p50 and p99 of a message to another process and back over zenoh, sent every 20 ms, µs."""
-    config = BusConfig(first_port=free_port(7547, 3))
+    config = BusConfig(first_port=free_ports(7547, 3))
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=echo_over_zenoh, args=(config, theirs), daemon=True)

@@ -1,39 +1,144 @@
-"""What `hilrig demo` does: lab up, controller on, lab down; then the recording's latency, picture and plot."""
+"""What `hilrig demo` does: lab up, controller on, lab down; then latency, verification, picture and plot of the run."""
 
 import importlib.util
+import json
+import shutil
 import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from hilrig_cli.lab import POLL_S, running_lab
+from hilrig_cli.supervisor import own_process_group
+from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.errors import OperationError
 
 CONTROLLER: Final = "pick_and_place.py"
 CONTROLLER_GRACE_S: Final = 15.0
 """What the controller may take beyond its duration, to start and to end, s."""
+LAB: Final = """# The lab of `hilrig demo`: one rig with the defaults, on ports that were free.
+name = "demo"
+
+[edge]
+first_port = {modbus_port}
+# The recording ends with the controller.
+session_grace_ms = 0
+
+[bus]
+first_port = {bus_port}
+
+[recorder]
+folder = {folder}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoRun:
+    """What a demo left behind."""
+
+    recording: Path
+    controller: dict[str, Any]
+    """What the controller said at its end; empty: it ended badly."""
+
+
+def run_demo(duration_s: float, out: Path, say: Callable[[str], None], tick: Callable[[float], None]) -> DemoRun:
+    """Run the lab with the example controller for `duration_s`; `tick` hears the share of it that has passed.
+
+    Raises:
+        OperationError: the folder can't be written, a service could not start, or nothing was recorded.
+    """
+    recordings = out / "recordings"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        # A demo's folder holds one demo.
+        shutil.rmtree(recordings, ignore_errors=True)
+        config = out / "lab.toml"
+        config.write_text(
+            LAB.format(
+                modbus_port=free_ports(5020), bus_port=free_ports(7447, 3), folder=json.dumps(str(recordings.resolve()))
+            )
+        )
+    except OSError as error:
+        raise OperationError(f"{out}: results can't be written there: {error.strerror}") from error
+    lab = load_lab(config)
+    stopping = threading.Event()
+    say("starting simulation, Modbus edge and recorder")
+    with running_lab(lab, config, say, stopping) as supervisor:
+        say(f"running for {duration_s:g} s: {CONTROLLER} over Modbus TCP at {lab.edge.host}:{_port(lab)}")
+        said = _run_controller(lab, config, duration_s, supervisor.poll, tick)
+    found = sorted(recordings.rglob("*.mcap"))
+    if not found:
+        raise OperationError(f"{recordings}: nothing was recorded: did the controller connect? It said: {said or 'nothing'}")
+    return DemoRun(found[-1], said)
+
+
+def _port(lab: LabConfig) -> int:
+    return lab.ports[lab.rigs[0].name]
+
+
+def _run_controller(
+    lab: LabConfig, config: Path, duration_s: float, poll: Callable[[], None], tick: Callable[[float], None]
+) -> dict[str, Any]:
+    command = [sys.executable, str(controller_path()), "--host", lab.edge.host, "--port", str(_port(lab))]
+    command += ["--duration", str(duration_s), "--scene", str(config), "--json"]
+    begin_s = time.monotonic()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **own_process_group()) as process:
+        try:
+            while process.poll() is None:
+                poll()
+                passed_s = time.monotonic() - begin_s
+                tick(min(1.0, passed_s / duration_s))
+                if passed_s > duration_s + CONTROLLER_GRACE_S:
+                    process.kill()
+                time.sleep(POLL_S)
+        except BaseException:
+            process.kill()
+            raise
+        output = process.stdout.read() if process.stdout is not None else ""
+    try:
+        said = json.loads(output)
+    except ValueError:
+        return {}
+    return said if isinstance(said, dict) and process.returncode == 0 else {}
 
 
 def controller_path() -> Path:
-    """The example controller: of this checkout, or as it was installed with the package."""
+    """The example controller: of this checkout, or as it was installed with the package.
+
+    Raises:
+        OperationError: this installation has none.
+    """
     beside = Path(__file__).parents[3] / "examples" / CONTROLLER
     if beside.exists():
         return beside
     spec = importlib.util.find_spec("hilrig_examples")
-    if spec is None or not spec.submodule_search_locations:
-        raise OperationError(f"the example controller {CONTROLLER} is not part of this installation")
-    return Path(next(iter(spec.submodule_search_locations))) / CONTROLLER
+    for folder in (spec.submodule_search_locations or []) if spec is not None else []:
+        if (path := Path(folder) / CONTROLLER).exists():
+            return path
+    raise OperationError(f"the example controller {CONTROLLER} is not part of this installation")
 
 
-def free_port(wanted: int, count: int = 1) -> int:
-    """`wanted` where it and the next ones are free on loopback, else the first of `count` that are."""
-    candidate = wanted
-    while True:
+def free_ports(wanted: int, count: int = 1) -> int:
+    """First of `count` neighbouring ports that are free on loopback, from `wanted` on."""
+    first = wanted
+    while not all(_is_free(port) for port in range(first, first + count)):
+        first += count
+    return first
+
+
+def _is_free(port: int) -> bool:
+    with closing(socket.socket()) as probe:
+        if sys.platform != "win32":
+            # As the services do: a port that only waits for its last connection to fade counts as free.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            for port in range(candidate, candidate + count):
-                with closing(socket.socket()) as probe:
-                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                    probe.bind(("127.0.0.1", port))
+            probe.bind(("127.0.0.1", port))
         except OSError:
-            candidate += count
-            continue
-        return candidate
+            return False
+    return True

@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -17,27 +17,32 @@ def demo(
 ) -> None:
     """Run the whole rig with the example controller, then measure, verify and draw what was recorded.
 
-    The controller, examples/pick_and_place.py, is another process that speaks Modbus TCP. Exit code 1: the loop never
-    closed.
+    The controller, examples/pick_and_place.py, is a process of its own that speaks Modbus TCP. Exit code 1: the loop
+    never closed, or the run could not be verified.
     """
+    from rich.console import Console
+    from rich.progress import Progress, TimeElapsedColumn
+
     from hilrig_cli.demo import run_demo
+    from hilrig_replay.latency import measure
+    from hilrig_replay.latency_plot import save_plot
+    from hilrig_replay.rerun_view import save_rrd
+    from hilrig_replay.run import open_run
 
-    result = run_demo(duration, out, progress=sys.stderr.isatty() and not as_json, quiet=as_json)
+    console = Console(stderr=True, quiet=as_json)
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress:
+        task = progress.add_task("controller", total=1.0)
+        result = run_demo(
+            duration,
+            out,
+            say=lambda line: console.print(f"hilrig: {line}", highlight=False),
+            tick=lambda share: progress.update(task, completed=share),
+        )
+    run = open_run(result.recording)
+    report = measure(run)
+    plot, rrd = out / "latency.png", out / "run.rrd"
+    save_plot(report, run, plot)
+    save_rrd(run, rrd)
     if as_json:
-        print(json.dumps(_as_object(result)))
-    else:
-        _print(result)
-    if not result.latency.samples:
-        raise typer.Exit(1)
-
-
-def _as_object(result: Any) -> dict[str, Any]:
-    return {
-        "recording": str(result.recording),
-        "rrd": str(result.rrd),
-        "plot": str(result.plot),
-        "latency": result.latency.as_dict(),
-    }
-
-
-def _print(result: Any) -> None: ...
+        print(json.dumps({"recording": str(result.recording), "rrd": str(rrd), "plot": str(plot), "latency": report.as_dict()}))
+    sys.exit(0)
