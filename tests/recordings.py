@@ -1,0 +1,330 @@
+"""Recordings with known content: a rig and a controller in virtual time, written with the stock MCAP writer.
+
+The simulation ticks on its own clock and the edge stamps with another one, years apart, as on two machines. What the
+controller does, and when, is scripted; so a test knows every stage of every loop without asking the code under test.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import Message
+from mcap.writer import CompressionType, Writer
+
+from hilrig_schemas import Event, JointState, ModbusRequest, ModbusTraffic, PartState, TorqueCommand
+from hilrig_schemas.topics import RECORDED
+
+START_WALL_NS = 1_767_225_600_000_000_000
+SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
+EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
+MS = 1_000_000
+CONTROLLER = "192.0.2.7:40001"
+
+URDF = """<robot name="arm">
+  <material name="steel"><color rgba="0.6 0.6 0.65 1"/></material>
+  <material name="orange"><color rgba="0.9 0.45 0.1 1"/></material>
+  <link name="base"><visual><origin xyz="0 0 0.06"/><geometry><cylinder radius="0.05" length="0.12"/></geometry>
+    <material name="steel"/></visual></link>
+  <link name="link1"><visual><origin xyz="0.15 0 0"/><geometry><box size="0.3 0.06 0.04"/></geometry>
+    <material name="orange"/></visual></link>
+  <link name="link2"><visual><origin xyz="0.15 0 0.04"/><geometry><box size="0.3 0.05 0.04"/></geometry>
+    <material name="orange"/></visual></link>
+  <link name="quill"><visual><origin xyz="0 0 0.11"/><geometry><cylinder radius="0.012" length="0.22"/></geometry>
+    <material name="steel"/></visual></link>
+  <link name="tool"><visual><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.02" length="0.02"/></geometry>
+    <material name="steel"/></visual></link>
+  <joint name="theta1" type="revolute"><parent link="base"/><child link="link1"/><origin xyz="0 0 0.139"/>
+    <axis xyz="0 0 1"/><limit lower="-2.4" upper="2.4" effort="30" velocity="10"/></joint>
+  <joint name="theta2" type="revolute"><parent link="link1"/><child link="link2"/><origin xyz="0.3 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-2.7" upper="2.7" effort="30" velocity="10"/></joint>
+  <joint name="d3" type="prismatic"><parent link="link2"/><child link="quill"/><origin xyz="0.3 0 0"/>
+    <axis xyz="0 0 -1"/><limit lower="0" upper="0.2" effort="30" velocity="2"/></joint>
+  <joint name="theta4" type="revolute"><parent link="quill"/><child link="tool"/>
+    <axis xyz="0 0 1"/><limit lower="-6.3" upper="6.3" effort="30" velocity="10"/></joint>
+</robot>
+"""
+
+
+@dataclass(frozen=True)
+class Script:
+    """What is recorded; times in ms unless the name says otherwise."""
+
+    seconds: float = 4.0
+    step_ms: float = 20.0
+    poll_ms: float = 5.0
+    """From one cycle of the controller to the next; 0: as fast as it can."""
+    delay_ms: float = 0.0
+    """What the controller takes between reading and writing."""
+    order: str = "read-compute-write"
+    """Or `write-read`: each cycle writes what it computed from the previous cycle's read, then reads and waits."""
+    network_ms: float = 0.4
+    """One way, controller to edge, and as much back."""
+    injected_state_ms: float = 0.0
+    injected_command_ms: float = 0.0
+    stalls: Mapping[int, float] = field(default_factory=dict)
+    """Step at whose start the simulation stands still, and for how long."""
+    edge_stalls: Mapping[float, float] = field(default_factory=dict)
+    """Time, s, at which the edge stands still, and for how long."""
+    delayed_ack_ms: float = 0.0
+    """What the request that follows a write at once waits for a delayed acknowledgement."""
+    lost_transport: int = 0
+    lost_recorder: int = 0
+    clock_steps: int = 0
+    controllers: bool = True
+    parts: bool = True
+    seed: int = 1
+
+
+def position(seconds: float) -> np.ndarray:
+    """Where the arm is: rad, rad, m, rad."""
+    t = seconds
+    return np.array([0.9 * np.sin(0.7 * t), 1.1 * np.sin(0.9 * t + 0.5), 0.1 - 0.1 * np.cos(1.3 * t), 0.8 * np.sin(t)])
+
+
+@dataclass
+class Made:
+    """One message on its way into the file."""
+
+    topic: str
+    publish_wall_ns: int
+    message: Message
+
+
+def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[Made]:
+    """The messages of a scripted run, in the order of publication."""
+    random = Random(script.seed)
+    step_ns = round(script.step_ms * MS)
+    ticks = _ticks(script, step_ns, random)
+    writes = list(_cycles(script, ticks, random)) if script.controllers else []
+    made: list[Made] = []
+    for write in writes:
+        command = write.command
+        command.rig, command.session, command.controller = rig, session, CONTROLLER
+        made.append(Made("command", command.sent_ns - EDGE_FROM_WALL_NS, command))
+    waiting = iter(writes)
+    following = next(waiting, None)
+    newest: _Write | None = None
+    sampled: dict[int, int] = {}
+    held = 0
+    parts = [PartState(name=f"part{n}", x=0.35, y=-0.15 + 0.1 * n, z=-0.04) for n in range(4)] if script.parts else []
+    for step, (tick_ns, lateness_ns, missed) in ticks.items():
+        seconds = tick_ns / 1e9
+        sampled[step] = tick_ns
+        fresh = None
+        while following is not None and following.arrives_ns <= tick_ns:
+            fresh = newest = following
+            following = next(waiting, None)
+        q, ahead = position(seconds), position(seconds + 1e-4)
+        state = JointState(rig=rig, session=session, incarnation=7, step=step)
+        state.sampled_ns = tick_ns + START_WALL_NS + SIM_FROM_WALL_NS
+        state.wall_ns = tick_ns + START_WALL_NS
+        state.lateness_ns, state.missed_steps = lateness_ns, missed
+        state.position.extend(q)
+        state.velocity.extend((ahead - q) / 1e-4)
+        state.effort.extend(newest.command.effort if newest else [0.0] * 4)
+        state.integration_error.extend([1e-12] * 4)
+        if newest:
+            state.command_seq, state.magnet = newest.command.seq, newest.command.magnet
+        if fresh and fresh.command.basis_step:
+            state.basis_step = fresh.command.basis_step
+            state.command_arrived_ns = fresh.arrives_ns + START_WALL_NS + SIM_FROM_WALL_NS
+            state.loop_latency_ns = tick_ns - sampled[fresh.command.basis_step]
+        if parts and (step - 1) % 50 == 0:
+            parts[held].x = 0.35 + 0.002 * (step // 50)
+            state.parts.extend(parts)
+        made.append(Made("state", state.wall_ns, state))
+        if missed:
+            text = f"{missed} steps missed"
+            event = Event(rig=rig, session=session, kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step)
+            event.wall_ns, event.source = state.wall_ns, "sim/1"
+            event.overrun_data.missed_steps = missed
+            made.append(Made("event", event.wall_ns, event))
+    for at_ns, kind, text in ((0, Event.SESSION_START, "took the rig"), (tick_ns, Event.SESSION_END, "left the rig")):
+        event = Event(rig=rig, session=session, kind=kind, severity=Event.INFO, text=f"{CONTROLLER} {text}")
+        event.wall_ns, event.source = START_WALL_NS + at_ns, "edge/1"
+        made.append(Made("event", event.wall_ns, event))
+    made.extend(_traffic(writes, rig))
+    return sorted(made, key=lambda one: one.publish_wall_ns)
+
+
+@dataclass
+class _Write:
+    command: TorqueCommand
+    arrives_ns: int
+    """At the simulation."""
+    read: tuple[int, int]
+    """Arrived and answered, of the read before it."""
+
+
+def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int, int, int]]:
+    ticks = {}
+    at_ns, step = 0, 1
+    while at_ns < script.seconds * 1e9:
+        late_ns = random.randrange(50_000, 150_000)
+        missed = 0
+        stall_ns = round(script.stalls.get(step, 0) * MS)
+        if stall_ns:
+            missed = (stall_ns + late_ns) // step_ns
+            at_ns += missed * step_ns
+            late_ns += stall_ns - missed * step_ns
+        ticks[step] = (at_ns + late_ns, late_ns + missed * step_ns, missed)
+        at_ns += step_ns
+        step += 1
+    return ticks
+
+
+def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Random) -> Iterator[_Write]:
+    """The controller's life on the true time, ns from the start, stamped by the edge's clock."""
+    network_ns, delay_ns = round(script.network_ms * MS), round(script.delay_ms * MS)
+    steps = list(ticks)
+    at_edge = np.array([ticks[step][0] + random.randrange(200_000, 300_000) for step in steps])
+    release = at_edge + round(script.injected_state_ms * MS)
+    free_ns = 0
+
+    def edge_free(at_ns: int) -> int:
+        """When the edge does what comes in at `at_ns`: later, while it stands still."""
+        for start_s, stall_ms in script.edge_stalls.items():
+            start_ns = round(start_s * 1e9)
+            if start_ns <= at_ns < start_ns + stall_ms * MS:
+                return start_ns + round(stall_ms * MS)
+        return at_ns
+
+    def stamp(true_ns: int) -> int:
+        return int(true_ns) + START_WALL_NS + EDGE_FROM_WALL_NS
+
+    begin_ns, seq = round(30 * MS), 0
+    seen: tuple[int, int] | None = None
+    while begin_ns < script.seconds * 1e9 - 100 * MS:
+        if script.order == "read-compute-write":
+            read_ns = edge_free(max(begin_ns + network_ns, free_ns))
+            seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
+            # A loop that reads right after it wrote waits for the acknowledgement of its write.
+            write_ns = read_ns + 2 * network_ns + delay_ns + random.randrange(50_000)
+        else:
+            write_ns = begin_ns + network_ns
+        write_ns = edge_free(write_ns)
+        sent_ns = write_ns + random.randrange(20_000, 60_000) + round(script.injected_command_ms * MS)
+        if seen is not None and seen[0] >= 0:
+            seq += 1
+            index, served_ns = seen
+            effort = 3 * np.sin(0.9 * seq / 50 + np.arange(4))
+            command = TorqueCommand(
+                seq=seq,
+                effort=effort,
+                magnet=(seq // 200) % 2 == 1,
+                basis_incarnation=7,
+                basis_step=steps[index],
+                state_arrived_ns=stamp(at_edge[index]),
+                state_served_ns=stamp(served_ns),
+                write_arrived_ns=stamp(write_ns),
+                sent_ns=stamp(sent_ns),
+                state_injected_ns=round(script.injected_state_ms * MS),
+                command_injected_ns=round(script.injected_command_ms * MS),
+                wall_ns=sent_ns + START_WALL_NS,
+            )
+            yield _Write(command, sent_ns + random.randrange(150_000, 250_000), (served_ns, write_ns))
+        free_ns = write_ns + 20_000 + round(script.delayed_ack_ms * MS)
+        done_ns = write_ns + network_ns
+        if script.order == "write-read":
+            read_ns = done_ns + network_ns
+            seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
+            done_ns = read_ns + network_ns + delay_ns
+        begin_ns = max(done_ns, begin_ns + round(script.poll_ms * MS))
+
+
+def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
+    batch = ModbusTraffic(rig=rig)
+    for write in writes:
+        command = write.command
+        for function, address, at_ns in ((3, 4, command.state_served_ns), (16, 0, command.write_arrived_ns)):
+            batch.requests.append(
+                ModbusRequest(
+                    function=function,
+                    address=address,
+                    count=4,
+                    arrived_ns=at_ns,
+                    answered_ns=at_ns + 15_000,
+                    controller=CONTROLLER,
+                )
+            )
+        if len(batch.requests) >= 20 or write is writes[-1]:
+            batch.closed_ns = command.sent_ns
+            batch.wall_ns = command.wall_ns
+            yield Made("traffic", batch.wall_ns, batch)
+            batch = ModbusTraffic(rig=rig)
+
+
+def write(
+    path: Path,
+    made: list[Made],
+    *,
+    script: Script = Script(),
+    metadata: Mapping[str, Mapping[str, str]] | None = None,
+    schema_version: str = "hilrig.v1",
+    compression: CompressionType = CompressionType.ZSTD,
+    session: str = "20260101T000000Z-rig1-abcd",
+    rig: str = "rig1",
+    finish: bool = True,
+) -> Path:
+    """Write messages as the recorder does; without `finish` the file has no end, as after a kill."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=64 * 1024, compression=compression)
+        writer.start()
+        channels = {}
+        for name, topic in RECORDED.items():
+            schema = writer.register_schema(topic.message.DESCRIPTOR.full_name, "protobuf", _descriptors(topic.message))
+            channels[name] = writer.register_channel(str(topic.channel), "protobuf", schema)
+        writer.add_metadata(
+            "hilrig.session",
+            {
+                "session": session,
+                "rig": rig,
+                "lab": "lab",
+                "controller": CONTROLLER if script.controllers else "",
+                "software_version": "0.1.0",
+                "machine": "test",
+                "schema_version": schema_version,
+                "start": "2026-01-01T00:00:00Z",
+            },
+        )
+        writer.add_metadata("hilrig.config", {"rig": rig, "step_ns": str(round(script.step_ms * MS))})
+        writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", URDF.encode())
+        sequences = dict.fromkeys(RECORDED, 0)
+        for one in made:
+            sequences[one.topic] += 1
+            writer.add_message(
+                channels[one.topic],
+                log_time=one.publish_wall_ns + 3 * MS,
+                publish_time=one.publish_wall_ns,
+                sequence=sequences[one.topic],
+                data=one.message.SerializeToString(),
+            )
+        if not finish:
+            writer.flush()
+            return path
+        summary = {
+            "ended": "session ended",
+            "lost_transport": str(script.lost_transport),
+            "lost_recorder": str(script.lost_recorder),
+            "overruns": str(len(script.stalls)),
+            "missed_steps": str(sum(one.message.missed_steps for one in made if isinstance(one.message, JointState))),
+            "clock_steps": str(script.clock_steps),
+        }
+        for name, values in {"hilrig.summary": summary, **(metadata or {})}.items():
+            writer.add_metadata(name, dict(values))
+        writer.finish()
+    return path
+
+
+def record(path: Path, script: Script = Script()) -> Path:
+    """Make a scripted run and write it."""
+    return write(path, make(script), script=script)
+
+
+def _descriptors(message: type[Message]) -> bytes:
+    files = FileDescriptorSet()
+    message.DESCRIPTOR.file.CopyToProto(files.file.add())
+    return files.SerializeToString()

@@ -1,0 +1,116 @@
+"""`hilrig latency`: where the time goes between a state and the torque that answers it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+if TYPE_CHECKING:
+    from hilrig_replay.latency import LatencyReport, Statistics
+
+
+def latency(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings.", show_default=False),
+    ],
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Draw histogram, stages, tail and history (.png, .svg, .pdf); one run.", show_default=False),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the loop latency of recordings: six stages, percentiles, jitter, and why it is what it is.
+
+    Exit code 1: the recording (or one of them) is not fit for latency claims; the reasons are printed.
+    """
+    from hilrig_replay.latency import measure
+    from hilrig_replay.latency_plot import check_plot_path, save_plot
+    from hilrig_replay.run import open_run
+    from hilrig_replay.selection import recordings
+    from hilrig_runtime.errors import InputError
+
+    paths = recordings(runs)
+    if plot is not None:
+        if len(paths) > 1:
+            raise InputError(f"--plot draws one run, and {len(paths)} were given")
+        check_plot_path(plot)
+    reports = []
+    for path in paths:
+        run = open_run(path)
+        report = measure(run)
+        if plot is not None:
+            save_plot(report, run, plot)
+        # Of many runs only the figures are kept.
+        reports.append(replace(report, table=report.table[:0].copy()))
+    if as_json:
+        print(json.dumps(reports[0].as_dict() if len(reports) == 1 else {"runs": [each.as_dict() for each in reports]}))
+    elif len(reports) == 1:
+        print_report(reports[0])
+    else:
+        print_overview(reports)
+    if not all(each.fit for each in reports):
+        raise typer.Exit(1)
+
+
+COLUMNS = ("p50", "p95", "p99", "p999", "max", "mean", "std")
+
+
+def print_report(report: "LatencyReport") -> None:
+    """Print one run's latency as a table for people."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from hilrig_replay.latency_plot import STAGE_NAMES
+
+    console = Console()
+    title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column("ms", no_wrap=True)
+    for column in COLUMNS:
+        table.add_column(column.replace("p999", "p99.9"), justify="right")
+    if report.loop_ms is not None:
+        table.add_row("loop", *_figures(report.loop_ms), style="bold", end_section=True)
+        for stage, statistics in report.stages_ms.items():
+            table.add_row(f"  {STAGE_NAMES[stage]}", *_figures(statistics))
+        table.add_section()
+    table.add_row("tick lateness", *_figures(report.jitter_ms.tick_lateness))
+    console.print(table)
+    console.print(
+        f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
+        f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
+    )
+    for finding in report.findings:
+        console.print(Text(f"• {finding.text}"))
+    if report.fit:
+        console.print(Text("fit for latency claims", style="green"))
+    else:
+        console.print(Text("not fit for latency claims: " + "; ".join(report.reasons), style="yellow"))
+
+
+def print_overview(reports: "list[LatencyReport]") -> None:
+    """Print many runs, one line each."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"Loop latency of {len(reports)} runs, ms", title_justify="left", title_style="bold")
+    table.add_column("session", overflow="fold")
+    for column in ("samples", "p50", "p99", "p99.9", "max"):
+        table.add_column(column, justify="right")
+    table.add_column("fit")
+    table.add_column("why", overflow="fold")
+    for report in reports:
+        loop = report.loop_ms
+        figures = [f"{value:.2f}" for value in (loop.p50, loop.p99, loop.p999, loop.max)] if loop else ["–"] * 4
+        why = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
+        table.add_row(report.session, str(report.samples), *figures, "yes" if report.fit else "no", why)
+    Console().print(table)
+
+
+def _figures(statistics: "Statistics") -> list[str]:
+    return [f"{getattr(statistics, column):.3f}" for column in COLUMNS]

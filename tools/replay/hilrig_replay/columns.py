@@ -1,0 +1,311 @@
+"""Messages to rows: the fields of a recording as numpy structured arrays, decoded in bulk.
+
+Each table below is declared once, as fields with their numpy types; the row layout is the same for `struct`, which
+writes a message's fields into a buffer in one call, and for numpy, which reads the buffer as an array without a copy.
+
+Repeated doubles are the slow part of a protobuf message in Python. On the wire a packed `repeated double` is a length
+and the numbers' bytes, exactly as a `bytes` field: so messages are parsed here with a view of their type in which
+those fields are `bytes`, and the numbers go into the row as they are.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError, Message
+from numpy.typing import NDArray
+
+from hilrig_schemas import JointState, ModbusTraffic, TorqueCommand
+
+Rows: TypeAlias = NDArray[np.void]
+"""A structured array: one row a message, fields by name."""
+
+_STRUCT_CODES: Final = {
+    "<i8": "q",
+    "<u8": "Q",
+    "<f8": "d",
+    "<u4": "I",
+    "<u2": "H",
+    "|u1": "B",
+    "|b1": "?",
+}
+_VECTOR: Final = ("<f8", (4,))
+_FIRST_CAPACITY: Final = 1024
+
+STATE: Final = np.dtype(
+    [
+        ("step", "<u8"),
+        ("incarnation", "<u8"),
+        ("sampled_ns", "<i8"),
+        ("wall_ns", "<i8"),
+        ("lateness_ns", "<i8"),
+        ("position", *_VECTOR),
+        ("velocity", *_VECTOR),
+        ("effort", *_VECTOR),
+        ("integration_error", *_VECTOR),
+        ("external_force_z", "<f8"),
+        ("external_torque_z", "<f8"),
+        ("command_seq", "<u8"),
+        ("basis_step", "<u8"),
+        ("command_arrived_ns", "<i8"),
+        ("loop_latency_ns", "<i8"),
+        ("log_ns", "<i8"),
+        ("missed_steps", "<u4"),
+        ("sequence", "<u4"),
+        ("limit_flags", "<u2"),
+        ("session", "<u2"),
+        ("held_part", "<u2"),
+        ("magnet", "|b1"),
+        ("safe", "|b1"),
+    ]
+)
+"""One row a `JointState`, units as in joint_state.proto; `sequence` of the sender, `log_ns` arrival at the recorder
+(wall clock). `session` and `held_part` are codes of `Names`."""
+
+COMMAND: Final = np.dtype(
+    [
+        ("seq", "<u8"),
+        ("wall_ns", "<i8"),
+        ("effort", *_VECTOR),
+        ("basis_incarnation", "<u8"),
+        ("basis_step", "<u8"),
+        ("state_arrived_ns", "<i8"),
+        ("state_served_ns", "<i8"),
+        ("write_arrived_ns", "<i8"),
+        ("sent_ns", "<i8"),
+        ("state_injected_ns", "<i8"),
+        ("command_injected_ns", "<i8"),
+        ("log_ns", "<i8"),
+        ("sequence", "<u4"),
+        ("resets", "<u4"),
+        ("echo", "<u2"),
+        ("session", "<u2"),
+        ("controller", "<u2"),
+        ("magnet", "|b1"),
+        ("safe", "|b1"),
+    ]
+)
+"""One row a `TorqueCommand`, units as in torque_command.proto; `session` and `controller` are codes of `Names`."""
+
+TRAFFIC: Final = np.dtype(
+    [
+        ("wall_ns", "<i8"),
+        ("arrived_ns", "<i8"),
+        ("answered_ns", "<i8"),
+        ("address", "<u2"),
+        ("count", "<u2"),
+        ("controller", "<u2"),
+        ("function", "|u1"),
+        ("exception", "|u1"),
+    ]
+)
+"""One row a Modbus request, units as in modbus_traffic.proto; `wall_ns` is `arrived_ns` on the wall clock."""
+
+PART: Final = np.dtype(
+    [
+        ("step", "<u8"),
+        ("wall_ns", "<i8"),
+        ("x", "<f8"),
+        ("y", "<f8"),
+        ("z", "<f8"),
+        ("yaw", "<f8"),
+        ("part", "<u2"),
+        ("held", "|b1"),
+    ]
+)
+"""One row a `PartState` within a state: centre in the world, m, yaw in rad. `part` is a code of `Names`."""
+
+
+class Names:
+    """Texts that repeat in a recording, as numbers: code 0 is the empty text."""
+
+    def __init__(self) -> None:
+        self._codes: dict[str, int] = {"": 0}
+        self._texts: list[str] = [""]
+
+    def code(self, text: str) -> int:
+        """Number of a text; a new text gets the next one."""
+        code = self._codes.get(text)
+        if code is None:
+            code = self._codes[text] = len(self._texts)
+            self._texts.append(text)
+        return code
+
+    def __getitem__(self, code: int) -> str:
+        return self._texts[code]
+
+    def texts(self, codes: NDArray[np.integer]) -> NDArray[np.object_]:
+        """The texts of an array of codes, same shape, as Python strings."""
+        texts: NDArray[np.object_] = np.array(self._texts, dtype=object)
+        return np.asarray(texts[codes])
+
+
+class Table:
+    """Rows that grow at their end; storage doubles, so that appending costs the same however long it gets."""
+
+    def __init__(self, dtype: np.dtype[np.void], capacity: int = 0) -> None:
+        self._dtype = dtype
+        self._struct = struct.Struct("<" + "".join(_code(dtype[name]) for name in dtype.names or ()))
+        self._size = dtype.itemsize
+        self._buffer = bytearray(self._size * max(capacity, _FIRST_CAPACITY))
+        self._end = 0
+        self._pack = self._struct.pack_into
+
+    def append(self, *fields: Any) -> None:
+        """Add a row: its fields in order, a vector as its bytes."""
+        if self._end == len(self._buffer):
+            self._buffer.extend(bytes(self._end))
+        self._pack(self._buffer, self._end, *fields)
+        self._end += self._size
+
+    def __len__(self) -> int:
+        return self._end // self._size
+
+    def take(self) -> Rows:
+        """Give the rows away, shape (number of rows,), and begin anew."""
+        rows = np.frombuffer(self._buffer, self._dtype, count=len(self))
+        self._buffer = bytearray(self._size * _FIRST_CAPACITY)
+        self._end = 0
+        return rows
+
+
+def _code(dtype: np.dtype[Any]) -> str:
+    return f"{dtype.itemsize}s" if dtype.subdtype else _STRUCT_CODES[dtype.str]
+
+
+def _bulk_view(message: type[Message]) -> type[Any]:
+    """`message`'s type with each `repeated double` as `bytes`: the same bytes on the wire, read faster."""
+    described = descriptor_pb2.FileDescriptorProto()
+    message.DESCRIPTOR.file.CopyToProto(described)
+    package = described.package
+    described.package = f"{package}.bulk"
+    for part in described.message_type:
+        for field in part.field:
+            if field.HasField("type_name"):
+                field.type_name = field.type_name.replace(f".{package}.", f".{described.package}.")
+            if field.type == field.TYPE_DOUBLE and field.label == field.LABEL_REPEATED:
+                field.type, field.label = field.TYPE_BYTES, field.LABEL_OPTIONAL
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(described)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{described.package}.{message.DESCRIPTOR.name}"))
+
+
+_StateView: Final = _bulk_view(JointState)
+_CommandView: Final = _bulk_view(TorqueCommand)
+_NO_VECTOR: Final = bytes(32)
+
+Decode = Callable[[bytes, int, int], None]
+"""Adds one message to its table: its bytes, the sender's sequence, the time of arrival at the recorder (ns, wall)."""
+
+
+def state_decoder(states: Table, parts: Table, names: Names) -> Decode:
+    """A function that adds `JointState` messages to a `STATE` table, and the parts in them to a `PART` table."""
+    message = _StateView()
+    parse, add, add_part, code = message.ParseFromString, states.append, parts.append, names.code
+
+    def decode(payload: bytes, sequence: int, log_ns: int) -> None:
+        parse(payload)
+        held_part = message.held_part
+        add(
+            message.step,
+            message.incarnation,
+            message.sampled_ns,
+            message.wall_ns,
+            message.lateness_ns,
+            _vector(message.position),
+            _vector(message.velocity),
+            _vector(message.effort),
+            message.integration_error or _NO_VECTOR,
+            message.external_force_z,
+            message.external_torque_z,
+            message.command_seq,
+            message.basis_step,
+            message.command_arrived_ns,
+            message.loop_latency_ns,
+            log_ns,
+            message.missed_steps,
+            sequence,
+            message.limit_flags,
+            code(message.session),
+            code(held_part) if held_part else 0,
+            message.magnet,
+            message.safe,
+        )
+        for part in message.parts:
+            add_part(
+                message.step, message.wall_ns, part.x, part.y, part.z, part.yaw, code(part.name), part.name == held_part
+            )
+
+    return decode
+
+
+def command_decoder(commands: Table, names: Names) -> Decode:
+    """A function that adds `TorqueCommand` messages to a `COMMAND` table."""
+    message = _CommandView()
+    parse, add, code = message.ParseFromString, commands.append, names.code
+
+    def decode(payload: bytes, sequence: int, log_ns: int) -> None:
+        parse(payload)
+        add(
+            message.seq,
+            message.wall_ns,
+            _vector(message.effort),
+            message.basis_incarnation,
+            message.basis_step,
+            message.state_arrived_ns,
+            message.state_served_ns,
+            message.write_arrived_ns,
+            message.sent_ns,
+            message.state_injected_ns,
+            message.command_injected_ns,
+            log_ns,
+            sequence,
+            message.resets,
+            message.echo & 0xFFFF,
+            code(message.session),
+            code(message.controller),
+            message.magnet,
+            message.safe,
+        )
+
+    return decode
+
+
+def traffic_decoder(requests: Table, names: Names) -> Decode:
+    """A function that adds the requests of `ModbusTraffic` messages to a `TRAFFIC` table."""
+    message = ModbusTraffic()
+    parse, add, code = message.ParseFromString, requests.append, names.code
+
+    def decode(payload: bytes, sequence: int, log_ns: int) -> None:  # noqa: ARG001
+        parse(payload)
+        wall_from_monotonic = message.wall_ns - message.closed_ns
+        for request in message.requests:
+            arrived_ns = request.arrived_ns
+            add(
+                wall_from_monotonic + arrived_ns,
+                arrived_ns,
+                request.answered_ns,
+                request.address & 0xFFFF,
+                request.count & 0xFFFF,
+                code(request.controller),
+                request.function & 0xFF,
+                request.exception & 0xFF,
+            )
+
+    return decode
+
+
+def _vector(packed: bytes) -> bytes:
+    if len(packed) == 32:
+        return packed
+    if not packed:
+        # A vector that was never set: the message's sender had none.
+        return _NO_VECTOR
+    raise DecodeError(f"a vector of {len(packed) // 8} numbers where 4 are due")
+
+
+def joined(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
+    """One array out of several; shape (sum of their lengths,)."""
+    return np.concatenate(pieces) if pieces else np.empty(0, dtype)

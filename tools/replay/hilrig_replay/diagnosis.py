@@ -1,0 +1,277 @@
+"""Why a loop is as slow as it is, in words, each with its evidence.
+
+Every rule is a function from the evidence of a run to a finding, or None where it does not apply. They state what was
+measured, what it looks like, and what to do about it.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.columns import Rows
+from hilrig_replay.run import Run
+
+MS: Final = 1e6
+WINDOW_S: Final = 10.0
+WINDOWS: Final = 6
+"""What needs the content of messages looks at so many windows of a run, evenly spread, whatever its length."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that explains where the time goes."""
+
+    kind: str
+    text: str
+    evidence: dict[str, float]
+    """The figures that the text rests on, by name with the unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the rules look at; times in ns."""
+
+    run: Run
+    samples: NDArray[np.void]
+    """Shape (n,), fields as `latency.SAMPLE`."""
+    step_ns: int
+    lateness_ns: NDArray[np.int64]
+    """Of every tick, shape (number of states,)."""
+    stalls: tuple[tuple[int, int], ...]
+    """(time in the run, lateness) of each tick that was late by more than a step."""
+    write_ns: NDArray[np.int64]
+    """Arrival of every write at the edge, shape (number of commands,)."""
+    _windows: list[tuple[Rows, Rows, Rows]] = field(default_factory=list)
+
+    @property
+    def cycle_ns(self) -> float:
+        """From one write to the next, median; 0: there are not two."""
+        return float(np.median(np.diff(self.write_ns))) if len(self.write_ns) > 1 else 0.0
+
+    def windows(self) -> list[tuple[Rows, Rows, Rows]]:
+        """States, commands and requests of a few windows of the run, evenly spread."""
+        if not self._windows:
+            duration = self.run.duration_s
+            count = min(WINDOWS, max(1, round(duration / WINDOW_S)))
+            for start in np.linspace(0, max(duration - WINDOW_S, 0), count):
+                records = self.run.between(float(start), float(start) + WINDOW_S)
+                self._windows.append((records.states, records.commands, records.traffic))
+        return self._windows
+
+
+Rule = Callable[[Evidence], Finding | None]
+
+
+def diagnose(evidence: Evidence) -> Iterator[Finding]:
+    """Every finding that applies, the most telling first."""
+    for rule in RULES:
+        finding = rule(evidence)
+        if finding is not None:
+            yield finding
+
+
+def simulation_stall(evidence: Evidence) -> Finding | None:
+    """Ticks that came more than a step late."""
+    if not evidence.stalls:
+        return None
+    at_ns, worst_ns = max(evidence.stalls, key=lambda stall: stall[1])
+    return Finding(
+        "simulation_stall",
+        f"the simulation stood still {_times(len(evidence.stalls))}, longest {worst_ns / MS:.0f} ms at "
+        f"{at_ns / 1e9:.1f} s: its host was too busy, or suspended",
+        {"stalls": len(evidence.stalls), "longest_ms": worst_ns / MS, "at_s": at_ns / 1e9},
+    )
+
+
+def edge_stall(evidence: Evidence) -> Finding | None:
+    """Writes that waited in the edge before they left as commands."""
+    waits = evidence.samples["edge"]
+    if not len(waits):
+        return None
+    limit = max(5 * MS, 20 * float(np.median(waits)))
+    late = np.flatnonzero(waits > limit)
+    if not late.size:
+        return None
+    worst = int(late[np.argmax(waits[late])])
+    at_s = float(evidence.run.time_s(evidence.samples[worst : worst + 1])[0])
+    return Finding(
+        "edge_stall",
+        f"the Modbus edge stood still {_times(len(late))}, longest {waits[worst] / MS:.0f} ms at {at_s:.1f} s: "
+        "a write that had arrived waited there",
+        {"stalls": len(late), "longest_ms": float(waits[worst] / MS), "at_s": at_s},
+    )
+
+
+def injected_delay(evidence: Evidence) -> Finding | None:
+    """Delay that was configured."""
+    injected = evidence.samples["injected"]
+    if not len(injected) or not injected.any():
+        return None
+    mean = float(injected.mean() / MS)
+    return Finding(
+        "injected_delay",
+        f"{mean:.1f} ms of the loop were added on purpose (impairment), both ways together, up to "
+        f"{injected.max() / MS:.1f} ms",
+        {"mean_ms": mean, "max_ms": float(injected.max() / MS)},
+    )
+
+
+def slow_polling(evidence: Evidence) -> Finding | None:
+    """A controller that writes less often than the simulation steps."""
+    cycle, step = evidence.cycle_ns, evidence.step_ns
+    if cycle < 1.25 * step:
+        return None
+    return Finding(
+        "slow_polling",
+        f"the controller writes every {cycle / MS:.1f} ms, the simulation steps every {step / MS:g} ms: each torque is "
+        f"held for {cycle / step:.1f} steps, and in between nothing reacts",
+        {"cycle_ms": cycle / MS, "step_ms": step / MS},
+    )
+
+
+def slow_controller(evidence: Evidence) -> Finding | None:
+    """A controller that keeps a state for a long time before it writes."""
+    if not len(evidence.samples):
+        return None
+    held, loop = float(np.median(evidence.samples["controller"])), float(np.median(evidence.samples["loop"]))
+    if held < max(0.4 * loop, 5 * MS):
+        return None
+    cycle = evidence.cycle_ns
+    why = "it computes for so long, or its network is slow"
+    if cycle and held > 0.8 * cycle and cycle > 1.25 * evidence.step_ns:
+        why = "it computes for so long, or reads right after writing and waits before the next write"
+    return Finding(
+        "slow_controller",
+        f"{held / MS:.1f} ms of the loop's {loop / MS:.1f} ms pass between reading the positions and writing the "
+        f"torques: {why}",
+        {"controller_ms": held / MS, "loop_ms": loop / MS, "cycle_ms": cycle / MS},
+    )
+
+
+def beating(evidence: Evidence) -> Finding | None:
+    """Controller and simulation at nearly the same rate: the wait for the tick drifts through the whole step."""
+    samples, step = evidence.samples, evidence.step_ns
+    if len(samples) < 50:
+        return None
+    waits = samples["tick_wait"].astype(np.float64)
+    low, high = np.percentile(waits, (5, 95))
+    if high - low < 0.5 * step:
+        return None
+    # Towards the nearest: a wait that falls below zero comes back a step higher.
+    drift = (np.diff(waits) + step / 2) % step - step / 2
+    typical = float(np.median(drift))
+    if abs(typical) > 0.15 * step or np.median(np.abs(drift - typical)) > 0.05 * step or abs(typical) < 1e-4 * step:
+        return None
+    period_s = step / abs(typical) * evidence.cycle_ns / 1e9
+    return Finding(
+        "beating",
+        f"the controller's cycle ({evidence.cycle_ns / MS:.2f} ms) beats with the step ({step / MS:g} ms): the wait "
+        f"for the tick drifts from {low / MS:.1f} to {high / MS:.1f} ms, once in {period_s:.1f} s",
+        {"cycle_ms": evidence.cycle_ns / MS, "period_s": period_s, "low_ms": low / MS, "high_ms": high / MS},
+    )
+
+
+ACK_DELAYS_MS: Final = ((39.0, 46.0), (195.0, 215.0))
+"""After so long TCP acknowledges on its own: 40 ms on Linux, 200 ms on Windows and many controllers."""
+
+
+def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
+    """Requests that wait for an acknowledgement, because the client holds small segments back (Nagle's algorithm)."""
+    gaps = []
+    for _, _, requests in evidence.windows():
+        for controller in np.unique(requests["controller"]):
+            mine = requests[requests["controller"] == controller]
+            gaps.append((mine["arrived_ns"][1:] - mine["answered_ns"][:-1]) / MS)
+    if not gaps:
+        return None
+    gaps_ms = np.concatenate(gaps)
+    for low, high in ACK_DELAYS_MS:
+        waited = gaps_ms[(gaps_ms > low) & (gaps_ms < high)]
+        if len(waited) < max(10, 0.1 * len(gaps_ms)) or waited.std() > 2.0:
+            continue
+        share = len(waited) / len(gaps_ms)
+        return Finding(
+            "delayed_acknowledgement",
+            f"{share:.0%} of the requests came {np.median(waited):.1f} ms after the answer before them, the time after "
+            "which TCP acknowledges on its own: set TCP_NODELAY in the controller, and send each request in one piece",
+            {"share": share, "wait_ms": float(np.median(waited))},
+        )
+    return None
+
+
+def previous_poll(evidence: Evidence) -> Finding | None:
+    """Torques that follow the state of the poll before the one just served: a pipeline of one cycle."""
+    just_read: list[float] = []
+    before: list[float] = []
+    for states, commands, _ in evidence.windows():
+        residuals = _residuals(states, commands)
+        just_read.extend(residual for residual, _ in residuals)
+        before.extend(residual for _, residual in residuals)
+    if len(before) < 3:
+        return None
+    newest, previous = float(np.median(just_read)), float(np.median(before))
+    if previous > 0.05 or newest < 4 * max(previous, 1e-4):
+        return None
+    cycle = evidence.cycle_ns
+    return Finding(
+        "previous_poll",
+        f"the torques follow the positions of the poll before (unexplained: {previous:.1%}) and not those just read "
+        f"({newest:.0%}): the controller works a cycle behind, which adds {cycle / MS:.1f} ms to what is measured here",
+        {"unexplained_previous": previous, "unexplained_newest": newest, "added_ms": cycle / MS},
+    )
+
+
+def _residuals(states: Rows, commands: Rows, length: int = 80) -> list[tuple[float, float]]:
+    """What a linear law leaves unexplained of the torques, given the positions just read, and those of a poll before.
+
+    The law has the positions of two polls (so a derivative is in it) and a slow change in time, fitted anew over every
+    `length` commands. Positions are rounded as the registers round them: that noise is in the controller's torques,
+    and tells which poll they came from.
+    """
+    commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
+    if len(commands) < length or not len(states):
+        return []
+    at = np.minimum(np.searchsorted(states["step"], commands["basis_step"]), len(states) - 1)
+    known = states["step"][at] == commands["basis_step"]
+    commands, at = commands[known], at[known]
+    # Polls that saw the same state say nothing about which one was used.
+    fresh = np.concatenate(([True], np.diff(commands["basis_step"].astype(np.int64)) > 0))
+    commands, at = commands[fresh], at[fresh]
+    scale = np.degrees(np.array([1.0, 1.0, 0.0, 1.0])) + np.array([0.0, 0.0, 1000.0, 0.0])
+    read = np.round(states["position"][at] * scale, 2)
+    found = []
+    for start in range(2, len(commands) - length + 1, length):
+        rows = np.arange(start, start + length)
+        torques = commands["effort"][rows]
+        slow = np.vander(np.linspace(-1, 1, length), 4)
+        spread = ((torques - torques.mean(axis=0)) ** 2).sum()
+        if spread < 1e-9:
+            continue
+        left = []
+        for lag in (0, 1):
+            law = np.hstack(
+                (read[rows - lag] - read[rows - lag].mean(axis=0), read[rows - lag] - read[rows - lag - 1], slow)
+            )
+            fitted, *_ = np.linalg.lstsq(law, torques, rcond=None)
+            left.append(float(((torques - law @ fitted) ** 2).sum() / spread))
+        found.append((left[0], left[1]))
+    return found
+
+
+RULES: Final[tuple[Rule, ...]] = (
+    simulation_stall,
+    edge_stall,
+    injected_delay,
+    previous_poll,
+    slow_controller,
+    slow_polling,
+    beating,
+    delayed_acknowledgement,
+)
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

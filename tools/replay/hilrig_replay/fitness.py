@@ -1,0 +1,126 @@
+"""Whether a recording supports claims about latency; otherwise why not, in words."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.columns import Rows
+from hilrig_replay.run import Run
+
+ENOUGH_SAMPLES: Final = 500
+"""Below, p99 rests on fewer than five samples."""
+BACKLOG_NS: Final = 1_000_000_000
+"""A recording whose messages waited longer than this to be taken in is not trusted."""
+CLOCK_STEP_NS: Final = 10_000_000
+"""Wall clock against monotonic clock from one state to the next: slewing moves it by microseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Messages that are missing in a recording, count."""
+
+    transport: int
+    recorder: int
+
+
+class FitnessWatch:
+    """What speaks against a recording, collected block by block."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._lateness: list[NDArray[np.int64]] = []
+        self._writes: list[NDArray[np.int64]] = []
+        self.stalls: list[tuple[int, int]] = []
+        self._gaps = 0
+        self._missed = 0
+        self._delay_ns: tuple[int, int] | None = None
+        self._clock_steps = 0
+        self._last_state: Rows | None = None
+        self._last_command: Rows | None = None
+
+    def add(self, states: Rows, commands: Rows) -> None:
+        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`."""
+        if len(states):
+            self._add_states(states)
+        if len(commands):
+            self._writes.append(commands["write_arrived_ns"][~commands["safe"]])
+            self._gaps += _gaps(commands, self._last_command)
+            self._last_command = commands[-1:].copy()
+
+    def _add_states(self, states: Rows) -> None:
+        self._lateness.append(states["lateness_ns"].copy())
+        self._missed += int(states["missed_steps"].sum())
+        late = np.flatnonzero((states["missed_steps"] > 0) | (states["lateness_ns"] > self._run.step_ns))
+        times = self._run.time_ns(states[late])
+        self.stalls.extend(zip(times.tolist(), states["lateness_ns"][late].tolist(), strict=True))
+        delay = states["log_ns"] - states["wall_ns"]
+        low, high = int(delay.min()), int(delay.max())
+        if self._delay_ns is not None:
+            low, high = min(low, self._delay_ns[0]), max(high, self._delay_ns[1])
+        self._delay_ns = (low, high)
+        followed = states if self._last_state is None else np.concatenate((self._last_state, states))
+        same = np.diff(followed["incarnation"]) == 0
+        drift = np.abs(np.diff(followed["wall_ns"] - followed["sampled_ns"]))
+        self._clock_steps += int((drift[same] > CLOCK_STEP_NS).sum())
+        self._gaps += _gaps(states, self._last_state)
+        self._last_state = states[-1:].copy()
+
+    def lateness_ns(self) -> NDArray[np.int64]:
+        """Of every tick behind its deadline, shape (number of states,), ns."""
+        return _joined(self._lateness)
+
+    def write_ns(self) -> NDArray[np.int64]:
+        """Arrival of every write of a controller at the edge, shape (number of writes,), ns."""
+        return _joined(self._writes)
+
+    def lost(self) -> Lost:
+        """What is missing: as the recorder counted, or as the senders' numbers show, whichever is more."""
+        said = self._run.losses
+        transport = max(self._gaps - (said.recorder if said else 0), said.transport if said else 0)
+        return Lost(transport, said.recorder if said else 0)
+
+    def reasons(self, samples: Rows, stages: Sequence[str], unmatched: int) -> Iterator[str]:
+        """Why the recording is not fit, once all of it was taken in; none: it is."""
+        run, lost = self._run, self.lost()
+        overruns = max(len(self.stalls), run.number("summary", "overruns") or 0)
+        clock_steps = max(self._clock_steps, run.number("summary", "clock_steps") or 0)
+        if lost.transport:
+            yield f"{_count(lost.transport, 'message')} lost on the way to the recorder"
+        if lost.recorder:
+            yield f"{_count(lost.recorder, 'message')} lost in the recorder"
+        if run.losses is None:
+            yield "the recording does not say whether something was lost (it did not end in order)"
+        if overruns:
+            worst = max((late for _, late in self.stalls), default=0) / 1e6
+            steps = f"{self._missed} steps missed, at most {worst:.0f} ms late"
+            yield f"{_count(overruns, 'overrun')} of the simulation, {steps}"
+        if self._delay_ns is not None and self._delay_ns[1] - self._delay_ns[0] > BACKLOG_NS:
+            behind = (self._delay_ns[1] - self._delay_ns[0]) / 1e9
+            yield f"the recorder was behind by up to {behind:.1f} s"
+        if clock_steps:
+            yield f"the wall clock was set {clock_steps} times during the run"
+        if unmatched:
+            yield f"the commands of {_count(unmatched, 'sample')} are not in the recording"
+        negative = int(sum((samples[stage] < 0).sum() for stage in stages))
+        if negative:
+            yield f"{_count(negative, 'stage')} came out negative: the stamps contradict each other"
+        if len(samples) < ENOUGH_SAMPLES:
+            yield f"{_count(len(samples), 'sample')} only: {ENOUGH_SAMPLES} are needed for a 99th percentile"
+
+
+def _gaps(rows: Rows, last: Rows | None) -> int:
+    """Messages missing within one sender's numbers; where they begin anew, its process did."""
+    sequence = (rows if last is None else np.concatenate((last, rows)))["sequence"].astype(np.int64)
+    steps = np.diff(sequence)
+    return int((steps[steps > 1] - 1).sum())
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _joined(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate(pieces) if pieces else np.empty(0, np.int64)

@@ -1,0 +1,226 @@
+"""Loop latency out of a recording: samples with their six stages, their statistics, whether they can be trusted.
+
+A sample is a state at which a new command took effect. Its loop latency is t_k − t_b on the simulation's clock, b the
+state that the controller had last been served. Five stages are differences of two stamps of one clock; transport,
+both ways over the bus, is what remains. So the six add up exactly, and no clocks are compared (docs/timing.md).
+"""
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.columns import Rows
+from hilrig_replay.diagnosis import Evidence, Finding, diagnose
+from hilrig_replay.fitness import FitnessWatch, Lost
+from hilrig_replay.run import Run
+from hilrig_runtime.errors import InputError
+
+STAGES: Final = ("register_wait", "controller", "edge", "injected", "tick_wait", "transport")
+"""In the order in which a state's news goes round, `transport` last because it is the remainder."""
+
+SAMPLE: Final = np.dtype(
+    [
+        ("step", "<u8"),
+        ("incarnation", "<u8"),
+        ("sampled_ns", "<i8"),
+        ("wall_ns", "<i8"),
+        ("basis_step", "<u8"),
+        ("command_seq", "<u8"),
+        ("loop", "<i8"),
+        *((stage, "<i8") for stage in STAGES),
+        ("write_arrived_ns", "<i8"),
+        ("state_served_ns", "<i8"),
+    ]
+)
+"""One row a sample: `loop` and the stages in ns, `sampled_ns` on the simulation's clock, the two last on the edge's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """How a quantity is distributed; ms. Percentiles are interpolated between samples."""
+
+    p50: float
+    p95: float
+    p99: float
+    p999: float
+    max: float
+    mean: float
+    std: float
+
+    @classmethod
+    def of(cls, values_ns: NDArray[np.int64]) -> "Statistics":
+        """Statistics of an array of ns, shape (n,), n at least 1."""
+        p50, p95, p99, p999 = np.percentile(values_ns, (50, 95, 99, 99.9)) / 1e6
+        return cls(
+            p50=float(p50),
+            p95=float(p95),
+            p99=float(p99),
+            p999=float(p999),
+            max=float(values_ns.max() / 1e6),
+            mean=float(values_ns.mean() / 1e6),
+            std=float(values_ns.std() / 1e6),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Jitter:
+    """How far the loop strays; ms."""
+
+    loop_std: float
+    loop_p99_p1: float
+    """From the 1st to the 99th percentile of the loop latency."""
+    tick_lateness: Statistics
+    """Of the simulation's ticks behind their deadlines."""
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyReport:
+    """What `hilrig latency` says of one run."""
+
+    session: str
+    rig: str
+    controller: str
+    samples: int
+    step_ms: float
+    loop_ms: Statistics | None
+    """None: there are no samples."""
+    stages_ms: dict[str, Statistics]
+    jitter_ms: Jitter
+    lost: Lost
+    fit: bool
+    """Whether the recording supports claims about latency."""
+    reasons: tuple[str, ...]
+    """Why it is not fit; empty: it is."""
+    findings: tuple[Finding, ...]
+    """Why the loop took what it took, in words."""
+    table: NDArray[np.void] = field(repr=False, compare=False)
+    """The samples themselves, shape (samples,), fields as `SAMPLE`."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for JSON: everything but the samples themselves."""
+        plain = asdict(replace(self, table=self.table[:0]))
+        del plain["table"]
+        return plain
+
+
+class Matcher:
+    """Finds the command behind each sample, from blocks in which the one can come before or after the other."""
+
+    def __init__(self) -> None:
+        self.unmatched = 0
+        """Samples whose command is not in the recording, count; complete after `finish`."""
+        self._commands: list[Rows] = []
+        self._waiting: Rows | None = None
+        self._found: list[NDArray[np.void]] = []
+
+    def add(self, states: Rows, commands: Rows) -> None:
+        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`."""
+        effective = states[states["basis_step"] != 0]
+        old = self._waiting
+        samples = effective if old is None else np.concatenate((old, effective))
+        known = np.concatenate((*self._commands, commands))
+        rows, found = _join(samples, known)
+        self._found.append(_stages(samples[found], known[rows[found]]))
+        # What came with this block waits for one more; what has waited is not there.
+        missing = ~found
+        waited = 0 if old is None else len(old)
+        self.unmatched += int(missing[:waited].sum())
+        self._waiting = samples[waited:][missing[waited:]]
+        self._commands = [*self._commands[-1:], commands]
+
+    def finish(self) -> NDArray[np.void]:
+        """Every sample in the order of its state, shape (n,), fields as `SAMPLE`."""
+        if self._waiting is not None:
+            self.unmatched += len(self._waiting)
+            self._waiting = None
+        if not self._found:
+            return np.empty(0, SAMPLE)
+        samples = np.concatenate(self._found)
+        order = np.lexsort((samples["sampled_ns"], samples["incarnation"]))
+        return samples[order]
+
+
+def match(states: Rows, commands: Rows) -> NDArray[np.void]:
+    """The samples of a whole run, shape (n,), fields as `SAMPLE`."""
+    matcher = Matcher()
+    matcher.add(states, commands)
+    return matcher.finish()
+
+
+def _join(samples: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Row of each sample's command by (session, seq), and where there is one."""
+    if not len(commands):
+        return np.zeros(len(samples), np.intp), np.zeros(len(samples), np.bool_)
+    # A code has 16 bits, a sequence number far fewer than 48.
+    keys = (commands["session"].astype(np.uint64) << np.uint64(48)) | commands["seq"]
+    wanted = (samples["session"].astype(np.uint64) << np.uint64(48)) | samples["command_seq"]
+    order = np.argsort(keys, kind="stable")
+    at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    rows = order[at]
+    found = (keys[rows] == wanted) & (commands["basis_step"][rows] == samples["basis_step"])
+    return rows, found
+
+
+def _stages(states: Rows, commands: Rows) -> NDArray[np.void]:
+    """Samples of states and their commands, row by row; the table of docs/timing.md."""
+    samples = np.empty(len(states), SAMPLE)
+    for name in ("step", "incarnation", "sampled_ns", "wall_ns", "basis_step", "command_seq"):
+        samples[name] = states[name]
+    for name in ("write_arrived_ns", "state_served_ns"):
+        samples[name] = commands[name]
+    served, written = commands["state_served_ns"], commands["write_arrived_ns"]
+    state_injected, command_injected = commands["state_injected_ns"], commands["command_injected_ns"]
+    samples["loop"] = states["loop_latency_ns"]
+    samples["register_wait"] = served - commands["state_arrived_ns"] - state_injected
+    samples["controller"] = written - served
+    samples["edge"] = commands["sent_ns"] - written - command_injected
+    samples["injected"] = state_injected + command_injected
+    samples["tick_wait"] = states["sampled_ns"] - states["command_arrived_ns"]
+    samples["transport"] = samples["loop"] - sum(samples[stage] for stage in STAGES[:-1])
+    return samples
+
+
+def measure(run: Run) -> LatencyReport:
+    """Go through a run once, a block at a time: its samples, their statistics and the judgement.
+
+    Raises:
+        InputError: nothing was commanded in it, or the file is damaged.
+    """
+    if not run.file.counts["command"]:
+        raise InputError(
+            f"{run.path}: a recording without commands: no controller wrote in this session, so it has no loop latency"
+        )
+    matcher = Matcher()
+    watch = FitnessWatch(run)
+    for block in run.blocks(frozenset({"state", "command"})):
+        matcher.add(block.states, block.commands)
+        watch.add(block.states, block.commands)
+    samples = matcher.finish()
+    evidence = Evidence(
+        run=run,
+        samples=samples,
+        step_ns=run.step_ns,
+        lateness_ns=watch.lateness_ns(),
+        stalls=tuple(watch.stalls),
+        write_ns=watch.write_ns(),
+    )
+    reasons = tuple(watch.reasons(samples, STAGES, matcher.unmatched))
+    loop = Statistics.of(samples["loop"]) if len(samples) else None
+    low, high = np.percentile(samples["loop"], (1, 99)) if len(samples) else (0.0, 0.0)
+    return LatencyReport(
+        session=run.session,
+        rig=run.rig,
+        controller=run.controller,
+        samples=len(samples),
+        step_ms=run.step_ns / 1e6,
+        loop_ms=loop,
+        stages_ms={stage: Statistics.of(samples[stage]) for stage in STAGES} if len(samples) else {},
+        jitter_ms=Jitter(loop.std if loop else 0.0, float(high - low) / 1e6, Statistics.of(evidence.lateness_ns)),
+        lost=watch.lost(),
+        fit=not reasons,
+        reasons=reasons,
+        findings=tuple(diagnose(evidence)),
+        table=samples,
+    )

@@ -1,0 +1,186 @@
+"""The picture of a run's latency: histogram, stages, tail, and how it went over time."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hilrig_replay.latency import STAGES, LatencyReport
+from hilrig_replay.run import Run
+from hilrig_runtime.errors import InputError, OperationError
+
+FORMATS: Final = (".png", ".svg", ".pdf")
+STAGE_NAMES: Final = {
+    "register_wait": "register wait",
+    "controller": "controller",
+    "edge": "edge",
+    "injected": "injected",
+    "tick_wait": "tick wait",
+    "transport": "transport",
+}
+STAGE_COLORS: Final = {
+    "register_wait": "#4c78a8",
+    "controller": "#f58518",
+    "edge": "#54a24b",
+    "injected": "#b279a2",
+    "tick_wait": "#9ecae9",
+    "transport": "#e45756",
+}
+"""One colour a stage, the same in every plot and in the viewer."""
+
+_INK: Final = "#333333"
+_MARK: Final = "#d62728"
+_POINTS: Final = 20_000
+
+
+def check_plot_path(path: Path) -> None:
+    """Refuse a picture that can't be written, before the work is done.
+
+    Raises:
+        InputError: its ending names no format, or its folder is not there.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
+
+
+def save_plot(report: LatencyReport, run: Run, path: Path) -> None:
+    """Draw a run's latency into a file; its ending tells the format.
+
+    Args:
+        report: what was measured.
+        run: of which run.
+        path: `.png`, `.svg` or `.pdf`.
+
+    Raises:
+        InputError: there is nothing to draw, or the ending names no format.
+        OperationError: the file can't be written.
+    """
+    check_plot_path(path)
+    if report.loop_ms is None:
+        raise InputError(f"{run.path}: no latency samples, so there is nothing to draw")
+    figure = Figure(figsize=(11, 7), layout="constrained", dpi=110)
+    (histogram, stages), (tail, history) = figure.subplots(2, 2, width_ratios=(1.3, 1))
+    loop_ms = report.table["loop"] / 1e6
+    _histogram(histogram, loop_ms, report)
+    _stages(stages, report)
+    _tail(tail, loop_ms, report)
+    _history(history, run.time_s(report.table), loop_ms, report)
+    fitness = "fit for latency claims" if report.fit else f"not fit for latency claims: {report.reasons[0]}"
+    figure.suptitle(
+        f"Loop latency of {report.session}\n"
+        f"{report.samples} samples, step {report.step_ms:g} ms, controller {report.controller or '(none)'} · {fitness}",
+        fontsize=11,
+        color=_INK,
+    )
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+
+
+def _histogram(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
+    statistics, step = report.loop_ms, report.step_ms
+    assert statistics is not None
+    # Far outliers would squeeze everything else: they are counted at the edge, and the tail shows them.
+    limit = max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step)
+    edges = np.arange(0, limit + step / 80, step / 40)
+    axes.hist(np.minimum(loop_ms, limit), bins=edges.tolist(), color=STAGE_COLORS["register_wait"], log=True)
+    for multiple in np.arange(step, limit + step / 2, step):
+        axes.axvline(float(multiple), color="#bbbbbb", linewidth=0.8, zorder=0)
+    beyond = int((loop_ms > limit).sum())
+    marks = (("p50", statistics.p50), ("p95", statistics.p95), ("p99", statistics.p99), ("p99.9", statistics.p999))
+    for row, (name, value) in enumerate(marks):
+        axes.axvline(value, color=_MARK, linewidth=0.9, linestyle=(0, (4, 2)))
+        near_right = value > 0.75 * limit
+        axes.annotate(
+            f"{name} {value:.2f} ms",
+            (value, 0.97 - 0.07 * row),
+            xycoords=("data", "axes fraction"),
+            xytext=(-4 if near_right else 4, 0),
+            textcoords="offset points",
+            ha="right" if near_right else "left",
+            va="top",
+            fontsize=8,
+            color=_MARK,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
+        )
+    axes.set_xlim(0, limit)
+    axes.set_ylim(bottom=0.7)
+    more = f"; {beyond} beyond {limit:g} ms" if beyond else ""
+    _label(axes, f"Histogram (grid: steps of {step:g} ms{more})", "loop latency, ms", "samples")
+
+
+def _stages(axes: Axes, report: LatencyReport) -> None:
+    for row, stage in enumerate(STAGES):
+        statistics = report.stages_ms[stage]
+        axes.barh(row, statistics.p50, color=STAGE_COLORS[stage], height=0.6)
+        axes.plot([statistics.p50, statistics.p99], [row, row], color=_INK, linewidth=1.2)
+        axes.plot([statistics.p99], [row], marker="|", color=_INK, markersize=9)
+        axes.annotate(
+            f"{statistics.p50:.2f}",
+            (statistics.p99, row),
+            xytext=(5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            color=_INK,
+        )
+    axes.set_yticks(range(len(STAGES)), [STAGE_NAMES[stage] for stage in STAGES])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.15 * max(1e-3, *(report.stages_ms[stage].p99 for stage in STAGES)))
+    _label(axes, "Stages: bar to p50 (figure), line to p99", "ms", "")
+
+
+def _tail(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
+    ordered = np.sort(loop_ms)
+    share_above = 1 - np.arange(len(ordered)) / len(ordered)
+    keep = np.unique(np.concatenate((np.linspace(0, len(ordered) - 1, _POINTS), len(ordered) - 1 - np.arange(200))))
+    keep = keep[keep >= 0].astype(np.intp)
+    axes.step(ordered[keep], share_above[keep], where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
+    axes.set_yscale("log")
+    axes.grid(color="#e5e5e5", linewidth=0.6)
+    for share, name in ((0.5, "p50"), (0.05, "p95"), (0.01, "p99"), (0.001, "p99.9")):
+        if share >= share_above[-1]:
+            axes.axhline(share, color=_MARK, linewidth=0.6, linestyle=(0, (4, 2)))
+            axes.annotate(
+                name,
+                (0.995, share),
+                xycoords=("axes fraction", "data"),
+                ha="right",
+                va="bottom",
+                fontsize=8,
+                color=_MARK,
+            )
+    axes.set_xlim(left=max(0.0, float(ordered[0]) - 0.1 * report.step_ms))
+    _label(axes, "Tail (share of samples that took longer)", "loop latency, ms", "share")
+
+
+def _history(axes: Axes, time_s: NDArray[np.float64], loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
+    # The slowest sample of each stretch, so that thinning hides none.
+    stretch = -(-len(loop_ms) // _POINTS)
+    starts = np.arange(0, len(loop_ms), stretch)
+    axes.plot(
+        time_s[starts],
+        np.maximum.reduceat(loop_ms, starts),
+        linestyle="none",
+        marker=".",
+        markersize=2.5,
+        color=STAGE_COLORS["register_wait"],
+        rasterized=True,
+    )
+    axes.set_ylim(0, 1.1 * float(loop_ms.max()))
+    axes.axhline(report.step_ms, color="#bbbbbb", linewidth=0.8, zorder=0)
+    _label(axes, "Over time", "time in the run, s", "loop latency, ms")
+
+
+def _label(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=9, loc="left", color=_INK)
+    axes.set_xlabel(x, fontsize=8, color=_INK)
+    axes.set_ylabel(y, fontsize=8, color=_INK)
+    axes.tick_params(labelsize=8, colors=_INK)
+    axes.spines[["top", "right"]].set_visible(False)

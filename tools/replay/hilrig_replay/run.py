@@ -1,0 +1,332 @@
+"""A recording as arrays: `open_run(path)` for the commands, for notebooks, and for whatever reads a run.
+
+Opening reads what the file says of itself; the arrays are read when they are asked for. `blocks` gives a run piece by
+piece, so that what goes through it once needs the same memory for a minute and for a day; `between` reads a range.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from hilrig_replay.columns import (
+    COMMAND,
+    PART,
+    STATE,
+    TRAFFIC,
+    Names,
+    Rows,
+    Table,
+    command_decoder,
+    joined,
+    state_decoder,
+    traffic_decoder,
+)
+from hilrig_replay.recording_file import RecordingFile, damaged, open_recording
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import Event
+
+EVENT: Final = np.dtype(
+    [
+        ("wall_ns", "<i8"),
+        ("step", "<u8"),
+        ("kind", "O"),
+        ("severity", "O"),
+        ("text", "O"),
+        ("source", "O"),
+        ("message", "O"),
+    ]
+)
+"""One row an `Event`: when, simulation's step (0: not known), kind and severity by name, text, the message whole."""
+
+ALL: Final = frozenset({"state", "command", "event", "traffic"})
+BLOCK_ROWS: Final = 20_000
+_SLACK_NS: Final = 2_000_000_000
+"""A message arrives at the recorder at most so long after it was sent, as a rule; a range is read that much wider."""
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """A piece of a run; each array has one row a message, in its sender's order."""
+
+    states: Rows
+    """Shape (n,), fields as `columns.STATE`."""
+    commands: Rows
+    """Shape (n,), fields as `columns.COMMAND`; a repeated command is not recorded again."""
+    events: Rows
+    """Shape (n,), fields as `EVENT`."""
+    traffic: Rows
+    """Shape (n,), fields as `columns.TRAFFIC`: one row a Modbus request."""
+    parts: Rows
+    """Shape (n,), fields as `columns.PART`: where the scene's parts are; only rows in which the sim stated them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """What a recording says is not in it."""
+
+    transport: int
+    """Messages that never reached the recorder, count."""
+    recorder: int
+    """Messages that reached it and could not be written, count."""
+
+
+class Run:
+    """One recording; make it with `open_run`. Times of its rows are seconds from its first state (`time_s`)."""
+
+    def __init__(self, file: RecordingFile) -> None:
+        self.file = file
+        self.path = file.path
+        self.metadata: Mapping[str, Mapping[str, str]] = file.metadata
+        """As recorded: metadata records by name, then key; all are text."""
+        self.names = Names()
+        """Texts behind the codes in the arrays."""
+        self._epochs: dict[int, tuple[int, int]] = {}
+        first = next(iter(self.blocks(frozenset({"state"}), rows=1)), None)
+        if first is None:
+            raise InputError(
+                f"{self.path}: an empty recording: it holds no state of the arm "
+                f"({sum(file.counts.values())} other messages)"
+            )
+        self.start_wall_ns = int(first.states["wall_ns"][0])
+        """The first state on the wall clock, ns since 1970-01-01 UTC."""
+
+    # -- what it says of itself ------------------------------------------------------------------------------------
+
+    @property
+    def session(self) -> str:
+        """Id of the session; where the file does not say it, its name."""
+        return self._said("session", "session") or self.path.stem
+
+    @property
+    def rig(self) -> str:
+        """Name of the rig."""
+        return self._said("session", "rig") or "rig"
+
+    @property
+    def lab(self) -> str:
+        """Name of the lab; empty: the file does not say it."""
+        return self._said("session", "lab")
+
+    @property
+    def controller(self) -> str:
+        """Address of the controller, "host:port"; empty: recorded by hand."""
+        return self._said("session", "controller")
+
+    @property
+    def ended(self) -> str:
+        """How the recording ended; empty: the file does not say it."""
+        return self._said("summary", "ended")
+
+    @cached_property
+    def step_ns(self) -> int:
+        """Length of a step, ns: as configured, or where the file does not say it, as the states tell."""
+        said = self.number("config", "step_ns")
+        if said:
+            return said
+        states = next(iter(self.blocks(frozenset({"state"}), rows=1000))).states
+        steps = np.diff(states["step"].astype(np.int64))
+        durations = np.diff(states["sampled_ns"])[steps == 1]
+        return int(np.median(durations)) if durations.size else 20_000_000
+
+    @cached_property
+    def parameters(self) -> Mapping[str, Any]:
+        """The rig's part of the configuration as it was resolved; empty: the file does not say it."""
+        try:
+            said = json.loads(self._said("config", "parameters_json") or "{}")
+        except ValueError:
+            return {}
+        return said if isinstance(said, dict) else {}
+
+    @property
+    def urdf(self) -> str:
+        """The arm as URDF; empty: the recording has none."""
+        data = self.file.attachments.get(f"{self.rig}.urdf", b"")
+        if not data:
+            data = next((data for name, data in self.file.attachments.items() if name.endswith(".urdf")), b"")
+        return data.decode("utf-8", errors="replace") or self._said("config", "urdf")
+
+    @property
+    def losses(self) -> Losses | None:
+        """What the recorder counted as lost; None: the file does not say it."""
+        transport, recorder = self.number("summary", "lost_transport"), self.number("summary", "lost_recorder")
+        return None if transport is None or recorder is None else Losses(transport, recorder)
+
+    @property
+    def recovered(self) -> bool:
+        """Whether the file was saved from a tear: its end may be missing."""
+        return "recovered" in self.ended or "hilrig.recovered" in self.metadata
+
+    def number(self, record: str, key: str) -> int | None:
+        """A whole number out of the metadata record `hilrig.<record>`; None: it does not say one."""
+        try:
+            return int(self._said(record, key))
+        except ValueError:
+            return None
+
+    def _said(self, record: str, key: str) -> str:
+        return self.metadata.get(f"hilrig.{record}", {}).get(key, "")
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last as they arrived at the recorder, s."""
+        return (self.file.end_ns - self.file.start_ns) / 1e9
+
+    # -- arrays ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def states(self) -> Rows:
+        """Every state, shape (n,), fields as `columns.STATE`."""
+        return self._whole("state").states
+
+    @cached_property
+    def parts(self) -> Rows:
+        """Where the parts are, shape (n,), fields as `columns.PART`."""
+        return self._whole("state").parts
+
+    @cached_property
+    def commands(self) -> Rows:
+        """Every command, shape (n,), fields as `columns.COMMAND`."""
+        return self._whole("command").commands
+
+    @cached_property
+    def events(self) -> Rows:
+        """Every event, shape (n,), fields as `EVENT`."""
+        return self._whole("event").events
+
+    @cached_property
+    def traffic(self) -> Rows:
+        """Every Modbus request, shape (n,), fields as `columns.TRAFFIC`."""
+        return self._whole("traffic").traffic
+
+    def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL) -> Records:
+        """What was sent in a range of the run's time, `until_s` excluded; only that part of the file is read."""
+        low, high = (self.start_wall_ns + round(limit * 1e9) for limit in (from_s, until_s))
+        pieces = list(self.blocks(topics, from_ns=low, until_ns=high + _SLACK_NS))
+
+        def cut(rows: Rows) -> Rows:
+            return rows[(rows["wall_ns"] >= low) & (rows["wall_ns"] < high)]
+
+        whole = _joined(pieces)
+        return Records(*(cut(rows) for rows in _fields(whole)))
+
+    def blocks(
+        self,
+        topics: frozenset[str] = ALL,
+        *,
+        rows: int = BLOCK_ROWS,
+        from_ns: int | None = None,
+        until_ns: int | None = None,
+    ) -> Iterator[Records]:
+        """The run in pieces of about `rows` messages, in the order of the file.
+
+        Messages of different senders are beside each other as they arrived: a state's command can be in the block
+        before or after it. `from_ns` and `until_ns` limit the time of arrival at the recorder, wall clock.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        names = self.names
+        states, commands, traffic, parts = Table(STATE), Table(COMMAND), Table(TRAFFIC), Table(PART)
+        events: list[tuple[Any, ...]] = []
+        decoders = {
+            "state": state_decoder(states, parts, names),
+            "command": command_decoder(commands, names),
+            "event": lambda payload, *_: events.append(_event_row(payload)),
+            "traffic": traffic_decoder(traffic, names),
+        }
+
+        def take() -> Records:
+            rows_of_events = np.array(events, EVENT)
+            events.clear()
+            piece = Records(states.take(), commands.take(), rows_of_events, traffic.take(), parts.take())
+            self._note_epochs(piece.states)
+            return piece
+
+        count = 0
+        try:
+            for topic, sequence, log_ns, _, payload in self.file.messages(topics, from_ns=from_ns, until_ns=until_ns):
+                decoders[topic](payload, sequence, log_ns)
+                count += 1
+                if count >= rows:
+                    count = 0
+                    yield take()
+        except DecodeError as error:
+            raise damaged(self.path, f"a message can't be decoded: {error}") from error
+        if count:
+            yield take()
+
+    def _whole(self, topic: str) -> Records:
+        return _joined(list(self.blocks(frozenset({topic}))))
+
+    # -- time ------------------------------------------------------------------------------------------------------
+
+    def time_s(self, rows: Rows) -> NDArray[np.float64]:
+        """When the rows were sent, shape as `rows`: seconds from the run's first state.
+
+        States go by the simulation's monotonic clock, and across a restart of the simulation by the wall clock; all
+        else goes by the wall clock.
+        """
+        return self.time_ns(rows) / 1e9
+
+    def time_ns(self, rows: Rows) -> NDArray[np.int64]:
+        """As `time_s`, in whole ns."""
+        names = rows.dtype.names or ()
+        if "sampled_ns" not in names:
+            return np.asarray(rows["wall_ns"] - self.start_wall_ns)
+        times = rows["sampled_ns"].copy()
+        incarnations = rows["incarnation"]
+        for incarnation, (sampled_ns, wall_ns) in self._epochs.items():
+            offset = wall_ns - self.start_wall_ns - sampled_ns
+            times[incarnations == incarnation] += offset
+        return times
+
+    def _note_epochs(self, states: Rows) -> None:
+        if not len(states):
+            return
+        incarnations = states["incarnation"]
+        changes = np.flatnonzero(np.diff(incarnations) != 0) + 1
+        for at in (0, *changes.tolist()):
+            row = states[at]
+            self._epochs.setdefault(int(row["incarnation"]), (int(row["sampled_ns"]), int(row["wall_ns"])))
+
+
+def open_run(path: Path | str) -> Run:
+    """Open a recording; its arrays are read when they are asked for.
+
+    Raises:
+        InputError: there is no such file, it is no recording, it is empty, torn or damaged, or a newer hilrig wrote it.
+    """
+    return Run(open_recording(Path(path)))
+
+
+def _event_row(payload: bytes) -> tuple[Any, ...]:
+    event = Event.FromString(payload)
+    kind = _name(Event.Kind, event.kind)
+    severity = _name(Event.Severity, event.severity)
+    return (event.wall_ns, event.step, kind, severity, event.text, event.source, event)
+
+
+def _name(enum: Any, number: int) -> str:
+    try:
+        return str(enum.Name(number))
+    except ValueError:
+        # A kind that a later minor version added: still worth its line.
+        return str(number)
+
+
+def _fields(records: Records) -> tuple[Rows, Rows, Rows, Rows, Rows]:
+    return records.states, records.commands, records.events, records.traffic, records.parts
+
+
+def _joined(pieces: list[Records]) -> Records:
+    dtypes = (STATE, COMMAND, EVENT, TRAFFIC, PART)
+    return Records(
+        *(joined([_fields(piece)[column] for piece in pieces], dtype) for column, dtype in enumerate(dtypes))
+    )
