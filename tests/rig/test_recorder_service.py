@@ -1,7 +1,7 @@
 """The recorder as a service, on a bus within this process: what other services sent is what the files hold."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -38,7 +38,7 @@ class Lab:
         publisher.put(source.batch(*arguments).SerializeToString())
 
     @contextmanager
-    def recorder(self, during: Callable[[Service], None] = lambda service: None) -> Iterator[Service]:
+    def recorder(self) -> Iterator[Service]:
         with Service("recorder", self.config, MemoryBus(self.hub)) as service:
             errors: list[BaseException] = []
 
@@ -146,6 +146,8 @@ def test_a_recorder_that_is_stopped_finishes_its_files(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_named_at_the_start(tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.write_text("in the way")
-    with pytest.raises(OperationError, match=r"file/lab: recordings can't be written there: Not a directory"):
-        with Lab(folder).recorder():
-            pass
+    with (
+        pytest.raises(OperationError, match=r"file/lab: recordings can't be written there: Not a directory"),
+        Lab(folder).recorder(),
+    ):
+        pass

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from hilrig_cli.commands import check, demo, latency, services, up
+from hilrig_cli.commands import check, demo, latency, recover, runs, services, up
 from hilrig_runtime.lifecycle import run_main
 
 app = typer.Typer(
@@ -30,7 +30,9 @@ app.command(rich_help_panel=RUN)(check.check)
 app.command(rich_help_panel=SERVICES)(services.sim)
 app.command(rich_help_panel=SERVICES)(services.edge)
 app.command(rich_help_panel=SERVICES)(services.recorder)
+app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
+app.command(rich_help_panel=REVIEW)(recover.recover)
 
 
 def _version(wanted: bool) -> None:

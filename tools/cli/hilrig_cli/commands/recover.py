@@ -1,0 +1,61 @@
+"""`hilrig recover`: whole files of torn or damaged ones."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+if TYPE_CHECKING:
+    from hilrig_recorder.recover import Recovery
+
+
+def recover(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="MCAP files, also foreign ones.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The new file; for one FILE only.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make whole, indexed files of torn or damaged ones; the original stays until the new file is safe.
+
+    `RUN.mcap.part` becomes `RUN.mcap`, any other file gets a `.recovered.mcap` beside it. Exit code 1: something was
+    lost.
+    """
+    import json
+    from dataclasses import asdict
+
+    from hilrig_recorder.recover import recover as make_whole
+    from hilrig_recorder.recover import recovered_path
+    from hilrig_recorder.writer import PART_SUFFIX
+    from hilrig_runtime.errors import InputError
+
+    if output is not None and len(files) > 1:
+        raise InputError(f"--output names one file, but {len(files)} are to be recovered")
+    recoveries = []
+    for source in files:
+        recovery = make_whole(source, output or recovered_path(source))
+        if recovery.path is not None and output is None and source.name.endswith(PART_SUFFIX):
+            source.unlink()
+        recoveries.append(recovery)
+        if not as_json:
+            _print(recovery)
+    if as_json:
+        print(json.dumps([asdict(recovery) for recovery in recoveries], indent=2, default=str))
+    if any(recovery.damaged_bytes or recovery.orphans for recovery in recoveries):
+        raise typer.Exit(1)
+
+
+def _print(recovery: "Recovery") -> None:
+    if recovery.path is None:
+        print(f"{recovery.source}: whole; nothing to do")
+        return
+    print(f"{recovery.source} -> {recovery.path}: {recovery.messages} messages in {recovery.chunks} chunks saved")
+    if recovery.damaged_bytes or recovery.orphans:
+        print(
+            f"  not saved: {recovery.damaged_bytes} bytes, {recovery.damaged_chunks} damaged chunks, "
+            f"{recovery.orphans} messages of unknown channels"
+        )
+        for reason in recovery.reasons[:10]:
+            print(f"  {reason}")

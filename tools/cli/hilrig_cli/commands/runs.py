@@ -1,0 +1,193 @@
+"""`hilrig runs`: the recordings of a folder, with what matters of each."""
+
+import sys
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilrig_cli.options import AsJson, Config
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hilrig_replay.index import RunEntry
+
+
+WIDE = 130
+"""Columns of a terminal from which on everything is shown."""
+
+
+class SortKey(StrEnum):
+    """What the list is sorted by."""
+
+    START = "start"
+    RIG = "rig"
+    DURATION = "duration"
+    SIZE = "size"
+    P50 = "p50"
+    P99 = "p99"
+    LOST = "lost"
+
+
+def runs(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where the recordings are; default: the lab's recorder.folder.")
+    ] = None,
+    config: Config = None,
+    rig: Annotated[str, typer.Option(help="Only this rig's.")] = "",
+    controller: Annotated[str, typer.Option(help="Only controllers whose address begins so.")] = "",
+    since: Annotated[datetime | None, typer.Option(help="Only those begun at or after this time, UTC.")] = None,
+    until: Annotated[datetime | None, typer.Option(help="Only those begun before this time, UTC.")] = None,
+    fit: Annotated[
+        bool | None, typer.Option("--fit/--unfit", help="Only those whose latencies can, or can't, be relied on.")
+    ] = None,
+    sort: Annotated[SortKey, typer.Option(help="What to sort by; the largest or newest first.")] = SortKey.START,
+    reverse: Annotated[bool, typer.Option("--reverse", help="The smallest or oldest first.")] = False,
+    limit: Annotated[int, typer.Option(min=0, help="How many to show; 0: all.")] = 100,
+    loop: Annotated[bool, typer.Option("--loop/--no-loop", help="Show the loop's latency (read once a file).")] = True,
+    rebuild: Annotated[bool, typer.Option("--rebuild", help="Read every file again.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List recordings: duration, size, loop latency, losses, how each ended; unusable files with the reason."""
+    from hilrig_replay.index import RunIndex
+    from hilrig_runtime.config import load_lab
+
+    index = RunIndex(load_lab(config).recorder.folder if folder is None else folder)
+    entries = index.load(rebuild=rebuild)
+    entries = [
+        entry
+        for entry in entries
+        if (not rig or entry.rig == rig)
+        and (not controller or entry.controller.startswith(controller))
+        and (since is None or entry.start_wall_ns >= _wall_ns(since))
+        and (until is None or entry.start_wall_ns < _wall_ns(until))
+    ]
+    by_loop = sort in (SortKey.P50, SortKey.P99)
+    if fit is not None or by_loop:
+        entries = _measured(index.measure, entries)
+        entries = [entry for entry in entries if fit is None or entry.fit is fit]
+    entries.sort(key=_sort_key(sort), reverse=not reverse)
+    total = len(entries)
+    entries = entries[: limit or None]
+    if loop:
+        entries = _measured(index.measure, entries)
+    index.save()
+    if as_json:
+        _print_json(index.folder, entries, total)
+    else:
+        _print_table(index.folder, entries, total)
+
+
+def _wall_ns(time: datetime) -> int:
+    return int(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1e9)
+
+
+def _sort_key(sort: SortKey) -> "Callable[[RunEntry], Any]":
+    keys: dict[SortKey, Callable[[RunEntry], Any]] = {
+        SortKey.START: lambda entry: entry.start_wall_ns,
+        SortKey.RIG: lambda entry: (entry.rig, entry.start_wall_ns),
+        SortKey.DURATION: lambda entry: entry.duration_s,
+        SortKey.SIZE: lambda entry: entry.size,
+        SortKey.P50: lambda entry: entry.loop_p50_ms or 0.0,
+        SortKey.P99: lambda entry: entry.loop_p99_ms or 0.0,
+        SortKey.LOST: lambda entry: entry.lost_transport + entry.lost_recorder,
+    }
+    return keys[sort]
+
+
+def _measured(
+    measure: "Callable[[list[RunEntry], Callable[[int], None] | None], list[RunEntry]]", entries: "list[RunEntry]"
+) -> "list[RunEntry]":
+    waiting = sum(1 for entry in entries if not entry.measured)
+    if waiting < 5 or not sys.stderr.isatty():
+        return measure(entries, None)
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reading recordings", total=len(entries))
+        return measure(entries, lambda done: progress.update(task, completed=done))
+
+
+def _print_json(folder: Path, entries: "list[RunEntry]", total: int) -> None:
+    import json
+    from dataclasses import asdict
+
+    runs = []
+    for entry in entries:
+        values = asdict(entry)
+        del values["mtime_ns"], values["measured"]
+        values["path"] = str(folder / entry.path)
+        values["start"] = _date(entry.start_wall_ns, "%Y-%m-%dT%H:%M:%SZ")
+        runs.append(values)
+    print(json.dumps({"folder": str(folder), "total": total, "runs": runs}, indent=2))
+
+
+def _date(wall_ns: int, form: str) -> str:
+    return datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime(form) if wall_ns else ""
+
+
+def _print_table(folder: Path, entries: "list[RunEntry]", total: int) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console() if sys.stdout.isatty() else Console(width=200)
+    wide = console.width >= WIDE
+    table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
+    table.add_column("recording", min_width=20)
+    if wide:
+        table.add_column("rig", no_wrap=True)
+        table.add_column("begun (UTC)", no_wrap=True)
+    for column in ("duration", "size", "p50 ms", "p99 ms", "lost"):
+        table.add_column(column, justify="right", no_wrap=True)
+    if wide:
+        table.add_column("controller", no_wrap=True)
+        table.add_column("verified", no_wrap=True)
+    table.add_column("fit", no_wrap=True)
+    table.add_column("ended")
+    for entry in entries:
+        lost = entry.lost_transport + entry.lost_recorder
+        begun = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
+        table.add_row(
+            Path(entry.path).name.removesuffix(".mcap"),
+            *([entry.rig, begun] if wide else []),
+            _duration(entry.duration_s),
+            _size(entry.size),
+            _number(entry.loop_p50_ms),
+            _number(entry.loop_p99_ms),
+            f"[red]{lost}[/]" if lost else "0",
+            *([entry.controller, _answer(entry.verified)] if wide else []),
+            _answer(entry.fit),
+            f"[red]{escape(entry.trouble)}[/]" if entry.trouble else entry.ended,
+        )
+    console.print(table)
+    if total > len(entries):
+        Console(stderr=True).print(f"{total - len(entries)} more: --limit 0 shows all")
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _size(size: float) -> str:
+    for unit in ("B", "KiB", "MiB"):
+        if size < 1024:
+            return f"{size:.0f} {unit}"
+        size /= 1024
+    return f"{size:.1f} GiB"
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _answer(value: bool | None) -> str:
+    return {None: "", True: "yes", False: "no"}[value]
