@@ -58,8 +58,8 @@ def frame(transaction: int, unit: int, pdu: bytes) -> bytes:
 
 def _malformed(header: bytes | bytearray) -> str:
     # Said as soon as the bytes are there: a sender that is out of step must not be waited for.
-    if len(header) >= 4 and header[2:4] != b"\0\0":
-        return f"protocol {int.from_bytes(header[2:4], 'big')} in the header; Modbus is 0"
+    if any(header[2:4]):
+        return "another protocol in the header; Modbus is 0"
     if len(header) >= 6 and not MIN_LENGTH <= int.from_bytes(header[4:6], "big") <= MAX_LENGTH:
         return f"length {int.from_bytes(header[4:6], 'big')} in the header; {MIN_LENGTH} to {MAX_LENGTH} is possible"
     return ""

@@ -1,0 +1,504 @@
+"""One rig as a Modbus device, with a clock and a simulation that the test owns."""
+
+import random
+import struct
+from typing import Any
+
+import pytest
+
+from hilrig_modbus_edge import registers
+from hilrig_modbus_edge.client import Client
+from hilrig_modbus_edge.device import Device, DeviceSettings, ModbusError
+from hilrig_modbus_edge.registers import Status, Table
+from hilrig_runtime.clock import ManualClock
+from hilrig_runtime.service import Arrival
+from hilrig_schemas import Event, JointState, TorqueCommand
+
+MS = 1_000_000
+
+
+class Bench:
+    """A device on a bench: what it says is kept."""
+
+    def __init__(self, **settings: int) -> None:
+        self.clock = ManualClock()
+        self.commands: list[TorqueCommand] = []
+        self.repeats: list[TorqueCommand] = []
+        self.events: list[Event] = []
+        self.session_changes = 0
+        self.deadlines: list[int] = []
+        self.arrival: Arrival | None = None
+        self.device = Device(
+            "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
+        )
+
+    def send_command(self, command: TorqueCommand) -> None:
+        self.commands.append(TorqueCommand.FromString(command.SerializeToString()))
+
+    def repeat_command(self, command: TorqueCommand) -> None:
+        self.repeats.append(TorqueCommand.FromString(command.SerializeToString()))
+
+    def emit(self, event: Event) -> None:
+        self.events.append(event)
+
+    def sessions_changed(self) -> None:
+        self.session_changes += 1
+
+    def watch(self, deadline_ns: int) -> None:
+        self.deadlines.append(deadline_ns)
+
+    def state(self, step: int, **fields: Any) -> None:
+        message = JointState(
+            rig="rig1",
+            incarnation=7,
+            step=step,
+            position=fields.pop("position", (0.1, 0.2, 0.03, 0.4)),
+            velocity=fields.pop("velocity", (0, 0, 0, 0)),
+            effort=fields.pop("effort", (0, 0, 0, 0)),
+            **fields,
+        )
+        self.arrival = Arrival(message.SerializeToString(), self.clock.monotonic_ns())
+
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
+        return self.device.connect(host, port, **rights)
+
+    def read(self, client: Client, address: int, count: int, table: Table = Table.HOLDING_REGISTER) -> list[int]:
+        client.heard(self.clock.monotonic_ns())
+        return list(struct.unpack(f">{count}H", self.device.read_registers(client, table, address, count)))
+
+    def write(self, client: Client, address: int, *words: int) -> None:
+        now_ns = self.clock.monotonic_ns()
+        client.heard(now_ns)
+        self.device.write_registers(client, address, struct.pack(f">{len(words)}H", *words), now_ns)
+
+    def wait(self, ms: float) -> None:
+        self.clock.advance(round(ms * MS))
+        self.device.check(self.clock.monotonic_ns())
+
+    def kinds(self) -> list[str]:
+        return [Event.Kind.Name(event.kind) for event in self.events]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    bench = Bench()
+    bench.state(1)
+    return bench
+
+
+# -- commands and their stamps
+
+
+def test_a_write_goes_out_as_one_command(bench: Bench) -> None:
+    bench.write(bench.connect(), 0, 1000, 0xFFFF, 0, 4)
+    [command] = bench.commands
+    assert list(command.effort) == [1.0, -0.001, 0.0, 0.004]
+    assert (command.seq, command.safe, command.controller) == (1, False, "10.0.0.1:1000")
+    assert command.session == bench.device.session.id
+
+
+def test_registers_that_are_not_written_keep_their_torque(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 1, 2, 3, 4)
+    bench.write(client, 2, 30)
+    assert list(bench.commands[-1].effort) == [0.001, 0.002, 0.03, 0.004]
+    assert bench.read(client, 0, 4) == [1, 2, 30, 4]
+
+
+def test_the_basis_is_the_state_that_was_last_served_to_this_connection(bench: Bench) -> None:
+    client, other = bench.connect(), bench.connect(port=2000)
+    bench.state(5)
+    arrived_ns = bench.clock.monotonic_ns()
+    bench.clock.advance(3)
+    bench.read(client, 4, 4)
+    bench.clock.advance(4)
+    bench.state(6)
+    bench.read(other, 4, 4)
+    bench.clock.advance(5)
+    bench.write(client, 0, 1)
+    command = bench.commands[-1]
+    assert (command.basis_incarnation, command.basis_step) == (7, 5)
+    stamps = (command.state_arrived_ns, command.state_served_ns, command.write_arrived_ns, command.sent_ns)
+    assert [stamp - arrived_ns for stamp in stamps] == [0, 3, 12, 12]
+
+
+def test_a_connection_that_reads_nothing_is_based_on_what_its_host_was_served(bench: Bench) -> None:
+    reader, writer, stranger = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
+    bench.state(9)
+    bench.read(reader, 4, 1)
+    bench.write(writer, 0, 1)
+    assert bench.commands[-1].basis_step == 9
+    bench.device.disconnect(writer, "done")
+    bench.write(stranger, 0, 1)
+    assert bench.commands[-1].basis_step == 0
+
+
+def test_one_shot_connections_of_a_host_are_one_loop(bench: Bench) -> None:
+    reader = bench.connect()
+    bench.state(11)
+    bench.read(reader, 4, 4)
+    bench.device.disconnect(reader, "done")
+    bench.write(bench.connect(port=2), 0, 1)
+    assert bench.commands[-1].basis_step == 11
+
+
+def test_a_write_in_the_segment_of_a_read_is_not_based_on_that_read(bench: Bench) -> None:
+    """It was sent before the read was answered."""
+    client = bench.connect()
+    bench.state(2)
+    bench.read(client, 4, 4)
+    bench.clock.advance(1)
+    bench.state(3)
+    now_ns = bench.clock.monotonic_ns()
+    client.heard(now_ns)
+    bench.device.read_registers(client, Table.HOLDING_REGISTER, 4, 4)
+    bench.device.write_registers(client, 0, b"\0\1", now_ns)
+    assert bench.commands[-1].basis_step == 2
+    assert bench.commands[-1].state_served_ns < bench.commands[-1].write_arrived_ns
+
+
+def test_reading_torques_serves_no_state(bench: Bench) -> None:
+    client = bench.connect()
+    bench.read(client, 0, 4)
+    bench.write(client, 0, 1)
+    assert bench.commands[-1].basis_step == 0
+
+
+def test_the_standing_command_is_repeated_with_its_number(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 7)
+    bench.wait(199)
+    assert not bench.repeats
+    bench.wait(1)
+    bench.wait(200)
+    assert bench.repeats == [bench.commands[-1]] * 2
+    assert len(bench.commands) == 1
+
+
+def test_the_echo_word_comes_back_in_the_next_command(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, registers.ECHO, 4711)
+    assert not bench.commands
+    bench.write(client, 0, 1)
+    assert bench.commands[-1].echo == 4711
+
+
+def test_a_reset_zeroes_the_torques_and_is_counted(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 1000)
+    now_ns = bench.clock.monotonic_ns()
+    bench.device.write_coil(client, registers.RESET, True, now_ns)
+    assert (list(bench.commands[-1].effort), bench.commands[-1].resets) == ([0, 0, 0, 0], 1)
+    bench.device.write_coil(client, registers.RESET, False, now_ns)
+    assert len(bench.commands) == 2
+    assert bench.device.read_bits(client, Table.COIL, registers.RESET, 1) == 0
+
+
+def test_the_magnet_is_a_coil(bench: Bench) -> None:
+    client = bench.connect()
+    bench.device.write_coil(client, registers.MAGNET, True, bench.clock.monotonic_ns())
+    assert bench.commands[-1].magnet
+    assert bench.device.read_bits(client, Table.COIL, registers.MAGNET, 1) == 1
+
+
+# -- lease
+
+
+def test_the_first_writer_holds_the_rig_and_others_are_refused_with_06(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(holder, 0, 5)
+    with pytest.raises(ModbusError) as refusal:
+        bench.write(other, 0, 6)
+    assert refusal.value.code == 6
+    assert bench.read(other, 0, 1) == [5]
+    refused = bench.events[-1]
+    assert refused.kind == Event.LEASE_REFUSED
+    assert (refused.controller_data.controller, refused.controller_data.holder) == ("10.0.0.2:1000", "10.0.0.1:1000")
+
+
+def test_a_write_that_is_wrong_takes_no_lease(bench: Bench) -> None:
+    client = bench.connect()
+    for address in (4, 8, 99, 102):
+        with pytest.raises(ModbusError) as refusal:
+            bench.write(client, address, 1)
+        assert refusal.value.code == 2
+    assert bench.device.lease.holder is None
+    assert not bench.events
+
+
+def test_refusals_are_told_once_a_second_with_their_number(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(holder, 0, 5)
+    for _ in range(100):
+        bench.clock.advance(15 * MS)
+        bench.write(holder, 0, 5)
+        with pytest.raises(ModbusError):
+            bench.write(other, 0, 6)
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert len(refusals) == 2
+    assert "(67 times)" in refusals[1]
+
+
+def test_the_lease_ends_with_the_connection(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(holder, 0, 5)
+    bench.device.disconnect(holder, "it closed the connection")
+    assert bench.kinds()[-1] == "LEASE_LOST"
+    bench.write(other, 1, 6)
+    # The torque of the one before stands until the watchdog says otherwise.
+    assert list(bench.commands[-1].effort) == [0.005, 0.006, 0, 0]
+
+
+def test_the_lease_ends_with_silence_but_not_with_reading(bench: Bench) -> None:
+    holder = bench.connect()
+    bench.write(holder, 0, 5)
+    for _ in range(8):
+        bench.wait(1000)
+        bench.read(holder, 0, 1)
+    assert bench.device.lease.holder is holder
+    bench.wait(4999)
+    assert bench.device.lease.holder is holder
+    bench.wait(1)
+    assert bench.device.lease.holder is None
+    assert "no request for 5 s" in bench.events[-1].text
+
+
+def test_the_teacher_can_free_a_rig(bench: Bench) -> None:
+    assert bench.device.release("by the teacher") == ""
+    holder = bench.connect()
+    bench.write(holder, 0, 5)
+    assert bench.device.release("by the teacher") == "10.0.0.1:1000"
+    assert bench.device.lease.holder is None
+    assert bench.events[-1].controller_data.reason == "by the teacher"
+
+
+def test_an_observer_reads_and_its_writes_are_an_illegal_function(bench: Bench) -> None:
+    observer = bench.connect(may_write=False)
+    assert bench.read(observer, 0, 1) == [0]
+    with pytest.raises(ModbusError) as refusal:
+        bench.write(observer, 0, 1)
+    assert refusal.value.code == 1
+    assert bench.device.lease.holder is None
+    assert bench.kinds() == ["LEASE_REFUSED"]
+
+
+# -- watchdog
+
+
+def test_torque_goes_to_zero_when_the_writes_stop(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 1000, 1000, 1000, 1000)
+    assert bench.deadlines == [bench.clock.monotonic_ns() + 1000 * MS]
+    bench.wait(999)
+    assert not bench.commands[-1].safe
+    bench.wait(1)
+    command = bench.commands[-1]
+    assert (list(command.effort), command.safe, command.seq, command.basis_step) == ([0] * 4, True, 2, 0)
+    assert command.session == bench.device.session.id
+    assert bench.read(client, 0, 4) == [0] * 4
+    trip = bench.events[-1]
+    assert trip.kind == Event.WATCHDOG_TRIP
+    assert (trip.watchdog_data.silent_ns, trip.watchdog_data.timeout_ns) == (1000 * MS, 1000 * MS)
+
+
+def test_the_trip_says_why(bench: Bench) -> None:
+    def trip_text() -> str:
+        assert bench.events[-1].kind == Event.WATCHDOG_TRIP
+        return bench.events[-1].text
+
+    client = bench.connect()
+    bench.write(client, 0, 1)
+    bench.wait(1000)
+    assert "10.0.0.1:1000 is silent" in trip_text()
+    bench.write(client, 0, 1)
+    bench.wait(900)
+    bench.read(client, 4, 4)
+    bench.wait(100)
+    assert "reads but does not write" in trip_text()
+    bench.write(client, 0, 1)
+    bench.device.disconnect(client, "it closed the connection")
+    bench.wait(1000)
+    assert "10.0.0.1:1000 is gone" in trip_text()
+
+
+def test_the_next_write_rearms(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 1)
+    bench.wait(1000)
+    tripped = bench.read(client, 1, 1, Table.INPUT_REGISTER)[0]
+    assert tripped & Status.WATCHDOG_TRIPPED
+    bench.write(client, 1, 2)
+    assert bench.kinds()[-1] == "WATCHDOG_REARM"
+    # What stood before the trip does not come back.
+    assert list(bench.commands[-1].effort) == [0, 0.002, 0, 0]
+    assert not bench.read(client, 1, 1, Table.INPUT_REGISTER)[0] & Status.WATCHDOG_TRIPPED
+
+
+def test_a_rig_that_is_left_without_torque_needs_no_watchdog(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 1)
+    bench.write(client, 0, 0)
+    bench.device.disconnect(client, "it closed the connection")
+    bench.wait(2000)
+    assert "WATCHDOG_TRIP" not in bench.kinds()
+
+
+def test_the_time_out_is_set_by_register_within_bounds(bench: Bench) -> None:
+    client = bench.connect()
+    assert bench.read(client, registers.WATCHDOG, 1) == [1000]
+    bench.write(client, registers.WATCHDOG, 150)
+    assert bench.read(client, registers.WATCHDOG, 1) == [150]
+    bench.write(client, 0, 1)
+    bench.wait(150)
+    assert bench.commands[-1].safe
+    for wrong in (0, 99, 10_001, 65535):
+        with pytest.raises(ModbusError) as refusal:
+            bench.write(client, registers.ECHO, 42, wrong)
+        assert refusal.value.code == 4
+    assert bench.read(client, registers.ECHO, 2) == [0, 150]
+
+
+def test_a_new_session_starts_with_the_labs_time_out(bench: Bench) -> None:
+    one, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(one, registers.WATCHDOG, 150)
+    bench.device.disconnect(one, "done")
+    bench.write(other, 0, 1)
+    assert bench.read(other, registers.WATCHDOG, 1) == [1000]
+
+
+# -- sessions
+
+
+def test_a_session_begins_with_the_lease_and_ends_after_its_grace(bench: Bench) -> None:
+    client = bench.connect()
+    bench.write(client, 0, 0)
+    session = bench.device.session
+    assert session.id == "20231114T221320Z-rig1-" + session.id[-4:]
+    assert session.id[-4:].isalpha()
+    assert bench.kinds() == ["SESSION_START", "LEASE_GRANTED"]
+    bench.device.disconnect(client, "done")
+    bench.wait(4999)
+    assert bench.device.session is session
+    bench.wait(1)
+    assert bench.device.session is None
+    assert bench.kinds()[-1] == "SESSION_END"
+    assert bench.events[-1].session == session.id
+    assert bench.session_changes == 2
+    last = bench.commands[-1]
+    assert (last.session, last.seq, last.basis_step, last.safe) == ("", 2, 0, True)
+
+
+def test_the_same_host_goes_on_with_its_session_and_another_begins_its_own(bench: Bench) -> None:
+    first, again, other = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
+    bench.write(first, 0, 0)
+    session = bench.device.session
+    bench.device.disconnect(first, "done")
+    bench.wait(4000)
+    bench.write(again, 0, 0)
+    bench.wait(3000)
+    bench.read(again, 0, 1)
+    bench.wait(3000)
+    assert bench.device.session is session
+    bench.device.disconnect(again, "done")
+    bench.write(other, 0, 0)
+    assert bench.device.session is not session
+    assert bench.device.session.number == 2
+    assert [k for k in bench.kinds() if k.startswith("SESSION")] == ["SESSION_START", "SESSION_END", "SESSION_START"]
+
+
+def test_shutting_leaves_no_torque_no_lease_and_no_session(bench: Bench) -> None:
+    bench.write(bench.connect(), 0, 1000)
+    bench.device.shut("the edge stops")
+    assert bench.kinds()[-2:] == ["LEASE_LOST", "SESSION_END"]
+    last = bench.commands[-1]
+    assert (list(last.effort), last.safe, last.session) == ([0] * 4, True, "")
+    assert bench.device.session is None
+
+
+# -- what registers show
+
+
+def test_positions_before_the_first_state_are_a_device_failure() -> None:
+    bench = Bench()
+    client = bench.connect()
+    with pytest.raises(ModbusError) as refusal:
+        bench.read(client, 4, 1)
+    assert refusal.value.code == 4
+    assert bench.read(client, 0, 4) == [0] * 4
+    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 0
+
+
+def test_the_extended_map_shows_the_whole_state(bench: Bench) -> None:
+    client = bench.connect()
+    bench.state(
+        70_000,
+        position=(1.5, -1.0, 0.125, 6.2),
+        velocity=(0.5, 0.0, -0.25, 0.0),
+        effort=(1.0, 2.0, -3.5, 0.25),
+        loop_latency_ns=20_000_000,
+        limit_flags=0b1_0010_0001,
+        magnet=True,
+        held_part="cube",
+    )
+    bench.write(client, 0, 1)
+    bench.clock.advance(12 * MS)
+    data = struct.pack(">36H", *bench.read(client, 0, 36, Table.INPUT_REGISTER))
+    version, status, step, latency, lease, watchdog, timeout, session, stops, age = struct.unpack_from(
+        ">HHIIHHHHHH", data
+    )
+    assert (version, step, latency, timeout, session, age) == (1, 70_000, 20_000, 1000, 1, 12)
+    assert (lease, watchdog, stops) == (1, 2, 0b1_0010_0001)
+    wanted = (
+        Status.SIMULATION_ALIVE
+        | Status.SESSION_OPEN
+        | Status.LEASE_HELD
+        | Status.LEASE_IS_YOURS
+        | Status.WATCHDOG_ON
+        | Status.ON_STOP
+        | Status.MAGNET_ON
+        | Status.PART_HELD
+        | Status.POSITION_SATURATED
+    )
+    assert Status(status) == wanted
+    floats = struct.unpack_from(">12f", data, 24)
+    assert floats[:4] == pytest.approx([85.9437, -57.2958, 125.0, 355.2338], abs=1e-4)
+    assert floats[4:8] == pytest.approx([28.6479, 0.0, -250.0, 0.0], abs=1e-4)
+    assert floats[8:] == (1.0, 2.0, -3.5, 0.25)
+    bits = bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 16)
+    assert Status(bits) == wanted
+
+
+def test_the_lease_and_the_right_to_write_look_different_to_each_reader(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(port=2, may_write=False)
+    bench.write(holder, 0, 1)
+    assert bench.read(holder, 6, 1, Table.INPUT_REGISTER) == [1]
+    assert bench.read(other, 6, 1, Table.INPUT_REGISTER) == [2]
+    bits = bench.device.read_bits(other, Table.DISCRETE_INPUT, 0, 16)
+    assert bits & Status.READ_ONLY
+    assert not bits & Status.LEASE_IS_YOURS
+
+
+def test_a_state_that_grows_old_is_said_not_to_be_alive(bench: Bench) -> None:
+    client = bench.connect()
+    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 1
+    bench.clock.advance(1000 * MS)
+    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 0
+
+
+def test_a_message_that_is_no_state_is_left_out(bench: Bench) -> None:
+    client = bench.connect()
+    before = bench.read(client, 4, 4)
+    for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
+        bench.arrival = Arrival(payload, bench.clock.monotonic_ns())
+        assert bench.read(client, 4, 4) == before
+
+
+def test_one_read_shows_one_step(bench: Bench) -> None:
+    """Each state has its step in every float: a mix of two would be seen."""
+    client = bench.connect()
+    for step in range(1, 200):
+        bench.state(step, position=(0, 0, step / 1000, 0), velocity=(0, 0, step / 1000, 0), effort=(step,) * 4)
+        data = struct.pack(">36H", *bench.read(client, 0, 36, Table.INPUT_REGISTER))
+        floats = struct.unpack_from(">12f", data, 24)
+        assert struct.unpack_from(">I", data, 4) == (step,)
+        assert (floats[2], floats[6], floats[8:]) == (step, step, (step,) * 4)
