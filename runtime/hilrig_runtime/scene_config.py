@@ -136,12 +136,13 @@ class SceneConfig(Section):
 
     @model_validator(mode="after")
     def _everything_has_its_place(self) -> "SceneConfig":
-        names = [thing.name for thing in (*self.trays, *self.parts)]
+        things: tuple[TrayConfig | PartConfig, ...] = (*self.trays, *self.parts)
+        names = [thing.name for thing in things]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"two things are called {name!r}: names must be distinct")
         half = [length / 2 for length in self.table.size_mm]
-        for thing in (*self.trays, *self.parts):
+        for thing in things:
             x, y = (at - centre for at, centre in zip(thing.position_mm, self.table.centre_mm, strict=True))
             if abs(x) > half[0] or abs(y) > half[1]:
                 raise ValueError(

@@ -24,14 +24,14 @@ def check(
 
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.template import lab_template
-    from hilrig_sim.model import check_stable
+    from hilrig_sim.configured import rig_parameters
 
     if template:
         print(lab_template(), end="")
         return
     lab = load_lab(file)
     for rig in lab.rigs:
-        check_stable(lab.sim, rig)
+        rig_parameters(lab, rig)
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports}))
         return

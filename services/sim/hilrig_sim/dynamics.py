@@ -1,0 +1,215 @@
+"""The reduced closed form of the arm's dynamics, for any number of rigs at once.
+
+Point masses at the distal ends (17)–(19), viscous friction (33)–(39), the environment's wrench and a payload. With
+w1 = θ̇1 and w2 = θ̇1 + θ̇2, the speeds of the two links in the world, equations (25)–(31) become
+
+    I1·ẇ1 + p·ẇ2 = Q1,   Q1 = (τ1 − b1θ̇1) − (τ2 − b2θ̇2) + l2 l3 M sinθ2 · w2²
+    p·ẇ1 + A22·ẇ2 = Q2,  Q2 = τ2 + n_z − b2θ̇2 − l2 l3 M sinθ2 · w1²
+
+with I1 = l2²(m1+M), A22 = M l3², p = l2 l3 M cosθ2: the same model in fewer operations. Joints 3 and 4 are (32) and
+decision 2 of docs/model.md.
+
+Vectors are (rows, rigs): one row a quantity, so that each operation runs along contiguous memory, and a rig's numbers
+do not depend on how many stand beside it. Nothing is allocated in a step, and no BLAS is used: its sums depend on
+the shape.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_sim.model import GRAVITY, ArmParameters
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+STAGE_ROWS: Final = 5
+"""What the right-hand side depends on: the four joint velocities, and θ2."""
+
+
+class StageViews(NamedTuple):
+    """Views into a stage's state and its rates, made once: slicing in the step would cost as much as the sums."""
+
+    velocity: Floats
+    v1: Floats
+    v2: Floats
+    theta2: Floats
+    rates: Floats
+    a12: Floats
+    a1: Floats
+    a2: Floats
+    a34: Floats
+    theta2_rate: Floats
+
+
+def stage_views(state: Floats, rates: Floats) -> StageViews:
+    """Views of a stage: `state` is (5, N) with rows θ̇1, θ̇2, ḋ3, θ̇4, θ2; `rates` (5, N) gets their derivatives."""
+    return StageViews(
+        state[:4], state[0], state[1], state[4], rates, rates[:2], rates[0], rates[1], rates[2:4], rates[4]
+    )
+
+
+class ReducedDynamics:
+    """The reduced model of N rigs; `payload` changes when a magnet picks or drops."""
+
+    def __init__(self, arms: Sequence[ArmParameters]) -> None:
+        count = len(arms)
+        self.count = count
+        self.l2 = np.array([arm.l2 for arm in arms])
+        self.l3 = np.array([arm.l3 for arm in arms])
+        self.m1, self.m2, self.m3 = (np.array([arm.masses[i] for arm in arms]) for i in range(3))
+        self.j4 = np.array([arm.j4 for arm in arms])
+        self.friction = np.array([arm.friction for arm in arms]).T.copy()
+        self.force_z = np.array([arm.external_force_z for arm in arms])
+        self.torque_z = np.array([arm.external_torque_z for arm in arms])
+        # What a change of payload changes.
+        self.coupling = np.empty(count)
+        """l2 l3 M, kg·m²."""
+        self.inertia = np.empty((2, count))
+        """A22 = M l3², I1 = l2²(m1+M): each multiplies the other link's equation."""
+        self._a22, self._i1 = self.inertia
+        self._i1_a22 = np.empty(count)
+        self._inverse34 = np.empty((2, count))
+        self._offset = np.empty((4, count))
+        """What acts besides the efforts and the motion: the environment and gravity."""
+        # Scratch of one evaluation.
+        self._force = np.empty((4, count))
+        self._force1, self._force2, self._force34 = self._force[0], self._force[1], self._force[2:4]
+        self._cos_sin = np.empty((2, count))
+        self._cos, self._sin = self._cos_sin
+        self._squares = np.empty((2, count))
+        self._w2_squared, self._w1_squared = self._squares
+        self._q = np.empty((2, count))
+        self._q1, self._q2 = self._q
+        self._q_swapped = self._q[::-1]
+        self._cross = np.empty((2, count))
+        self._determinant = np.empty(count)
+        self._scratch = np.empty(count)
+        self._held: tuple[Bools, Bools, Bools] | None = None
+        self.set_payload(np.zeros(count))
+
+    @classmethod
+    def of(cls, arm: ArmParameters, payload: float = 0.0) -> Self:
+        """The model of a single rig that holds `payload`, kg."""
+        model = cls([arm])
+        model.set_payload(np.array([payload]))
+        return model
+
+    def set_payload(self, payload: Floats) -> None:
+        """Let the magnets hold m4 = `payload`, kg, (N,)."""
+        mass = self.m2 + self.m3 + payload
+        mass3 = self.m3 + payload
+        self.payload = payload.copy()
+        self.coupling[:] = self.l2 * self.l3 * mass
+        self._a22[:] = mass * self.l3 * self.l3
+        self._i1[:] = self.l2 * self.l2 * (self.m1 + mass)
+        np.multiply(self._a22, self._i1, out=self._i1_a22)
+        self._inverse34[0] = 1.0 / mass3
+        self._inverse34[1] = 1.0 / self.j4
+        self._offset[0] = self.torque_z
+        self._offset[1] = self.torque_z
+        self._offset[2] = GRAVITY * mass3 - self.force_z
+        self._offset[3] = self.torque_z
+
+    def hold(self, held1: Bools | None, held2: Bools | None = None) -> None:
+        """Say which joints 1 and 2 are held on a stop, (N,) each: they do not accelerate. None: no joint is."""
+        self._held = None if held1 is None or held2 is None else (held1 & ~held2, held2 & ~held1, held1 & held2)
+
+    def drive(self, effort: Floats, out: Floats) -> None:
+        """All that acts on the joints apart from their motion, (4, N), from the efforts, (4, N)."""
+        np.add(effort, self._offset, out=out)
+
+    def rates(
+        self,
+        stage: StageViews,
+        drive: Floats,
+        # Bound here: a name of the module and its attribute cost a look-up each, 130 times a step.
+        add: Any = np.add,
+        subtract: Any = np.subtract,
+        multiply: Any = np.multiply,
+        divide: Any = np.divide,
+        cos: Any = np.cos,
+        sin: Any = np.sin,
+    ) -> None:
+        """Derivatives of a stage's state into its `rates`, (25)–(32), (38), (39); `drive` is (4, N)."""
+        velocity, v1, v2, theta2, _, a12, a1, a2, a34, theta2_rate = stage
+        force, force1, force2 = self._force, self._force1, self._force2
+        cos_sin, squares, q, q1, q2 = self._cos_sin, self._squares, self._q, self._q1, self._q2
+        cross, determinant = self._cross, self._determinant
+        w2_squared, w1_squared = self._w2_squared, self._w1_squared
+        multiply(self.friction, velocity, out=force)
+        subtract(drive, force, out=force)
+        multiply(self._force34, self._inverse34, out=a34)
+        cos(theta2, out=self._cos)
+        sin(theta2, out=self._sin)
+        multiply(cos_sin, self.coupling, out=cos_sin)
+        add(v1, v2, out=w2_squared)
+        multiply(w2_squared, w2_squared, out=w2_squared)
+        multiply(v1, v1, out=w1_squared)
+        multiply(squares, self._sin, out=squares)
+        subtract(force1, force2, out=q1)
+        add(q1, w2_squared, out=q1)
+        subtract(force2, w1_squared, out=q2)
+        multiply(self._cos, self._cos, out=determinant)
+        subtract(self._i1_a22, determinant, out=determinant)
+        multiply(self.inertia, q, out=a12)
+        multiply(self._q_swapped, self._cos, out=cross)
+        subtract(a12, cross, out=a12)
+        divide(a12, determinant, out=a12)
+        subtract(a2, a1, out=a2)
+        theta2_rate[:] = v2
+        if self._held is not None:
+            self._hold_rates(stage)
+
+    def _hold_rates(self, stage: StageViews) -> None:
+        """Where a joint is held the other one moves alone: with its own row of the mass matrix."""
+        assert self._held is not None
+        only1, only2, both = self._held
+        together = self._scratch
+        # θ2 held: both links turn as one body, α θ̈1 = Q1 + Q2 with α = I1 + 2p + A22.
+        np.add(self._cos, self._cos, out=together)
+        np.add(together, self._i1, out=together)
+        np.add(together, self._a22, out=together)
+        np.add(self._q1, self._q2, out=self._determinant)
+        np.divide(self._determinant, together, out=stage.a1, where=only2)
+        np.divide(self._q2, self._a22, out=stage.a2, where=only1)
+        np.copyto(stage.a2, 0.0, where=only2)
+        np.copyto(stage.a1, 0.0, where=only1)
+        np.copyto(stage.a12, 0.0, where=both)
+
+    def mass_matrix_12(self, theta2: Floats) -> tuple[Floats, Floats, Floats]:
+        """Elements α = a11 + a12, a12, a22 of the mass matrix of joints 1 and 2, kg·m², (N,) each, (25)–(27)."""
+        p = self.coupling * np.cos(theta2)
+        return self._i1 + 2 * p + self._a22, p + self._a22, self._a22
+
+    def kinetic_energy(self, theta2: Floats, velocity: Floats) -> Floats:
+        """½ q̇ᵀ M q̇ of each rig, J, (N,), from θ2 (N,) and the joint velocities (4, N)."""
+        alpha, a12, a22 = self.mass_matrix_12(theta2)
+        v1, v2, v3, v4 = velocity
+        plane = alpha * v1 * v1 + 2 * a12 * v1 * v2 + a22 * v2 * v2
+        return np.asarray(0.5 * (plane + (self.m3 + self.payload) * v3 * v3 + self.j4 * v4 * v4))
+
+
+def mass_matrix(arm: ArmParameters, theta2: float, payload: float = 0.0) -> Floats:
+    """Mass matrix M(q), (4, 4); kg·m², kg·m², kg, kg·m² on its diagonal."""
+    alpha, a12, a22 = ReducedDynamics.of(arm, payload).mass_matrix_12(np.array([theta2]))
+    matrix = np.zeros((4, 4))
+    matrix[:2, :2] = [[alpha[0], a12[0]], [a12[0], a22[0]]]
+    matrix[2, 2] = arm.masses[2] + payload
+    matrix[3, 3] = arm.j4
+    return matrix
+
+
+def forward_dynamics(
+    arm: ArmParameters, position: Floats, velocity: Floats, effort: Floats, payload: float = 0.0
+) -> Floats:
+    """Joint accelerations q̈, (4,), from position, velocity and effort, (4,) each, SI units, away from all stops."""
+    model = ReducedDynamics.of(arm, payload)
+    state = np.concatenate([velocity, position[1:2]])[:, np.newaxis]
+    rates = np.empty_like(state)
+    drive = np.empty((4, 1))
+    model.drive(np.asarray(effort, dtype=np.float64)[:, np.newaxis], drive)
+    model.rates(stage_views(state, rates), drive)
+    return rates[:4, 0]

@@ -1,0 +1,221 @@
+"""The simulation as a service: at each absolute deadline, command in, state out, then the plant moves on.
+
+The order within a tick is the contract of docs/timing.md. The newest commands are latched, the tick is stamped, the
+state x_k is published with the effort that acts from now on, and only then is x_k+1 computed: a state leaves at the
+start of its step.
+"""
+
+import gc
+import platform
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Final
+
+import numpy as np
+
+from hilrig_runtime.rate import Rate, Tick
+from hilrig_runtime.service import Service
+from hilrig_schemas import JointState, RigConfig, topics
+from hilrig_sim.commands import CommandFollower, StepTimes
+from hilrig_sim.configured import rig_parameters
+from hilrig_sim.model import RigParameters
+from hilrig_sim.plant import Plant
+from hilrig_sim.reports import Reporter
+from hilrig_sim.urdf import urdf
+from hilrig_sim.world import NONE
+
+ALL_PARTS_PERIOD_NS: Final = 1_000_000_000
+"""All parts are stated at least so often, ns."""
+
+
+def run(service: Service) -> None:
+    """Simulate every rig of the lab until the service is to stop.
+
+    Raises:
+        InputError: the lab's parameters do not fit together.
+    """
+    lab = service.lab
+    parameters = [rig_parameters(lab, rig) for rig in lab.rigs]
+    simulation = Simulation(service, parameters)
+    step_ns = lab.sim.step_ns
+    with ExitStack() as served:
+        for rig, values in zip(lab.rigs, parameters, strict=True):
+            answer = Constant(_configuration(service, rig.name, values).SerializeToString())
+            served.enter_context(service.bus.serve(topics.CONFIG.key(lab.name, rig.name), answer))
+        service.counters.rigs = len(parameters)
+        rate = Rate(step_ns, service.clock)
+        gc.collect()
+        gc.freeze()
+        service.ready()
+        stopping = service.stopping
+        while not stopping.is_set():
+            tick = rate.wait()
+            simulation.tick(tick)
+            service.beat(service.clock.monotonic_ns())
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """Answers every question alike."""
+
+    payload: bytes
+
+    def __call__(self, question: bytes) -> bytes:
+        """The answer, whatever is asked."""
+        del question
+        return self.payload
+
+
+class Simulation:
+    """The rigs of one process: plant, commands and states."""
+
+    def __init__(self, service: Service, parameters: list[RigParameters]) -> None:
+        lab = service.lab
+        self._plant = Plant(parameters)
+        self._warm_up()
+        self._commands = service.latest(topics.COMMAND)
+        self._step_ns = lab.sim.step_ns
+        self._clock = service.clock
+        self._counters = service.counters
+        self._incarnation = service.incarnation
+        self._times = StepTimes()
+        self._step = 0
+        self._effort = np.zeros((4, len(parameters)))
+        self._magnet = np.zeros(len(parameters), dtype=np.bool_)
+        self._reporter = Reporter(service.emit, [rig.name for rig in lab.rigs], self._plant)
+        self._rigs = [
+            _Rig(index, rig.name, values, service, self._plant)
+            for index, (rig, values) in enumerate(zip(lab.rigs, parameters, strict=True))
+        ]
+
+    def tick(self, tick: Tick) -> None:
+        """Latch, stamp, publish, integrate."""
+        self._step = step = self._step + 1
+        newest, rigs, plant = self._commands.get, self._rigs, self._plant
+        arrivals = [newest(rig.name) for rig in rigs]
+        # Stamped after they were taken: no command arrives later than the tick that applies it.
+        sampled_ns, wall_ns = self._clock.monotonic_ns(), self._clock.wall_ns()
+        self._times.add(step, sampled_ns)
+        for rig, arrival in zip(rigs, arrivals, strict=True):
+            follower = rig.follower
+            follower.latch(arrival, sampled_ns)
+            if follower.changed:
+                self._effort[:, rig.index] = follower.effort
+                self._magnet[rig.index] = follower.magnet
+            if follower.reset:
+                plant.reset(rig.index)
+        positions, velocities = plant.position.T.tolist(), plant.velocity.T.tolist()
+        errors = plant.error.T.tolist()
+        lateness_ns = sampled_ns - tick.deadline_ns
+        for rig, position, velocity, error in zip(rigs, positions, velocities, errors, strict=True):
+            state = rig.state
+            state.step = step
+            state.sampled_ns = sampled_ns
+            state.wall_ns = wall_ns
+            state.lateness_ns = lateness_ns
+            state.missed_steps = tick.missed_steps
+            state.position[:] = position
+            state.velocity[:] = velocity
+            state.integration_error[:] = error
+            rig.publish(self._times, sampled_ns)
+        for rig in rigs:
+            if rig.follower.lost or rig.follower.back or rig.follower.reset:
+                self._reporter.tell_of_commands(rig.index, rig.follower, step)
+        events = plant.step(self._effort, self._magnet)
+        if events:
+            self._reporter.tell_of_plant(events, step + 1, sampled_ns, [rig.follower.session for rig in rigs])
+        self._counters.count_tick(tick, self._step_ns)
+        if tick.missed_steps or tick.lateness_ns > self._step_ns:
+            self._reporter.tell_of_overrun(tick, step, sampled_ns)
+
+    def _warm_up(self) -> None:
+        """Take the first steps, which are slow, before time counts."""
+        effort, magnet = np.zeros((4, self._plant.count)), np.zeros(self._plant.count, dtype=np.bool_)
+        for _ in range(3):
+            self._plant.step(effort, magnet)
+        for rig in range(self._plant.count):
+            self._plant.reset(rig)
+
+
+class _Rig:
+    """What one rig sends: a message that is filled anew each step."""
+
+    def __init__(self, index: int, name: str, parameters: RigParameters, service: Service, plant: Plant) -> None:
+        self.index = index
+        self.name = name
+        self.follower = CommandFollower(service.incarnation, service.lab.sim.command_timeout_ns)
+        self.state = JointState(
+            rig=name,
+            incarnation=service.incarnation,
+            effort=self.follower.effort,
+            external_force_z=parameters.arm.external_force_z,
+            external_torque_z=parameters.arm.external_torque_z,
+            safe=True,
+        )
+        self._world = plant.world
+        self._plant = plant
+        self._part_names = plant.world.part_names[index]
+        self._send = service.sender(topics.STATE, name).send
+        self._has_commanded = False
+        self._has_parts = False
+        self._parts_due_ns = 0
+
+    def publish(self, times: StepTimes, sampled_ns: int) -> None:
+        """Complete the state with what seldom changes, and send it."""
+        state, follower, world, index = self.state, self.follower, self._world, self.index
+        if follower.changed:
+            state.session = follower.session
+            state.effort[:] = follower.effort
+            state.magnet = follower.magnet
+            state.command_seq = follower.seq
+            state.safe = follower.safe
+        if follower.is_new:
+            basis_ns = times.get(follower.basis_step)
+            state.command_arrived_ns = follower.arrived_ns
+            state.basis_step = follower.basis_step if basis_ns is not None else 0
+            state.loop_latency_ns = sampled_ns - basis_ns if basis_ns is not None else 0
+            self._has_commanded = True
+        elif self._has_commanded:
+            state.command_arrived_ns = state.basis_step = state.loop_latency_ns = 0
+            self._has_commanded = False
+        state.limit_flags = self._plant.limit_flags[index]
+        if self._part_names:
+            if world.moving[index] or sampled_ns >= self._parts_due_ns:
+                self._parts_due_ns = sampled_ns + ALL_PARTS_PERIOD_NS
+                self._state_parts()
+            elif self._has_parts:
+                del state.parts[:]
+                self._has_parts = False
+        self._send(state)
+
+    def _state_parts(self) -> None:
+        state, world, index = self.state, self._world, self.index
+        held = int(world.held[index])
+        state.held_part = self._part_names[held] if held != NONE else ""
+        del state.parts[:]
+        poses = zip(
+            self._part_names,
+            world.x[:, index].tolist(),
+            world.y[:, index].tolist(),
+            world.z[:, index].tolist(),
+            world.yaw[:, index].tolist(),
+            strict=False,
+        )
+        for name, x, y, z, yaw in poses:
+            state.parts.add(name=name, x=x, y=y, z=z, yaw=yaw)
+        self._has_parts = True
+
+
+def _configuration(service: Service, rig: str, parameters: RigParameters) -> RigConfig:
+    """What a rig is, for whoever asks."""
+    return RigConfig(
+        rig=rig,
+        incarnation=service.incarnation,
+        step_ns=parameters.sim.step_ns,
+        parameters_json=parameters.to_json(),
+        urdf=urdf(parameters, rig),
+        lab_toml=service.lab.source,
+        software_version=version("hilrig"),
+        machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+    )

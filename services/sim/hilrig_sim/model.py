@@ -1,0 +1,196 @@
+"""The parameters of a rig in SI units: what a simulation, a picture and a judge need to know of it.
+
+They come from the laboratory's configuration, travel as JSON in `RigConfig.parameters_json`, and are read back from
+a recording exactly as they were.
+"""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from hilrig_runtime.errors import InputError
+
+GRAVITY: Final = 9.81
+"""m/s², as in the paper (20)."""
+LARGEST_REGISTER_FORCE: Final = 32.767
+"""What the paper's force register can ask for, N."""
+
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+
+JOINT_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(f"the arm's {name} must be a positive number, found {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class ArmParameters:
+    """The arm (docs/model.md); point masses at the distal ends of the links (17)–(19)."""
+
+    l1: float = 0.139
+    """Height of the arm's plane above the base plane, m."""
+    l2: float = 0.300
+    """Length of link 1, m."""
+    l3: float = 0.300
+    """Length of link 2, m."""
+    masses: Vector3 = (1.0, 1.0, 0.5)
+    """m1, m2, m3, kg."""
+    j4: float = 0.005
+    """Inertia of joint 4, kg·m²."""
+    friction: Vector4 = (2.0, 2.0, 5.0, 0.05)
+    """b1…b4; N·m·s, N·m·s, N·s/m, N·m·s."""
+    lower: Vector4 = (math.radians(-133.0), math.radians(-153.0), 0.0, math.radians(-360.0))
+    """Lower stops; rad, rad, m, rad."""
+    upper: Vector4 = (math.radians(133.0), math.radians(153.0), 0.200, math.radians(360.0))
+    """Upper stops; rad, rad, m, rad."""
+    start: Vector4 = (0.0, 0.0, 0.0, 0.0)
+    """Start pose; rad, rad, m, rad."""
+    external_force_z: float = 0.0
+    """f_z, the environment on the tool, world z up, N."""
+    external_torque_z: float = 0.0
+    """n_z, the same about world z, N·m."""
+
+    def __post_init__(self) -> None:
+        _positive(l1=self.l1, l2=self.l2, l3=self.l3, j4=self.j4)
+        for name, mass in zip(("m1", "m2", "m3"), self.masses, strict=True):
+            _positive(**{name: mass})
+        for name, coefficient in zip(("b1", "b2", "b3", "b4"), self.friction, strict=True):
+            if not (coefficient >= 0 and math.isfinite(coefficient)):
+                raise InputError(f"the arm's {name} must be a number not below 0, found {coefficient!r}")
+        for name, low, high, start in zip(JOINT_NAMES, self.lower, self.upper, self.start, strict=True):
+            if not low < high:
+                raise InputError(f"the arm's {name}: its lower limit {low:g} is not below its upper limit {high:g}")
+            if not low <= start <= high:
+                raise InputError(f"the arm's {name}: its start {start:g} is not within {low:g} to {high:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class PartParameters:
+    """A part, and where it stands at the start."""
+
+    name: str
+    shape: str
+    """"cylinder" or "box"."""
+    size: Vector3
+    """Length, width (a cylinder's both are its diameter), height, m."""
+    mass: float
+    """kg."""
+    ferromagnetic: bool
+    colour: str
+    """#rrggbb."""
+    position: Vector3
+    """Its centre, world, m."""
+    yaw: float
+    """About world z, rad."""
+
+    @property
+    def radius(self) -> float:
+        """Radius of its footprint, the largest disc inside it, m."""
+        return min(self.size[0], self.size[1]) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class TrayParameters:
+    """A flat tray and its places."""
+
+    name: str
+    size: Vector3
+    """Length, width, height, m."""
+    position: Vector3
+    """Centre of its bottom, world, m."""
+    yaw: float
+    """About world z, rad."""
+    colour: str
+    """#rrggbb."""
+    places: tuple[Vector3, ...]
+    """Where the bottoms of parts belong, world, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneParameters:
+    """What stands around the arm."""
+
+    table_height: float = -0.060
+    """World z of the table's top, m."""
+    table_centre: Vector2 = (0.0, 0.0)
+    table_size: Vector2 = (1.3, 1.3)
+    """Extent along x and y, m."""
+    magnet_reach: float = 0.015
+    """Largest sideways distance from the tip to the middle of a part's top, m."""
+    magnet_gap: float = 0.005
+    """Largest difference in height between the tip and a part's top, m."""
+    trays: tuple[TrayParameters, ...] = ()
+    parts: tuple[PartParameters, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StepParameters:
+    """How the plant is stepped."""
+
+    step_ns: int = 20_000_000
+    substeps: int = 1
+    integrator: str = "rkf45"
+
+    @property
+    def step(self) -> float:
+        """Length of a step of the loop, s."""
+        return self.step_ns * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class RigParameters:
+    """All of a rig that the physics and its picture depend on."""
+
+    arm: ArmParameters = ArmParameters()
+    sim: StepParameters = StepParameters()
+    scene: SceneParameters = SceneParameters()
+
+    def __post_init__(self) -> None:
+        for part in self.scene.parts:
+            weight = (self.arm.masses[2] + part.mass) * GRAVITY
+            if part.ferromagnetic and weight > LARGEST_REGISTER_FORCE:
+                most = LARGEST_REGISTER_FORCE / GRAVITY - self.arm.masses[2]
+                raise InputError(
+                    f"part {part.name!r} is too heavy: quill and part weigh {weight:.1f} N, the force register "
+                    f"carries {LARGEST_REGISTER_FORCE} N; {most:.2f} kg is the most"
+                )
+
+    def to_json(self) -> str:
+        """The same as JSON, exactly."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read what `to_json` wrote.
+
+        Raises:
+            InputError: it is something else, or a value is none.
+        """
+        try:
+            fields = json.loads(text)
+            scene = _tuples(fields["scene"])
+            scene["trays"] = tuple(TrayParameters(**tray) for tray in scene["trays"])
+            scene["parts"] = tuple(PartParameters(**part) for part in scene["parts"])
+            return cls(
+                arm=ArmParameters(**_tuples(fields["arm"])),
+                sim=StepParameters(**fields["sim"]),
+                scene=SceneParameters(**scene),
+            )
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"the rig's parameters are not understood: {error}") from error
+
+
+def _tuples(value: Any) -> Any:
+    """JSON knows lists only; frozen parameters hold tuples."""
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return value

@@ -1,0 +1,355 @@
+"""One step of N rigs: magnet, motion, stops, contact, falling parts. A pure function of state, effort and parameters.
+
+`Plant` owns the state and the scratch memory of the step; it knows no clock and no bus, so the same object runs in
+real time, in a recording's verification and in a study of a thousand rigs. Between two steps everything that the
+next one depends on is in the published state, but for the speed of a part that is falling.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_runtime.errors import InputError
+from hilrig_sim.dynamics import ReducedDynamics
+from hilrig_sim.integrators import TABLEAUS, Tableau
+from hilrig_sim.model import RigParameters
+from hilrig_sim.stepping import FixedStep
+from hilrig_sim.stops import crossing, stop_outward
+from hilrig_sim.world import NONE, TOUCHING, World
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+TOOL_CONTACT_FLAG: Final = 1 << 8
+LARGEST_EFFORT: Final = 1e6
+"""Efforts beyond it, N·m or N, are no numbers of this arm: they are cut off so that the state stays finite."""
+
+
+class Happening(Enum):
+    """What a step may bring that is worth an event."""
+
+    LIMIT_HIT = "limit hit"
+    PART_PICKED = "part picked"
+    PART_DROPPED = "part dropped"
+
+
+@dataclass(frozen=True, slots=True)
+class PlantEvent:
+    """Something that happened to one rig in a step."""
+
+    happening: Happening
+    rig: int
+    joint: int = 0
+    """1 to 4 at a limit; 0: the tool, on what lies below it."""
+    upper: bool = False
+    speed: float = 0.0
+    """Of the joint at the impact; rad/s or m/s."""
+    part: int = NONE
+    """Index of the part in the rig's scene."""
+
+
+class Plant:
+    """N rigs that step together; they share step length, sub-steps and integrator, all else is each rig's own."""
+
+    def __init__(self, rigs: Sequence[RigParameters]) -> None:
+        """Start every rig at its start pose.
+
+        Raises:
+            InputError: no rig is given, or their steps differ.
+        """
+        if not rigs:
+            raise InputError("a plant needs at least one rig")
+        if len({rig.sim for rig in rigs}) > 1:
+            raise InputError("rigs that step together need the same step, sub-steps and integrator")
+        self.rigs = tuple(rigs)
+        count = len(rigs)
+        sim = rigs[0].sim
+        self._arms = [rig.arm for rig in rigs]
+        self._tableau: Tableau = TABLEAUS[sim.integrator]
+        self._substeps = sim.substeps
+        self._step = sim.step / sim.substeps
+        self.position = np.empty((4, count))
+        """q: rad, rad, m, rad, (4, N)."""
+        self.velocity = np.zeros((4, count))
+        """q̇: rad/s, rad/s, m/s, rad/s, (4, N)."""
+        self.error = np.zeros((4, count))
+        """Embedded estimate of the last integration step's error of q, (4, N)."""
+        self.world = World([rig.scene for rig in rigs])
+        self.dynamics = ReducedDynamics(self._arms)
+        self._integrator = FixedStep(self.dynamics, self._tableau, self._step)
+        self._l1 = np.array([arm.l1 for arm in self._arms])
+        self._lower = np.array([arm.lower for arm in self._arms]).T.copy()
+        self._stop = np.array([arm.upper for arm in self._arms]).T.copy()
+        self._upper = self._stop.copy()
+        """Upper stops, those of the quill raised to what lies below the tool."""
+        self._free3 = np.empty(count)
+        """d3 up to which nothing can be below the tool, m, (N,)."""
+        self._at_lower = np.zeros((4, count), dtype=np.bool_)
+        self._at_upper = np.zeros((4, count), dtype=np.bool_)
+        self._at_any = np.zeros((4, count), dtype=np.bool_)
+        self._below = np.zeros(count, dtype=np.bool_)
+        self._effort = np.zeros((4, count))
+        self._start_position = np.empty((4, count))
+        self._start_velocity = np.empty((4, count))
+        self._all_rigs = np.arange(count)
+        self._flags = [0] * count
+        self._touching = False
+        self._events: list[PlantEvent] = []
+        self.position[:] = np.array([arm.start for arm in self._arms]).T
+        self._begin_anew()
+
+    @property
+    def count(self) -> int:
+        """How many rigs there are."""
+        return len(self.rigs)
+
+    @property
+    def limit_flags(self) -> Sequence[int]:
+        """For each rig: bit j-1 joint j on its lower stop, bit 3+j on its upper one, bit 8 tool on what is below it."""
+        return self._flags
+
+    def tool(self, rigs: Ints) -> Floats:
+        """Poses (x, y, z, yaw) of the tools of some rigs, (4, K); (1)–(4)."""
+        theta1, theta2, d3, theta4 = self.position[:, rigs]
+        l2, l3 = self.dynamics.l2[rigs], self.dynamics.l3[rigs]
+        sum12 = theta1 + theta2
+        x = l2 * np.cos(theta1) + l3 * np.cos(sum12)
+        y = l2 * np.sin(theta1) + l3 * np.sin(sum12)
+        return np.stack([x, y, self._l1[rigs] - d3, sum12 + theta4])
+
+    def reset(self, rig: int) -> None:
+        """Put a rig and its parts back to the start, at rest."""
+        self.position[:, rig] = self._arms[rig].start
+        self.velocity[:, rig] = 0.0
+        self.error[:, rig] = 0.0
+        self.world.reset(rig)
+        self._begin_anew()
+
+    def place(
+        self,
+        rig: int,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        parts: Sequence[tuple[float, float, float, float]] | None = None,
+        held: int = NONE,
+    ) -> None:
+        """Set a rig's state: q and q̇, (4,) each, and where its parts are (x, y, z, yaw); None: as they are."""
+        self.position[:, rig] = position
+        self.velocity[:, rig] = velocity
+        if parts is not None:
+            self.world.place(rig, parts, held, self.tool(np.array([rig]))[:, 0])
+        self._begin_anew()
+
+    def step(self, effort: Floats, magnet: Bools) -> Sequence[PlantEvent]:
+        """Move every rig on by one step of the loop; says what happened, in a list that the next step reuses.
+
+        Args:
+            effort: τ1, τ2, τ3, τ4 of each rig, constant over the step; N·m, N·m, N, N·m, (4, N).
+            magnet: which magnets are on, (N,).
+        """
+        events = self._events
+        if events:
+            events.clear()
+        world = self.world
+        world.moving[:] = False
+        np.clip(effort, -LARGEST_EFFORT, LARGEST_EFFORT, out=self._effort)
+        self._switch_magnets(magnet)
+        for _ in range(self._substeps):
+            self._substep()
+        if world.held.max() != NONE:
+            holding = np.flatnonzero(world.held != NONE)
+            world.carry(holding, self.tool(holding))
+        if world.any_falling():
+            world.fall(self._step * self._substeps)
+            self._refresh_free()
+        return events
+
+    def _switch_magnets(self, magnet: Bools) -> None:
+        world = self.world
+        holds = world.held != NONE
+        changed = magnet != holds
+        if not changed.any():
+            return
+        dropping = np.flatnonzero(changed & holds)
+        if dropping.size:
+            for rig in dropping:
+                self._events.append(PlantEvent(Happening.PART_DROPPED, int(rig), part=int(world.held[rig])))
+            world.release(dropping)
+            self.dynamics.set_payload(world.payload())
+        wanting = np.flatnonzero(changed & magnet)
+        if wanting.size:
+            taken = world.attract(wanting, self.tool(wanting))
+            if taken.size:
+                for rig in taken:
+                    self._events.append(PlantEvent(Happening.PART_PICKED, int(rig), part=int(world.held[rig])))
+                self._share_momentum(taken)
+        if self._events:
+            self._refresh_free()
+
+    def _share_momentum(self, rigs: Ints) -> None:
+        """A part at rest is taken along: momentum stays, energy goes, as in any inelastic impact."""
+        dynamics = self.dynamics
+        before = [element[rigs] for element in dynamics.mass_matrix_12(self.position[1])]
+        mass3 = (dynamics.m3 + dynamics.payload)[rigs]
+        dynamics.set_payload(self.world.payload())
+        alpha, a12, a22 = (element[rigs] for element in dynamics.mass_matrix_12(self.position[1]))
+        v1, v2, v3, _ = self.velocity[:, rigs]
+        p1, p2 = before[0] * v1 + before[1] * v2, before[1] * v1 + before[2] * v2
+        determinant = alpha * a22 - a12 * a12
+        self.velocity[0, rigs] = (a22 * p1 - a12 * p2) / determinant
+        self.velocity[1, rigs] = (alpha * p2 - a12 * p1) / determinant
+        self.velocity[2, rigs] = v3 * mass3 / (dynamics.m3 + dynamics.payload)[rigs]
+
+    def _substep(self) -> None:
+        position, velocity = self.position, self.velocity
+        held = self._touching and self._hold_pressed()
+        self._start_position[:] = position
+        self._start_velocity[:] = velocity
+        self._integrator.advance(position, velocity, self._effort, self.error)
+        if held:
+            self.dynamics.hold(None)
+        if (position[2] > self._free3).any():
+            self._find_contact()
+        lower, upper = self._at_lower, self._at_upper
+        np.less_equal(position, self._lower, out=lower)
+        np.greater_equal(position, self._upper, out=upper)
+        if not np.logical_or(lower, upper, out=self._at_any).any():
+            if self._touching:
+                self._touching = False
+                self._update_flags()
+            return
+        self._touching = True
+        speed = velocity.copy()
+        if self._at_any[:2].any():
+            self._impact()
+            np.less_equal(position, self._lower, out=lower)
+            np.greater_equal(position, self._upper, out=upper)
+        # Joints 3 and 4 move by themselves: to stop them is to stop where the limit is.
+        np.copyto(position, self._lower, where=lower)
+        np.copyto(position, self._upper, where=upper)
+        np.copyto(velocity[2:], 0.0, where=(lower[2:] & (velocity[2:] < 0)) | (upper[2:] & (velocity[2:] > 0)))
+        self._update_flags(speed)
+
+    def _hold_pressed(self) -> bool:
+        """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
+        side1, side2 = self._sides()
+        if not (side1.any() or side2.any()):
+            return False
+        rates = self._integrator.accelerations(self.position, self.velocity, self._effort)
+        mass = self.dynamics.mass_matrix_12(self.position[1])
+        # Only what rests on a stop can be held there; what moves off it is free.
+        side1 = np.where(self.velocity[0] == 0, side1, 0.0)
+        side2 = np.where(self.velocity[1] == 0, side2, 0.0)
+        _, _, held1, held2 = stop_outward(rates[0], rates[1], side1, side2, mass)
+        if not (held1.any() or held2.any()):
+            return False
+        self.dynamics.hold(held1, held2)
+        return True
+
+    def _sides(self) -> tuple[Floats, Floats]:
+        sides = (self.position[:2] >= self._stop[:2]).astype(np.float64) - (self.position[:2] <= self._lower[:2])
+        return sides[0], sides[1]
+
+    def _find_contact(self) -> None:
+        """Raise the quill's stop to what lies below the tool, where it may reach it."""
+        world = self.world
+        rigs = np.flatnonzero(self.position[2] > self._free3)
+        tip = self.tool(rigs)
+        bottom = self._l1[rigs] - self._start_position[2, rigs] - world.held_height[rigs]
+        x, y = world.footprint_centre(rigs, tip)
+        below = world.contact(rigs, x, y, bottom)
+        self._upper[2] = self._stop[2]
+        self._upper[2, rigs] = np.minimum(self._stop[2, rigs], self._l1[rigs] - world.held_height[rigs] - below)
+
+    def _impact(self) -> None:
+        """Stop joints 1 and 2 at their limits: at the time within the step at which they get there."""
+        position, velocity = self.position, self.velocity
+        beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
+        rigs = np.flatnonzero(beyond.any(axis=0))
+        if rigs.size:
+            limit = np.where(position[:2] > self._stop[:2], self._stop[:2], self._lower[:2])[:, rigs]
+            q0, v0 = self._start_position[:, rigs], self._start_velocity[:, rigs]
+            q1, v1 = position[:, rigs], velocity[:, rigs]
+            outside = beyond[:, rigs]
+            shares = np.ones((2, rigs.size))
+            for joint in (0, 1):
+                share = crossing(q0[joint], q1[joint], v0[joint] * self._step, v1[joint] * self._step, limit[joint])
+                shares[joint] = np.where(outside[joint], share, 1.0)
+            first = shares.min(axis=0)
+            arms = [self._arms[rig] for rig in rigs]
+            dynamics = ReducedDynamics(arms)
+            dynamics.set_payload(self.dynamics.payload[rigs])
+            effort = self._effort[:, rigs]
+            plane, plane_rate = q0.copy(), v0.copy()
+            FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, effort)
+            arriving = outside & (shares == first)
+            np.copyto(plane[:2], limit, where=arriving)
+            side = np.where(arriving, np.sign(limit - q0[:2]), 0.0)
+            side = np.where(arriving & (side == 0), np.sign(q1[:2] - limit), side)
+            self._stop_plane(dynamics, plane, plane_rate, side)
+            # The rest of the step goes on from the stop, pressed onto it or leaving it.
+            rest = FixedStep(dynamics, self._tableau, (1.0 - first) * self._step)
+            rates = rest.accelerations(plane, plane_rate, effort)
+            mass = dynamics.mass_matrix_12(plane[1])
+            resting = np.where(plane_rate[:2] == 0, side, 0.0)
+            _, _, held1, held2 = stop_outward(rates[0], rates[1], resting[0], resting[1], mass)
+            dynamics.hold(held1, held2)
+            rest.advance(plane, plane_rate, effort)
+            # Joints 3 and 4 had the whole step already.
+            position[:2, rigs], velocity[:2, rigs] = plane[:2], plane_rate[:2]
+        # What is at a stop at the end, by a second impact in one step or since before, does not move outwards.
+        np.maximum(position[:2], self._lower[:2], out=position[:2])
+        np.minimum(position[:2], self._stop[:2], out=position[:2])
+        self._stop_plane(self.dynamics, position, velocity, np.array(self._sides()))
+
+    @staticmethod
+    def _stop_plane(dynamics: ReducedDynamics, position: Floats, velocity: Floats, side: Floats) -> None:
+        mass = dynamics.mass_matrix_12(position[1])
+        velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
+
+    def _update_flags(self, speed: Floats | None = None) -> None:
+        """Restate the limit flags, and tell of the limits that were hit since."""
+        np.less(self._upper[2], self._stop[2], out=self._below)
+        for rig in np.flatnonzero(self._at_any.any(axis=0) | (np.asarray(self._flags) != 0)):
+            flags = 0
+            for joint in range(4):
+                if self._at_lower[joint, rig]:
+                    flags |= 1 << joint
+                if self._at_upper[joint, rig]:
+                    flags |= TOOL_CONTACT_FLAG if joint == 2 and self._below[rig] else 1 << (4 + joint)
+            new = flags & ~self._flags[rig]
+            self._flags[rig] = flags
+            if new and speed is not None:
+                self._tell_hits(int(rig), new, speed)
+
+    def _tell_hits(self, rig: int, new: int, speed: Floats) -> None:
+        for joint in range(4):
+            for upper in (False, True):
+                if new & (1 << (4 * upper + joint)):
+                    hit = PlantEvent(Happening.LIMIT_HIT, rig, joint + 1, upper, abs(float(speed[joint, rig])))
+                    self._events.append(hit)
+        if new & TOOL_CONTACT_FLAG:
+            self._events.append(PlantEvent(Happening.LIMIT_HIT, rig, 0, True, abs(float(speed[2, rig]))))
+
+    def _begin_anew(self) -> None:
+        self.dynamics.set_payload(self.world.payload())
+        self._refresh_free()
+        self._upper[2] = self._stop[2]
+        if (self.position[2] > self._free3).any():
+            self._start_position[:] = self.position
+            self._find_contact()
+        np.less_equal(self.position, self._lower, out=self._at_lower)
+        np.greater_equal(self.position, self._upper, out=self._at_upper)
+        np.logical_or(self._at_lower, self._at_upper, out=self._at_any)
+        self._touching = bool(self._at_any.any())
+        self._update_flags()
+
+    def _refresh_free(self) -> None:
+        np.subtract(self._l1, self.world.held_height, out=self._free3)
+        np.subtract(self._free3, self.world.highest, out=self._free3)
+        np.subtract(self._free3, TOUCHING, out=self._free3)
