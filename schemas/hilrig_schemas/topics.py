@@ -1,8 +1,8 @@
 """The one registry of topics: key on the bus, message type, kind of traffic, channel in a recording.
 
 No key string stands anywhere else. A key is `hil/<lab>/<rig>/<name>` for what concerns a rig and
-`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; `log`, `health` and `alive` are therefore no
-names for a rig.
+`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; `log`, `health`, `control` and `alive` are
+therefore no names for a rig.
 """
 
 import re
@@ -79,9 +79,11 @@ TRAFFIC: Final = RigTopic("traffic", ModbusTraffic, Traffic.REPORT, channel="/tr
 CONFIG: Final = RigTopic("config", RigConfig, Traffic.QUERY)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
+CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
+"""What a person asks of a service: the recorder begins and ends sessions by hand."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG)  # type: ignore[assignment]
-SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH)  # type: ignore[assignment]
+SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL)  # type: ignore[assignment]
 RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in RIG_TOPICS if topic.channel}
 
 ALIVE: Final = "alive"

@@ -19,6 +19,7 @@ SCHEMA_VERSION: Final = "hilrig.v1"
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _FIXED_LENGTH: Final = _MESSAGE.size - 9
+_OPCODE: Final = int(Opcode.MESSAGE)
 _pack: Final = _MESSAGE.pack
 
 
@@ -53,14 +54,5 @@ CHANNEL_OF_TOPIC: Final = {name: number for number, name in enumerate(RECORDED, 
 
 def encode_message(channel_id: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> bytes:
     """One MCAP message record; times are wall clock, ns. MCAP keeps 32 bits of the sequence number."""
-    return (
-        _pack(
-            Opcode.MESSAGE.value,
-            _FIXED_LENGTH + len(payload),
-            channel_id,
-            sequence & 0xFFFFFFFF,
-            log_time,
-            publish_time,
-        )
-        + payload
-    )
+    length = _FIXED_LENGTH + len(payload)
+    return _pack(_OPCODE, length, channel_id, sequence & 0xFFFFFFFF, log_time, publish_time) + payload

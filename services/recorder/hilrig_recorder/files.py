@@ -4,6 +4,7 @@
 too large, the disk was full for a while) the next is `<session>.2.mcap`, and its metadata names the one before.
 """
 
+import contextlib
 import errno
 import platform
 import shutil
@@ -16,11 +17,12 @@ from typing import Final
 
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.disk import Disk
-from hilrig_recorder.recover import read_tail
+from hilrig_recorder.recover import Tail, read_tail
 from hilrig_recorder.sessions import SECOND_NS, Recording, Sink
 from hilrig_recorder.writer import RunWriter, part_path
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import RecorderConfig
+from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, RigConfig
 
 CHUNK_NS: Final = SECOND_NS
@@ -100,10 +102,10 @@ class Files:
         folder = self.folder / recording.rig
         number, previous = self._next_number(folder, recording.session)
         if previous is not None:
-            tail = read_tail(previous if previous.exists() else part_path(previous))
+            tail = self._tail(previous)
             if tail.end == "ended":
                 return None
-            recording.seen = tail.keys
+            recording.seen, recording.last = tail.keys, tail.last
         if self._full:
             return None
         return self._open_file(recording, folder, number, previous)
@@ -184,6 +186,14 @@ class Files:
         self._trouble.pop(about, None)
 
     # -- files ------------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _tail(previous: Path) -> Tail:
+        # It may get its name just now, from the disk's thread or because it is recovered.
+        for path in (previous, part_path(previous), previous):
+            with contextlib.suppress(InputError):
+                return read_tail(path)
+        return Tail("", set(), {})
 
     def _next_number(self, folder: Path, session: str) -> tuple[int, Path | None]:
         number, previous = 1, None

@@ -18,6 +18,7 @@ from hilrig_recorder.writer import LIBRARY, PART_SUFFIX, RunWriter, lock_file
 from hilrig_runtime.errors import InputError, OperationError
 
 RECOVERING_SUFFIX: Final = ".recovering"
+_HEAD_BYTES: Final = 64 * 1024
 TAIL_NS: Final = 15_000_000_000
 """How far back from its end a file's messages are looked at when the next file of its session begins."""
 
@@ -50,8 +51,8 @@ class Tail:
     """How it ended, as its summary says; empty: it has none."""
     keys: set[tuple[int, int, int]]
     """Channel, sequence and publish time of its last messages."""
-    session: dict[str, str]
-    """What `hilrig.session` says of it."""
+    last: dict[int, tuple[int, int]]
+    """Sequence and publish time of the last message of each channel."""
 
 
 def map_file(path: Path) -> memoryview:
@@ -75,15 +76,13 @@ def read_tail(path: Path) -> Tail:
     Raises:
         InputError: it can't be read.
     """
-    end, session = "", {}
+    end = ""
+    last: dict[int, tuple[int, int]] = {}
     chunks: list[Chunk] = []
     keys: set[tuple[int, int, int]] = set()
     for _, item in scan(map_file(path)):
-        if isinstance(item, Metadata):
-            if item.name == "hilrig.summary":
-                end = item.metadata.get("ended", "")
-            elif item.name == "hilrig.session":
-                session = item.metadata
+        if isinstance(item, Metadata) and item.name == "hilrig.summary":
+            end = item.metadata.get("ended", "")
         elif isinstance(item, Chunk):
             chunks.append(item)
     horizon = max((chunk.last_ns for chunk in chunks), default=0) - TAIL_NS
@@ -93,7 +92,20 @@ def read_tail(path: Path) -> Tail:
                 for message in open_chunk(chunk):
                     if isinstance(message, Message):
                         keys.add((message.channel_id, message.sequence, message.publish_time))
-    return Tail(end, keys, session)
+                        last[message.channel_id] = (message.sequence, message.publish_time)
+    return Tail(end, keys, last)
+
+
+def session_of(path: Path) -> dict[str, str]:
+    """What `hilrig.session` at a file's beginning says; empty: nothing.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    for _, item in scan(map_file(path)[:_HEAD_BYTES]):
+        if isinstance(item, Metadata) and item.name == "hilrig.session":
+            return dict(item.metadata)
+    return {}
 
 
 def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: True) -> Recovery:
@@ -153,7 +165,7 @@ class _Copy:
         self._last_ns = 0
 
     def write(self, path: Path, part: Path, go_on: Callable[[], bool]) -> None:
-        header = next((item for _, item in scan(self._view[: 1 << 16]) if isinstance(item, Header)), None)
+        header = next((item for _, item in scan(self._view[:_HEAD_BYTES]) if isinstance(item, Header)), None)
         if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
             raise InputError(f"{self._recovery.source}: holds nothing of an MCAP file")
         ours = header is not None and header.library == LIBRARY

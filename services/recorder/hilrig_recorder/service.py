@@ -2,25 +2,36 @@
 
 import contextlib
 import logging
+import random
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Final
 
 from google.protobuf.message import DecodeError
 
+from hilrig_recorder.by_hand import HandSessions
 from hilrig_recorder.disk import Disk
 from hilrig_recorder.files import Files
+from hilrig_recorder.guard import FolderLock, elder, introduction
+from hilrig_recorder.housekeeping import Housekeeping, unfinished
 from hilrig_recorder.intake import Intake
+from hilrig_recorder.recover import session_of
 from hilrig_recorder.sessions import SECOND_NS, Recording, SessionBook
 from hilrig_recorder.writer import RunWriter
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, RigConfig
-from hilrig_schemas.topics import CONFIG, LOG
+from hilrig_schemas import Event, OpenSession, RigConfig
+from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
 TICK_NS: Final = SECOND_NS // 10
 _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
+_ANSWER_TIMEOUT_S: Final = 1.0
+_ELDER_PERIOD_NS: Final = 10 * SECOND_NS
 _LAST_BATCHES_NS: Final = SECOND_NS // 2
 """When it is told to stop, the recorder waits so long for what the others still have to say."""
 _FINISH_TIMEOUT_S: Final = 0.5
@@ -32,13 +43,37 @@ def run(service: Service) -> None:
     """Record every session of the lab until the service is told to stop.
 
     Raises:
-        OperationError: the folder for recordings can't be written.
+        OperationError: the folder for recordings can't be written, or another recorder records this lab.
     """
-    recorder = Recorder(service)
-    try:
+    with ExitStack() as closing:
+        closing.enter_context(_own_folder(service))
+        recorder = Recorder(service)
+        closing.callback(recorder.close)
         recorder.run()
-    finally:
-        recorder.close()
+
+
+def _own_folder(service: Service) -> FolderLock:
+    folder = service.lab.recorder.folder / service.lab.name
+    probe = folder / f".probe-{service.incarnation}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+        return FolderLock(folder)
+    except OSError as error:
+        raise OperationError(
+            f"{folder}: recordings can't be written there: {error.strerror}; choose another recorder.folder"
+        ) from error
+
+
+@dataclass(slots=True)
+class _Request:
+    """What a person asked for, on its way to the recorder's thread and back."""
+
+    event: Event
+    answer: Event = field(default_factory=Event)
+    refusal: str = ""
+    done: threading.Event = field(default_factory=threading.Event)
 
 
 class Recorder:
@@ -47,21 +82,23 @@ class Recorder:
     def __init__(self, service: Service) -> None:
         self._service = service
         self._clock = service.clock
-        config = service.lab.recorder
-        self._check_folder(service)
-        self._intake = Intake(config.queue_entries, service.clock)
+        lab, config = service.lab, service.lab.recorder
         # What other threads have to say; the recorder's thread listens.
-        self._troubles: SimpleQueue[tuple[RunWriter, OSError]] = SimpleQueue()
+        self._troubles: SimpleQueue[tuple[RunWriter, OSError] | str] = SimpleQueue()
         self._configs: SimpleQueue[tuple[str, RigConfig | None]] = SimpleQueue()
+        self._requests: SimpleQueue[_Request] = SimpleQueue()
+        self._elders: SimpleQueue[str] = SimpleQueue()
+        self._elder_due_ns = 0
         self._asked: dict[str, int] = {}
-        self._asking = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
+        self._asking = ThreadPoolExecutor(max_workers=2, thread_name_prefix="asking")
+        self._intake = Intake(config.queue_entries, service.clock)
         self._disk = Disk(
             service.clock,
             on_trouble=lambda writer, error: self._troubles.put((writer, error)),
             on_published=lambda writer: logger.info("recorded %s", writer.path),
         )
         self._files = Files(
-            service.lab.name,
+            lab.name,
             config,
             service.clock,
             self._disk,
@@ -70,28 +107,36 @@ class Recorder:
             ask_config=self._ask_config,
             give_up=self._give_up,
         )
-        self._book = SessionBook(service.lab.name, config.preroll_s, self._files)
-        self._stream = service.bus.subscribe_recording(
-            LOG.key(service.lab.name, "*", "*"), self._intake.offer, self._on_loss
-        )
+        self._book = SessionBook(lab.name, config.preroll_s, self._files)
+        self._by_hand = HandSessions((rig.name for rig in lab.rigs), random.Random(service.incarnation))
+        parts = unfinished(self._files.folder)
+        self._restore(parts)
+        self._stream = service.bus.subscribe_recording(LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss)
+        self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
+        self._housekeeping = Housekeeping(self._files.folder, parts, config, service.clock, self._troubles.put)
 
-    @staticmethod
-    def _check_folder(service: Service) -> None:
-        folder = service.lab.recorder.folder / service.lab.name
-        probe = folder / f".probe-{service.incarnation}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            raise OperationError(
-                f"{folder}: recordings can't be written there: {error.strerror}; choose another recorder.folder"
-            ) from error
+    def _restore(self, parts: list[Path]) -> None:
+        for part in parts:
+            with contextlib.suppress(HilrigError, ValueError):
+                session = session_of(part)
+                if session.get("keeper") == self._service.source:
+                    start_wall_ns = int(session["start_wall_ns"])
+                    self._by_hand.restore(
+                        OpenSession(rig=session["rig"], session=session["session"], start_wall_ns=start_wall_ns)
+                    )
+
+    # -- the loop ---------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Record until the service is told to stop, then what was sent before that."""
+        """Record until the service is told to stop, then what was sent before that.
+
+        Raises:
+            OperationError: another recorder was here before.
+        """
         service, clock = self._service, self._clock
         due_ns = clock.monotonic_ns()
+        self._make_way(self._find_elder())
+        service.log.set_sessions(self._by_hand.sessions)
         service.ready()
         while not service.stopping.is_set():
             due_ns = self._turn(due_ns)
@@ -115,22 +160,33 @@ class Recorder:
 
     def _tick(self, now_ns: int) -> None:
         self._book.tick(now_ns, self._clock.wall_ns())
-        with contextlib.suppress(Empty):
-            while True:
-                self._files.fail(*self._troubles.get_nowait())
-        with contextlib.suppress(Empty):
-            while True:
-                rig, config = self._configs.get_nowait()
-                if config is None:
-                    self._asked[rig] = now_ns + _CONFIG_RETRY_NS
-                else:
-                    self._asked.pop(rig, None)
-                    self._files.configure(config)
+        self._hear()
         self._files.tick(now_ns)
         for rig in self._files.unconfigured():
             if now_ns >= self._asked.get(rig, 0):
                 self._ask_config(rig)
+        if now_ns >= self._elder_due_ns:
+            self._elder_due_ns = now_ns + _ELDER_PERIOD_NS
+            self._asking.submit(lambda: self._elders.put(self._find_elder()))
         self._report(now_ns)
+
+    def _hear(self) -> None:
+        with contextlib.suppress(Empty):
+            while True:
+                trouble = self._troubles.get_nowait()
+                if isinstance(trouble, str):
+                    self._tell(Event(severity=Event.ERROR, text=trouble))
+                else:
+                    self._files.fail(*trouble)
+        with contextlib.suppress(Empty):
+            while True:
+                self._take_config(*self._configs.get_nowait())
+        with contextlib.suppress(Empty):
+            while True:
+                self._do(self._requests.get_nowait())
+        with contextlib.suppress(Empty):
+            while True:
+                self._make_way(self._elders.get_nowait())
 
     def _report(self, now_ns: int) -> None:
         counters, intake, book = self._service.counters, self._intake, self._book
@@ -144,17 +200,64 @@ class Recorder:
         counters.trouble = self._files.trouble
         self._service.beat(now_ns)
 
+    def _tell(self, event: Event) -> None:
+        logger.warning("%s", event.text)
+        self._service.emit(event)
+
+    def _give_up(self, recording: Recording) -> None:
+        self._book.drop(recording)
+
     @staticmethod
     def _on_loss(batches: int) -> None:
         # What was lost is counted from the sequence numbers, where it is known to whom it belonged.
         logger.warning("%d batches of a log stream were lost on the way", batches)
 
-    def _give_up(self, recording: Recording) -> None:
-        self._book.drop(recording)
+    # -- sessions by hand -------------------------------------------------------------------------------------------
 
-    def _tell(self, event: Event) -> None:
-        logger.warning("%s", event.text)
-        self._service.emit(event)
+    def _answer(self, payload: bytes) -> bytes:
+        """Answer a question; on a thread of the bus, so the recorder's own thread does it."""
+        try:
+            request = _Request(Event.FromString(payload))
+        except DecodeError as error:
+            raise OperationError("a request that can't be decoded") from error
+        if request.event.kind == Event.KIND_UNSPECIFIED:
+            return introduction(self._service.source, self._service.incarnation)
+        self._requests.put(request)
+        if not request.done.wait(_ANSWER_TIMEOUT_S):
+            raise OperationError("the recorder is too busy to answer")
+        if request.refusal:
+            raise OperationError(request.refusal)
+        return request.answer.SerializeToString()
+
+    def _do(self, request: _Request) -> None:
+        event = request.event
+        try:
+            if event.kind == Event.SESSION_START:
+                request.answer = self._by_hand.begin(event.rig, self._clock.wall_ns())
+            elif event.kind == Event.SESSION_END:
+                request.answer = self._by_hand.end(event.rig)
+            else:
+                raise OperationError("a request that the recorder does not know")
+            self._service.emit(request.answer)
+            self._service.log.set_sessions(self._by_hand.sessions)
+        except HilrigError as error:
+            request.refusal = str(error)
+        request.done.set()
+
+    # -- questions to others ----------------------------------------------------------------------------------------
+
+    def _find_elder(self) -> str:
+        key = CONTROL.key(self._service.lab.name, self._service.name, "*")
+        try:
+            return elder(self._service.bus.ask(key, timeout_s=_ANSWER_TIMEOUT_S), self._service.incarnation)
+        except OperationError:
+            # The bus is being closed.
+            return ""
+
+    @staticmethod
+    def _make_way(found: str) -> None:
+        if found:
+            raise OperationError(f"another recorder records this lab already: {found}; one is enough")
 
     def _ask_config(self, rig: str) -> None:
         # Not again while an answer is awaited.
@@ -166,7 +269,8 @@ class Recorder:
     def _fetch_config(self, rig: str) -> None:
         config = None
         try:
-            for answer in self._service.bus.ask(CONFIG.key(self._service.lab.name, rig), timeout_s=_CONFIG_TIMEOUT_S):
+            key = CONFIG.key(self._service.lab.name, rig)
+            for answer in self._service.bus.ask(key, timeout_s=_CONFIG_TIMEOUT_S):
                 if not answer.error:
                     config = CONFIG.decode(answer.payload)
         except (DecodeError, OperationError) as error:
@@ -174,10 +278,21 @@ class Recorder:
         finally:
             self._configs.put((rig, config))
 
+    def _take_config(self, rig: str, config: RigConfig | None) -> None:
+        if config is None:
+            self._asked[rig] = self._clock.monotonic_ns() + _CONFIG_RETRY_NS
+        else:
+            self._asked.pop(rig, None)
+            self._files.configure(config)
+
+    # -- the end ----------------------------------------------------------------------------------------------------
+
     def close(self) -> None:
-        """Finish every file; a second call does nothing."""
+        """Finish every file."""
         self._stream.close()
+        self._control.close()
         self._asking.shutdown(wait=False, cancel_futures=True)
         self._book.stop()
         if not self._disk.close(_FINISH_TIMEOUT_S):
             logger.error("the disk is too slow: some files keep their .part name, to be recovered")
+        self._housekeeping.close()

@@ -86,6 +86,8 @@ class Recording:
     """The sink's `add`."""
     seen: set[tuple[int, int, int]] | None = None
     """Messages (channel, sequence, publish time) that an earlier file of this session holds; None: none is known."""
+    last: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Last sequence and publish time of each channel in that earlier file."""
     end_wall_ns: int | None = None
     """Its end, sender's wall clock, ns; None: it goes on."""
     end_reason: str = ""
@@ -99,7 +101,16 @@ class Recording:
         """Whether a message belongs into this file."""
         if self.end_wall_ns is not None and publish_ns > self.end_wall_ns + POSTROLL_NS:
             return False
-        return self.seen is None or (channel_id, sequence & 0xFFFFFFFF, publish_ns) not in self.seen
+        if self.seen is None:
+            return True
+        if (channel_id, sequence & 0xFFFFFFFF, publish_ns) in self.seen:
+            return False
+        # The first new message of a channel with one sender tells what was missed between the files.
+        if channel_id != _EVENT_CHANNEL and channel_id in self.last:
+            last_sequence, last_publish_ns = self.last.pop(channel_id)
+            if publish_ns > last_publish_ns and sequence > last_sequence:
+                self.tally.lost_recorder += sequence - last_sequence - 1
+        return True
 
     def forget_seen(self) -> None:
         """Stop comparing with the earlier file: what could come twice has come."""
@@ -111,7 +122,8 @@ class Shelf(Protocol):
     """Where recordings are put; implemented by the recorder's files, and by a list in a test."""
 
     def open(self, recording: Recording) -> Sink | None:
-        """Begin a recording's file; None: it must not or cannot be recorded. It may set `recording.seen`."""
+        """Begin a recording's file; None: it must not or cannot be recorded. It may set `recording.seen` and
+        `recording.last`."""
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
         """End a recording's file; `end` is one word for programs, `reason` a sentence for people."""

@@ -74,7 +74,7 @@ class RunWriter:
         library: str = LIBRARY,
         part: Path | None = None,
         on_failure: Callable[[OSError], None] | None = None,
-        level: int = 3,
+        level: int = 1,
     ) -> None:
         self.path = path
         self.part = part_path(path) if part is None else part

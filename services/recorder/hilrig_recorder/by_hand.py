@@ -1,0 +1,62 @@
+"""Sessions that a person begins and ends with `hilrig record`; the recorder keeps them, as the edge keeps the others.
+
+Beginning one only says so on the recorder's own log stream: from there on it is a session like any other.
+"""
+
+import random
+import string
+from collections.abc import Iterable
+from datetime import UTC, datetime
+
+from hilrig_runtime.errors import OperationError
+from hilrig_schemas import Event, OpenSession
+
+
+class HandSessions:
+    """At most one session by hand for each rig."""
+
+    def __init__(self, rigs: Iterable[str], letters: random.Random) -> None:
+        self._rigs = sorted(rigs)
+        self._letters = letters
+        self._open: dict[str, OpenSession] = {}
+
+    @property
+    def sessions(self) -> list[OpenSession]:
+        """Those that go on, as the log stream states them."""
+        return list(self._open.values())
+
+    def restore(self, session: OpenSession) -> None:
+        """Go on with a session of a recorder that did not end it."""
+        self._open.setdefault(session.rig, session)
+
+    def begin(self, rig: str, wall_ns: int) -> Event:
+        """Begin one; the event to send.
+
+        Raises:
+            OperationError: there is no such rig, or it is being recorded by hand already.
+        """
+        if rig not in self._rigs:
+            raise OperationError(f"{rig!r} is no rig of this lab; it has {', '.join(self._rigs)}")
+        if rig in self._open:
+            raise OperationError(f"{rig} is being recorded by hand already: {self._open[rig].session}")
+        time = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
+        session = f"{time}-{rig}-{''.join(self._letters.choices(string.ascii_lowercase, k=4))}"
+        self._open[rig] = OpenSession(rig=rig, session=session, start_wall_ns=wall_ns)
+        return self._event(Event.SESSION_START, rig, session, "begun by hand")
+
+    def end(self, rig: str) -> Event:
+        """End one; the event to send.
+
+        Raises:
+            OperationError: the rig is not being recorded by hand.
+        """
+        session = self._open.pop(rig, None)
+        if session is None:
+            raise OperationError(f"{rig} is not being recorded by hand")
+        return self._event(Event.SESSION_END, rig, session.session, "ended by hand")
+
+    @staticmethod
+    def _event(kind: Event.Kind, rig: str, session: str, reason: str) -> Event:
+        event = Event(kind=kind, rig=rig, session=session, severity=Event.INFO, text=f"recording {session} {reason}")
+        event.session_data.reason = reason
+        return event
