@@ -54,12 +54,13 @@ def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
         "listen/endpoints": listen,
         "connect/endpoints": connect,
         # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
-        # between tries; a peer connects whenever the others come up.
-        "connect/timeout_ms": 500 if mode == "client" else 0,
+        # between tries; a peer opens at once and connects whenever the others come up, also for the second time.
+        "connect/timeout_ms": 500 if mode == "client" else -1,
         "connect/exit_on_failure": mode == "client",
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
         # Implicit shared memory can lose data, and a batch is larger than its threshold.
         "transport/shared_memory/enabled": False,
     }

@@ -133,6 +133,18 @@ def test_what_was_closed_is_silent_and_closing_twice_is_fine(open_bus: OpenBus) 
     edge.close()
 
 
+def test_services_find_each_other_in_any_order_and_again_after_a_restart() -> None:
+    config = BusConfig(first_port=free_ports(3))
+    got: list[bytes] = []
+    with ZenohBus(config, "recorder") as recorder, ZenohBus(config, "edge") as edge:
+        for bus in (recorder, edge):
+            bus.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(payload))
+        for life in (b"first", b"second"):
+            with ZenohBus(config, "sim") as sim:
+                publisher = sim.publisher("hil/lab/rig1/state", Traffic.CONTROL)
+                eventually(lambda life=life, publisher=publisher: publisher.put(life) or got.count(life) >= 2)
+
+
 def test_a_taken_bus_port_is_said_in_one_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
