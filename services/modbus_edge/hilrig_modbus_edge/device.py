@@ -13,7 +13,7 @@ from typing import Final, Protocol
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge import codec, registers
-from hilrig_modbus_edge.client import Client, Host, Served
+from hilrig_modbus_edge.client import Client, Host
 from hilrig_modbus_edge.image import StateImage
 from hilrig_modbus_edge.lease import Lease
 from hilrig_modbus_edge.registers import Status, Table
@@ -164,8 +164,8 @@ class Device:
         if end <= registers.POSITION:
             return bytes(self._torque[2 * address : 2 * end])
         if end <= registers.PAPER_END:
-            image = bytes(self._torque) + self._show(client).position_words
-            return image[2 * address : 2 * end]
+            positions = self._show(client).position_words
+            return (bytes(self._torque) + positions)[2 * address : 2 * end]
         if address >= registers.ECHO and end <= registers.EXTENDED_END:
             image = self._echo.to_bytes(2, "big") + (self.watchdog.timeout_ns // MS).to_bytes(2, "big")
             return image[2 * (address - registers.ECHO) : 2 * (end - registers.ECHO)]
@@ -312,15 +312,16 @@ class Device:
             self._open_session(client)
             self._emit(Event.LEASE_GRANTED, Event.INFO, f"{client.address} holds {self.rig}", client.address)
             self._last_writer = client.address
-        was_watching = self.watchdog.fed_ns is not None
-        if self.watchdog.feed(now_ns):
-            event = self._event(
-                Event.WATCHDOG_REARM, Event.INFO, f"{client.address} writes again: the watchdog is armed"
-            )
-            event.watchdog_data.timeout_ns = self.watchdog.timeout_ns
+        watchdog = self.watchdog
+        if watchdog.fed_ns is not None:
+            watchdog.fed_ns = now_ns
+            return
+        if watchdog.feed(now_ns):
+            text = f"{client.address} writes again: the watchdog is armed"
+            event = self._event(Event.WATCHDOG_REARM, Event.INFO, text)
+            event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._outlet.emit(event)
-        if not was_watching:
-            self._rewatch()
+        self._rewatch()
 
     def _rewatch(self) -> None:
         deadline_ns = self.watchdog.deadline_ns
@@ -454,7 +455,7 @@ class Device:
     def _look(self) -> StateImage:
         arrival = self._newest_state()
         state = self._state
-        if arrival is not None and arrival is not state.arrival:
+        if arrival is not state.arrival and arrival is not None:
             state.take(arrival)
         return state
 
@@ -462,8 +463,8 @@ class Device:
         state = self._look()
         if state.arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
-        # Stamped behind the look at the bus: a state is never shown before it came.
-        client.shown(Served(state.incarnation, state.step, state.arrived_ns, self._monotonic_ns(), 0))
+        # Stamped after the look at the bus: a state is never shown before it came.
+        client.shown((state.incarnation, state.step, state.arrived_ns, self._monotonic_ns(), 0))
         return state
 
     def _input_image(self, client: Client) -> bytes:

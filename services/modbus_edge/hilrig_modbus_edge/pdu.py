@@ -63,14 +63,10 @@ def exception(function: int, code: int) -> bytes:
     return bytes((function | 0x80, code))
 
 
-def _read_holding(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
-    _, address, count = _address_and_count(request, MAX_READ_REGISTERS)
-    return bytes((0x03, 2 * count)) + device.read_registers(client, Table.HOLDING_REGISTER, address, count)
-
-
-def _read_input(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
-    _, address, count = _address_and_count(request, MAX_READ_REGISTERS)
-    return bytes((0x04, 2 * count)) + device.read_registers(client, Table.INPUT_REGISTER, address, count)
+def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+    function, address, count = _address_and_count(request, MAX_READ_REGISTERS)
+    table = Table.HOLDING_REGISTER if function == 0x03 else Table.INPUT_REGISTER
+    return bytes((function, 2 * count)) + device.read_registers(client, table, address, count)
 
 
 def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
@@ -95,7 +91,7 @@ def _write_register(device: Device, client: Client, request: bytes, arrived_ns: 
 
 
 def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    address, count = _block(request, MAX_WRITE_BITS, lambda count: (count + 7) // 8)
+    address, count = _block(request, MAX_WRITE_BITS, bits=True)
     if count > 1:
         # No two coils are neighbours.
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
@@ -104,7 +100,7 @@ def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int
 
 
 def _write_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    address, _ = _block(request, MAX_WRITE_REGISTERS, lambda count: 2 * count)
+    address, _ = _block(request, MAX_WRITE_REGISTERS)
     device.write_registers(client, address, request[6:], arrived_ns)
     return request[:5]
 
@@ -155,23 +151,24 @@ def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -
 
 
 def _address_and_count(request: bytes, most: int) -> tuple[int, int, int]:
-    function, address, count = _unpack(_ADDRESS_WORD, request)
-    if not 1 <= count <= most:
-        raise ModbusError(ExcCodes.ILLEGAL_VALUE)
-    return function, address, count
+    # Too long is as wrong as too short.
+    if len(request) == _ADDRESS_WORD.size:
+        fields: tuple[int, int, int] = _ADDRESS_WORD.unpack(request)
+        if 1 <= fields[2] <= most:
+            return fields
+    raise ModbusError(ExcCodes.ILLEGAL_VALUE)
 
 
-def _block(request: bytes, most: int, size_of: Callable[[int], int]) -> tuple[int, int]:
-    if len(request) < _ADDRESS_BLOCK.size:
-        raise ModbusError(ExcCodes.ILLEGAL_VALUE)
-    _, address, count, size = _ADDRESS_BLOCK.unpack_from(request)
-    if not (1 <= count <= most and size == size_of(count) == len(request) - _ADDRESS_BLOCK.size):
-        raise ModbusError(ExcCodes.ILLEGAL_VALUE)
-    return address, count
+def _block(request: bytes, most: int, *, bits: bool = False) -> tuple[int, int]:
+    if len(request) > _ADDRESS_BLOCK.size:
+        _, address, count, size = _ADDRESS_BLOCK.unpack_from(request)
+        needed = (count + 7) // 8 if bits else 2 * count
+        if 1 <= count <= most and size == needed == len(request) - _ADDRESS_BLOCK.size:
+            return address, count
+    raise ModbusError(ExcCodes.ILLEGAL_VALUE)
 
 
 def _unpack(layout: struct.Struct, request: bytes) -> tuple[int, ...]:
-    # A request that is too long is as wrong as one that is too short.
     if len(request) != layout.size:
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
     return layout.unpack(request)
@@ -180,8 +177,8 @@ def _unpack(layout: struct.Struct, request: bytes) -> tuple[int, ...]:
 _HANDLERS: Final[dict[int, Handler]] = {
     0x01: _read_bits,
     0x02: _read_bits,
-    0x03: _read_holding,
-    0x04: _read_input,
+    0x03: _read_registers,
+    0x04: _read_registers,
     0x05: _write_coil,
     0x06: _write_register,
     0x0F: _write_coils,

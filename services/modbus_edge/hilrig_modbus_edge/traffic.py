@@ -3,25 +3,20 @@
 The request path pays for one tuple. Requests are kept as the bytes that came.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
 from hilrig_schemas import ModbusTraffic
 
-MOST: Final = 4096
-"""Notes after which a batch is due though its time has not come: memory stays bounded under a flood."""
+MOST: Final = 256
+"""Notes after which a batch is due though its time has not come: no batch takes long to encode."""
 _SINGLE: Final = frozenset({0x05, 0x06, 0x16})
 """Functions whose third word is a value, not a count."""
 _ADDRESSED: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
 
 
-class Note(NamedTuple):
-    """One request."""
-
-    pdu: bytes
-    arrived_ns: int
-    answered_ns: int
-    exception: int
-    controller: str
+Note = tuple[bytes, int, int, int, str]
+"""One request: its PDU, when it arrived and was answered (ns, monotonic clock), the exception code of the answer or 0,
+and the controller's address. A plain tuple, for one is made with each request."""
 
 
 def batch(rig: str, notes: list[Note], closed_ns: int, wall_ns: int) -> ModbusTraffic:
