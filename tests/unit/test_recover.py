@@ -1,0 +1,288 @@
+"""Whole files of torn and damaged ones: nothing whole is lost, nothing is invented, and nothing crashes."""
+
+import random
+import shutil
+import struct
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+import recordings
+from hilrig_recorder.channels import encode_message
+from hilrig_recorder.recover import recover, recovered_path, session_of
+from hilrig_recorder.scan import Chunk, Message, is_whole, open_chunk, scan
+from hilrig_recorder.writer import RunWriter, lock_file
+from hilrig_runtime.errors import InputError, OperationError
+from labs import hilrig
+
+START = 1_767_225_600_000_000_000
+HEADER_BYTES = 31
+"""Of a recording: what comes before says nothing."""
+Found = tuple[int, int, int, bytes]
+
+
+def good_file(path: Path, chunks: int = 40) -> list[list[Found]]:
+    """Write a recording of many small chunks; gives the messages of each."""
+    rng = random.Random(1)
+    writer = RunWriter(path)
+    writer.add_metadata("hilrig.session", {"session": "s1", "rig": "rig1"})
+    made = []
+    number = 0
+    for chunk in range(chunks):
+        content = []
+        for _ in range(rng.randrange(1, 30)):
+            number += 1
+            channel, log_time = rng.choice((1, 2, 3)), START + number * 1_000_000
+            data = bytes(rng.randrange(4) for _ in range(rng.randrange(200)))
+            writer.add(channel, log_time, encode_message(channel, number, log_time, log_time, data))
+            content.append((channel, number, log_time, data))
+        writer.close_chunk()
+        made.append(content)
+        if chunk == chunks // 2:
+            writer.add_attachment("a.txt", "text/plain", b"hello" * 100, log_time=START)
+    writer.finish(lambda: {"hilrig.summary": {"ended": "ended"}})
+    writer.publish()
+    return made
+
+
+def read(path: Path) -> list[Found]:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = [(m.channel_id, m.sequence, m.log_time, m.data) for _, _, m in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        list(reader.iter_attachments())
+        list(reader.iter_metadata())
+    return found
+
+
+def chunk_ends(path: Path) -> list[int]:
+    """Where each chunk of a file ends."""
+    data = path.read_bytes()
+    return [
+        offset + 9 + struct.unpack_from("<Q", data, offset + 1)[0]
+        for offset, item in scan(data)
+        if isinstance(item, Chunk)
+    ]
+
+
+def test_a_whole_file_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    good_file(path)
+    before = path.read_bytes()
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert recovery.path is None
+    assert path.read_bytes() == before
+    assert not (tmp_path / "new.mcap").exists()
+
+
+def test_cut_anywhere_every_whole_chunk_is_kept(tmp_path: Path) -> None:
+    path, torn, new = (tmp_path / name for name in ("run.mcap", "torn.mcap", "new.mcap"))
+    made = good_file(path)
+    good, ends = path.read_bytes(), chunk_ends(path)
+    seed = random.randrange(1 << 30)
+    rng = random.Random(seed)
+    for length in sorted({0, 1, 8, 9, *ends[:3], *(rng.randrange(len(good)) for _ in range(500))}):
+        torn.write_bytes(good[:length])
+        expected = [message for end, content in zip(ends, made, strict=True) if end <= length for message in content]
+        if length < HEADER_BYTES:
+            with pytest.raises(InputError, match="nothing of an MCAP file"):
+                recover(torn, new)
+            continue
+        recovery = recover(torn, new)
+        assert read(new) == expected, f"seed {seed}, cut at {length}"
+        assert recovery.messages == len(expected)
+        assert torn.read_bytes() == good[:length]
+        new.unlink()
+
+
+def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_are_kept(tmp_path: Path) -> None:
+    path, damaged, new = (tmp_path / name for name in ("run.mcap", "damaged.mcap.part", "new.mcap"))
+    made = good_file(path)
+    good = path.read_bytes()
+    starts = [offset for offset, item in scan(good) if isinstance(item, Chunk)]
+    ends = chunk_ends(path)
+    seed = random.randrange(1 << 30)
+    rng = random.Random(seed)
+    for _ in range(300):
+        # The end is cut off too, or a file would be taken for whole.
+        data = bytearray(good[: -rng.randrange(1, 50)])
+        places = [rng.randrange(len(data)) for _ in range(rng.choice((1, 1, 3)))]
+        for place in places:
+            data[place] ^= rng.randrange(1, 256)
+        damaged.write_bytes(data)
+        try:
+            recover(damaged, new)
+        except InputError:
+            pytest.fail(f"seed {seed}: recognised nothing, flipped at {places}")
+        whole = [
+            content
+            for start, end, content in zip(starts, ends, made, strict=True)
+            if not any(start <= place < end for place in places)
+        ]
+        allowed = {message for content in made for message in content}
+        found = read(new)
+        assert set(found) <= allowed, f"seed {seed}, flipped at {places}"
+        # What comes before the first chunk are the schemas and channels: without them messages have no home.
+        if all(place > starts[0] for place in places):
+            assert set(found) >= {message for content in whole for message in content}, f"seed {seed}, {places}"
+        new.unlink()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_foreign_file_is_recovered_too(tmp_path: Path, compression: CompressionType, chunked: bool) -> None:
+    source, new = tmp_path / "foreign.mcap", tmp_path / "new.mcap"
+    with source.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1_000, compression=compression, use_chunking=chunked)
+        writer.start(profile="ros2", library="somebody else's")
+        for number in range(3):
+            schema = writer.register_schema(f"pkg/Type{number}", "ros2msg", b"int32 x")
+            channel = writer.register_channel(f"/topic{number}", "cdr", schema, {"qos": "1"})
+            for sequence in range(100):
+                writer.add_message(channel, START + sequence, b"%d" % sequence, START, sequence)
+        writer.flush()
+    recovery = recover(source, new)
+    assert recovery.messages == 300
+    with new.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        found = [
+            (schema.name, channel.topic, m.data) for schema, channel, m in reader.iter_messages(log_time_order=False)
+        ]
+        assert {record.name for record in reader.iter_metadata()} == {"hilrig.recovery"}
+    assert sorted(found) == sorted(
+        (f"pkg/Type{number}", f"/topic{number}", b"%d" % sequence) for number in range(3) for sequence in range(100)
+    )
+
+
+def test_a_recovered_recording_says_what_it_is(tmp_path: Path) -> None:
+    source = tmp_path / "run.mcap.part"
+    recordings.write(source, recordings.make(recordings.Script(seconds=1)), finish=False)
+    data = bytearray(source.read_bytes())
+    source.write_bytes(data)
+    recover(source, tmp_path / "run.mcap")
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        names = [record.name for record in make_reader(stream).iter_metadata()]
+    assert "hilrig.session" in names
+    assert "hilrig.recovery" in names
+
+
+def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    for transport, recorder in ((3, 0), (0, 4)):
+        writer.add_metadata("hilrig.loss", {"transport": str(transport), "recorder": str(recorder)})
+    writer.close()
+    recover(writer.part, writer.path)
+    with writer.path.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert found["hilrig.summary"]["ended"] == "recovered"
+    assert (found["hilrig.summary"]["lost_transport"], found["hilrig.summary"]["lost_recorder"]) == ("3", "4")
+
+
+def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    with pytest.raises(InputError, match="being written just now"):
+        recover(writer.part, tmp_path / "new.mcap")
+    writer.close()
+    recover(writer.part, tmp_path / "new.mcap")
+
+
+def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
+    source = tmp_path / "run.mcap.part"
+    good_file(tmp_path / "run.mcap")
+    source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
+    before = (tmp_path / "run.mcap").read_bytes()
+    with pytest.raises(OperationError, match="exists"):
+        recover(source, tmp_path / "run.mcap")
+    assert (tmp_path / "run.mcap").read_bytes() == before
+
+
+def test_recovering_can_be_interrupted_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    good_file(tmp_path / "run.mcap")
+    source = tmp_path / "torn.mcap"
+    source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
+    asked = iter([True, True, False])
+    with pytest.raises(OperationError, match="interrupted"):
+        recover(source, tmp_path / "new.mcap", go_on=lambda: next(asked))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "torn.mcap"]
+
+
+def test_where_the_new_file_goes(tmp_path: Path) -> None:
+    assert recovered_path(tmp_path / "a.mcap.part") == tmp_path / "a.mcap"
+    assert recovered_path(tmp_path / "a.mcap") == tmp_path / "a.recovered.mcap"
+
+
+def test_the_session_of_a_torn_file_is_known(tmp_path: Path) -> None:
+    good_file(tmp_path / "run.mcap")
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes((tmp_path / "run.mcap").read_bytes()[:14_000])
+    assert session_of(torn) == {"session": "s1", "rig": "rig1"}
+
+
+def test_scanning_and_the_stock_reader_agree(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    made = good_file(path)
+    data = path.read_bytes()
+    assert is_whole(data)
+    found = [
+        (message.channel_id, message.sequence, message.log_time, message.data)
+        for _, item in scan(data)
+        if isinstance(item, Chunk)
+        for message in open_chunk(item)
+        if isinstance(message, Message)
+    ]
+    assert found == [message for content in made for message in content] == read(path)
+
+
+def test_the_command_recovers_and_says_what_was_lost(tmp_path: Path) -> None:
+    good_file(tmp_path / "run.mcap")
+    part = tmp_path / "torn.mcap.part"
+    part.write_bytes((tmp_path / "run.mcap").read_bytes()[:15_000])
+    answer = hilrig("recover", part)
+    assert answer.returncode == 1
+    assert "messages in" in answer.stdout
+    assert "not saved" in answer.stdout
+    assert not part.exists()
+    assert read(tmp_path / "torn.mcap")
+    whole = hilrig("recover", tmp_path / "run.mcap")
+    assert whole.returncode == 0
+    assert "nothing to do" in whole.stdout
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 1000])
+def test_what_is_no_mcap_file_is_named_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "notes.mcap"
+    path.write_bytes(content)
+    answer = hilrig("recover", path)
+    assert answer.returncode == 2
+    assert answer.stderr.count("\n") == 1
+    assert "notes.mcap" in answer.stderr
+    assert path.read_bytes() == content
+
+
+def test_a_full_disk_leaves_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good_file(tmp_path / "run.mcap")
+    source = tmp_path / "torn.mcap"
+    shutil.copyfile(tmp_path / "run.mcap", source)
+    source.write_bytes(source.read_bytes()[:-10])
+    before = source.read_bytes()
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RunWriter, "publish", refuse)
+    with pytest.raises(OperationError, match="No space left"):
+        recover(source, tmp_path / "new.mcap")
+    assert source.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "torn.mcap"]
+
+
+def test_a_lock_shows_whether_a_file_is_open(tmp_path: Path) -> None:
+    with (tmp_path / "file").open("w") as one, (tmp_path / "file").open("r+") as two:
+        assert lock_file(one.fileno())
+        assert not lock_file(two.fileno())

@@ -1,0 +1,216 @@
+"""The file that the recorder writes, judged by the stock MCAP reader."""
+
+import errno
+import random
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC, CHANNELS, encode_message
+from hilrig_recorder.writer import CHUNK_BYTES, RunWriter, part_path
+from hilrig_schemas import JointState
+
+START = 1_767_225_600_000_000_000
+STATE, COMMAND = CHANNEL_OF_TOPIC["state"], CHANNEL_OF_TOPIC["command"]
+
+
+def fill(writer: RunWriter, count: int, seed: int = 1, size: int = 150) -> list[tuple[int, int, int, bytes]]:
+    """Add messages of random bytes; gives (channel, sequence, log time, bytes) of each."""
+    rng = random.Random(seed)
+    added = []
+    for number in range(count):
+        channel = (STATE, COMMAND)[number % 2]
+        data = rng.randbytes(size)
+        log_time = START + number * 1_000_000
+        writer.add(channel, log_time, encode_message(channel, number, log_time, log_time - 1000, data))
+        added.append((channel, number, log_time, data))
+    return added
+
+
+def read(path: Path) -> list[tuple[int, int, int, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (message.channel_id, message.sequence, message.log_time, message.data)
+            for _, _, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
+
+
+def test_the_stock_reader_finds_everything(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    writer.add_metadata("about", {"rig": "rig1"})
+    added = fill(writer, 2_000)
+    writer.add_attachment("a.txt", "text/plain", b"hello", log_time=START)
+    writer.finish(lambda: {"last": {"words": "bye"}})
+    assert part_path(path).exists()
+    assert not path.exists()
+    writer.publish()
+    assert not part_path(path).exists()
+    assert read(path) == added
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        statistics = summary.statistics
+        assert statistics is not None
+        assert statistics.message_count == 2_000
+        assert statistics.channel_message_counts == {STATE: 1_000, COMMAND: 1_000}
+        assert (statistics.message_start_time, statistics.message_end_time) == (added[0][2], added[-1][2])
+        assert (statistics.chunk_count, statistics.channel_count) == (len(summary.chunk_indexes), len(CHANNELS))
+        assert {record.name: record.metadata for record in reader.iter_metadata()} == {
+            "about": {"rig": "rig1"},
+            "last": {"words": "bye"},
+        }
+        assert [(item.name, item.data) for item in reader.iter_attachments()] == [("a.txt", b"hello")]
+    with path.open("rb") as stream:
+        records = list(StreamReader(stream, validate_crcs=True).records)
+    assert type(records[-1]).__name__ == "Footer"
+
+
+def test_the_index_leads_to_the_messages_of_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    added = fill(writer, 3_000)
+    writer.finish()
+    writer.publish()
+    low, high = added[1_000][2], added[1_200][2]
+    with path.open("rb") as stream:
+        found = [
+            (message.channel_id, message.sequence)
+            for _, _, message in make_reader(stream).iter_messages(
+                topics=["/state"], starting_at=low, ending_before=high
+            )
+        ]
+    assert found == [(channel, number) for channel, number, at, _ in added if channel == STATE and low <= at < high]
+
+
+def test_chunks_are_at_most_64_kib(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    fill(writer, 2_000, size=700)
+    fill(writer, 3, size=CHUNK_BYTES * 2)
+    writer.finish()
+    writer.publish()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    sizes = [index.uncompressed_size for index in summary.chunk_indexes]
+    assert sum(size > CHUNK_BYTES for size in sizes) == 3, "only a message that is larger makes a chunk that is larger"
+    assert len(sizes) > 20
+
+
+def test_a_recorded_state_decodes_with_the_schema_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    state = JointState(rig="rig1", step=7, position=[1, 2, 3, 4])
+    with_parts = JointState(rig="rig1", step=8)
+    with_parts.parts.add(name="bolt", x=0.5)
+    writer = RunWriter(path)
+    for message in (state, with_parts):
+        writer.add(STATE, START, encode_message(STATE, message.step, START, START, message.SerializeToString()))
+    writer.finish()
+    writer.publish()
+    with path.open("rb") as stream:
+        decoded = [
+            m for _, _, _, m in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        ]
+    assert [message.step for message in decoded] == [7, 8]
+    assert decoded[1].parts[0].name == "bolt"
+
+
+def test_an_empty_recording_is_a_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    writer.finish()
+    writer.publish()
+    assert read(path) == []
+
+
+def test_every_whole_chunk_is_on_the_disk_before_the_file_is_finished(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    added = fill(writer, 500)
+    writer.close_chunk()
+    messages = []
+
+    def read_all(stream: BinaryIO) -> None:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Message):
+                messages.append(record.data)
+
+    with writer.part.open("rb") as stream, pytest.raises(EndOfFile):
+        read_all(stream)
+    writer.discard()
+    assert messages == [data for _, _, _, data in added]
+
+
+def test_a_file_is_never_written_over(tmp_path: Path) -> None:
+    first = RunWriter(tmp_path / "run.mcap")
+    with pytest.raises(FileExistsError):
+        RunWriter(tmp_path / "run.mcap")
+    first.discard()
+
+
+class SmallDisk:
+    """Stands before a file and has room for so many bytes."""
+
+    def __init__(self, file: FileIO, room: int) -> None:
+        self._file = file
+        self.room = room
+
+    def write(self, data: memoryview) -> int:
+        left = self.room - self._file.tell()
+        if left <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self._file.write(data[:left]) or 0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._file, name)
+
+
+@pytest.mark.parametrize("room", [*range(11_000, 21_000, 613), 100_000, 200_000])
+def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
+    path = tmp_path / "run.mcap"
+    failures: list[OSError] = []
+    writer = RunWriter(path, on_failure=failures.append)
+    writer._file = SmallDisk(writer._file, room)  # type: ignore[assignment]
+    added = []
+    number = 0
+    while not failures:
+        number += 1
+        added += fill(writer, 20, seed=number)
+        try:
+            if not failures:
+                writer.close_chunk()
+        except OSError as error:
+            failures.append(error)
+    writer.finish(lambda: {"hilrig.summary": {"lost_recorder": str(writer.given_up)}})
+    writer.publish()
+    assert path.stat().st_size <= room
+    found = read(path)
+    assert [data for *_, data in found] == [data for *_, data in added[: len(found)]]
+    assert len(found) + writer.given_up == len(added)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        [words] = [record.metadata for record in reader.iter_metadata()]
+        assert words == {"lost_recorder": str(writer.given_up)}
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == len(found)
+        assert sum(summary.statistics.channel_message_counts.values()) == len(found)
+
+
+def test_with_no_room_for_anything_it_says_so(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    writer._file = SmallDisk(writer._file, writer.size + 100)  # type: ignore[assignment]
+    fill(writer, 10)
+    with pytest.raises(OSError, match="No space left"):
+        writer.finish()
+    assert writer.given_up == 10
+    writer.discard()
