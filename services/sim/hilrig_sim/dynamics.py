@@ -11,7 +11,7 @@ decision 2 of docs/model.md.
 
 Vectors are (rows, rigs): one row a quantity, so that each operation runs along contiguous memory, and a rig's numbers
 do not depend on how many stand beside it. Nothing is allocated in a step, and no BLAS is used: its sums depend on
-the shape.
+the shape. Operands have one shape wherever that is cheap: numpy takes twice as long for a few numbers to be broadcast.
 """
 
 from collections.abc import Sequence
@@ -65,8 +65,9 @@ class ReducedDynamics:
         self.force_z = np.array([arm.external_force_z for arm in arms])
         self.torque_z = np.array([arm.external_torque_z for arm in arms])
         # What a change of payload changes.
-        self.coupling = np.empty(count)
-        """l2 l3 M, kg·m²."""
+        self._coupling_twice = np.empty((2, count))
+        self.coupling = self._coupling_twice[0]
+        """l2 l3 M, kg·m², (N,)."""
         self.inertia = np.empty((2, count))
         """A22 = M l3², I1 = l2²(m1+M): each multiplies the other link's equation."""
         self._a22, self._i1 = self.inertia
@@ -79,12 +80,12 @@ class ReducedDynamics:
         self._force1, self._force2, self._force34 = self._force[0], self._force[1], self._force[2:4]
         self._cos_sin = np.empty((2, count))
         self._cos, self._sin = self._cos_sin
-        self._squares = np.empty((2, count))
-        self._w2_squared, self._w1_squared = self._squares
+        self._w2_squared = np.empty(count)
+        self._w1_squared = np.empty(count)
         self._q = np.empty((2, count))
         self._q1, self._q2 = self._q
-        self._q_swapped = self._q[::-1]
         self._cross = np.empty((2, count))
+        self._cross1, self._cross2 = self._cross
         self._determinant = np.empty(count)
         self._scratch = np.empty(count)
         self._held: tuple[Bools, Bools, Bools] | None = None
@@ -102,7 +103,7 @@ class ReducedDynamics:
         mass = self.m2 + self.m3 + payload
         mass3 = self.m3 + payload
         self.payload = payload.copy()
-        self.coupling[:] = self.l2 * self.l3 * mass
+        self._coupling_twice[:] = self.l2 * self.l3 * mass
         self._a22[:] = mass * self.l3 * self.l3
         self._i1[:] = self.l2 * self.l2 * (self.m1 + mass)
         np.multiply(self._a22, self._i1, out=self._i1_a22)
@@ -135,30 +136,32 @@ class ReducedDynamics:
     ) -> None:
         """Derivatives of a stage's state into its `rates`, (25)–(32), (38), (39); `drive` is (4, N)."""
         velocity, v1, v2, theta2, _, a12, a1, a2, a34, theta2_rate = stage
-        force, force1, force2 = self._force, self._force1, self._force2
-        cos_sin, squares, q, q1, q2 = self._cos_sin, self._squares, self._q, self._q1, self._q2
-        cross, determinant = self._cross, self._determinant
+        force, force1, force2, force34 = self._force, self._force1, self._force2, self._force34
+        p, ps, q1, q2, determinant = self._cos, self._sin, self._q1, self._q2, self._determinant
         w2_squared, w1_squared = self._w2_squared, self._w1_squared
-        multiply(self.friction, velocity, out=force)
-        subtract(drive, force, out=force)
-        multiply(self._force34, self._inverse34, out=a34)
-        cos(theta2, out=self._cos)
-        sin(theta2, out=self._sin)
-        multiply(cos_sin, self.coupling, out=cos_sin)
-        add(v1, v2, out=w2_squared)
-        multiply(w2_squared, w2_squared, out=w2_squared)
-        multiply(v1, v1, out=w1_squared)
-        multiply(squares, self._sin, out=squares)
-        subtract(force1, force2, out=q1)
-        add(q1, w2_squared, out=q1)
-        subtract(force2, w1_squared, out=q2)
-        multiply(self._cos, self._cos, out=determinant)
-        subtract(self._i1_a22, determinant, out=determinant)
-        multiply(self.inertia, q, out=a12)
-        multiply(self._q_swapped, self._cos, out=cross)
-        subtract(a12, cross, out=a12)
-        divide(a12, determinant, out=a12)
-        subtract(a2, a1, out=a2)
+        multiply(self.friction, velocity, force)
+        subtract(drive, force, force)
+        multiply(force34, self._inverse34, a34)
+        cos(theta2, p)
+        sin(theta2, ps)
+        multiply(self._cos_sin, self._coupling_twice, self._cos_sin)
+        add(v1, v2, w2_squared)
+        multiply(w2_squared, w2_squared, w2_squared)
+        multiply(w2_squared, ps, w2_squared)
+        multiply(v1, v1, w1_squared)
+        multiply(w1_squared, ps, w1_squared)
+        subtract(force1, force2, q1)
+        add(q1, w2_squared, q1)
+        subtract(force2, w1_squared, q2)
+        multiply(p, p, determinant)
+        subtract(self._i1_a22, determinant, determinant)
+        multiply(self.inertia, self._q, a12)
+        multiply(q2, p, self._cross1)
+        multiply(q1, p, self._cross2)
+        subtract(a12, self._cross, a12)
+        divide(a1, determinant, a1)
+        divide(a2, determinant, a2)
+        subtract(a2, a1, a2)
         theta2_rate[:] = v2
         if self._held is not None:
             self._hold_rates(stage)

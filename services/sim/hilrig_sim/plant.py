@@ -30,6 +30,9 @@ LARGEST_EFFORT: Final = 1e6
 """Efforts beyond it, N·m or N, are no numbers of this arm: they are cut off so that the state stays finite."""
 
 
+_TRUE: Final = b"\x01"
+
+
 class Happening(Enum):
     """What a step may bring that is worth an event."""
 
@@ -91,14 +94,20 @@ class Plant:
         """d3 up to which nothing can be below the tool, m, (N,)."""
         self._at_lower = np.zeros((4, count), dtype=np.bool_)
         self._at_upper = np.zeros((4, count), dtype=np.bool_)
-        self._at_any = np.zeros((4, count), dtype=np.bool_)
         self._below = np.zeros(count, dtype=np.bool_)
-        self._effort = np.zeros((4, count))
+        self._switched = np.zeros(count, dtype=np.bool_)
+        self._low = np.zeros(count, dtype=np.bool_)
+        self._contact_known = np.full((4, count), np.nan)
+        """θ1, θ2, d3 at the start of the step, θ4 for which `_upper` was found, (4, N)."""
+        self._contact_place = np.empty((4, count))
+        self._contact_differs = np.zeros((4, count), dtype=np.bool_)
+        self._contact_unknown = np.zeros(count, dtype=np.bool_)
         self._start_position = np.empty((4, count))
         self._start_velocity = np.empty((4, count))
-        self._all_rigs = np.arange(count)
         self._flags = [0] * count
-        self._touching = False
+        self._flagged = False
+        self._flag_key = b""
+        self._touching_plane = False
         self._events: list[PlantEvent] = []
         self.position[:] = np.array([arm.start for arm in self._arms]).T
         self._begin_anew()
@@ -149,39 +158,36 @@ class Plant:
         """Move every rig on by one step of the loop; says what happened, in a list that the next step reuses.
 
         Args:
-            effort: τ1, τ2, τ3, τ4 of each rig, constant over the step; N·m, N·m, N, N·m, (4, N).
+            effort: τ1, τ2, τ3, τ4 of each rig, finite, constant over the step; N·m, N·m, N, N·m, (4, N).
             magnet: which magnets are on, (N,).
         """
         events = self._events
         if events:
             events.clear()
         world = self.world
-        world.moving[:] = False
-        np.clip(effort, -LARGEST_EFFORT, LARGEST_EFFORT, out=self._effort)
-        self._switch_magnets(magnet)
+        world.begin_step()
+        np.not_equal(magnet, world.holds, self._switched)
+        if any_true(self._switched):
+            self._switch_magnets(magnet)
         for _ in range(self._substeps):
-            self._substep()
-        if world.held.max() != NONE:
-            holding = np.flatnonzero(world.held != NONE)
+            self._substep(effort)
+        if world.holding:
+            holding = np.flatnonzero(world.holds)
             world.carry(holding, self.tool(holding))
-        if world.any_falling():
+        if world.falling:
             world.fall(self._step * self._substeps)
-            self._refresh_free()
+            self._world_changed()
         return events
 
     def _switch_magnets(self, magnet: Bools) -> None:
         world = self.world
-        holds = world.held != NONE
-        changed = magnet != holds
-        if not changed.any():
-            return
-        dropping = np.flatnonzero(changed & holds)
+        dropping = np.flatnonzero(self._switched & world.holds)
         if dropping.size:
             for rig in dropping:
                 self._events.append(PlantEvent(Happening.PART_DROPPED, int(rig), part=int(world.held[rig])))
             world.release(dropping)
             self.dynamics.set_payload(world.payload())
-        wanting = np.flatnonzero(changed & magnet)
+        wanting = np.flatnonzero(self._switched & magnet)
         if wanting.size:
             taken = world.attract(wanting, self.tool(wanting))
             if taken.size:
@@ -189,7 +195,7 @@ class Plant:
                     self._events.append(PlantEvent(Happening.PART_PICKED, int(rig), part=int(world.held[rig])))
                 self._share_momentum(taken)
         if self._events:
-            self._refresh_free()
+            self._world_changed()
 
     def _share_momentum(self, rigs: Ints) -> None:
         """A part at rest is taken along: momentum stays, energy goes, as in any inelastic impact."""
@@ -205,42 +211,47 @@ class Plant:
         self.velocity[1, rigs] = (alpha * p2 - a12 * p1) / determinant
         self.velocity[2, rigs] = v3 * mass3 / (dynamics.m3 + dynamics.payload)[rigs]
 
-    def _substep(self) -> None:
+    def _substep(self, effort: Floats) -> None:
         position, velocity = self.position, self.velocity
-        held = self._touching and self._hold_pressed()
+        held = self._touching_plane and self._hold_pressed(effort)
         self._start_position[:] = position
         self._start_velocity[:] = velocity
-        self._integrator.advance(position, velocity, self._effort, self.error)
+        self._integrator.advance(position, velocity, effort, self.error)
         if held:
             self.dynamics.hold(None)
-        if (position[2] > self._free3).any():
+        np.greater(position[2], self._free3, self._low)
+        if any_true(self._low):
             self._find_contact()
         lower, upper = self._at_lower, self._at_upper
-        np.less_equal(position, self._lower, out=lower)
-        np.greater_equal(position, self._upper, out=upper)
-        if not np.logical_or(lower, upper, out=self._at_any).any():
-            if self._touching:
-                self._touching = False
-                self._update_flags()
+        np.less_equal(position, self._lower, lower)
+        np.greater_equal(position, self._upper, upper)
+        at_lower, at_upper = lower.tobytes(), upper.tobytes()
+        if not (_TRUE in at_lower or _TRUE in at_upper):
+            if self._flagged:
+                self._touching_plane = False
+                self._update_flags(None)
             return
-        self._touching = True
-        speed = velocity.copy()
-        if self._at_any[:2].any():
-            self._impact()
-            np.less_equal(position, self._lower, out=lower)
-            np.greater_equal(position, self._upper, out=upper)
+        arriving = velocity.copy()
+        plane = 2 * self.count
+        self._touching_plane = _TRUE in at_lower[:plane] or _TRUE in at_upper[:plane]
+        if self._touching_plane:
+            self._impact(effort)
+            np.less_equal(position, self._lower, lower)
+            np.greater_equal(position, self._upper, upper)
         # Joints 3 and 4 move by themselves: to stop them is to stop where the limit is.
-        np.copyto(position, self._lower, where=lower)
-        np.copyto(position, self._upper, where=upper)
-        np.copyto(velocity[2:], 0.0, where=(lower[2:] & (velocity[2:] < 0)) | (upper[2:] & (velocity[2:] > 0)))
-        self._update_flags(speed)
+        np.maximum(position, self._lower, out=position)
+        np.minimum(position, self._upper, out=position)
+        speed34, lower34, upper34 = velocity[2:], lower[2:], upper[2:]
+        np.maximum(speed34, 0.0, out=speed34, where=lower34)
+        np.minimum(speed34, 0.0, out=speed34, where=upper34)
+        self._update_flags(arriving)
 
-    def _hold_pressed(self) -> bool:
+    def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
         side1, side2 = self._sides()
         if not (side1.any() or side2.any()):
             return False
-        rates = self._integrator.accelerations(self.position, self.velocity, self._effort)
+        rates = self._integrator.accelerations(self.position, self.velocity, effort)
         mass = self.dynamics.mass_matrix_12(self.position[1])
         # Only what rests on a stop can be held there; what moves off it is free.
         side1 = np.where(self.velocity[0] == 0, side1, 0.0)
@@ -257,16 +268,24 @@ class Plant:
 
     def _find_contact(self) -> None:
         """Raise the quill's stop to what lies below the tool, where it may reach it."""
-        world = self.world
-        rigs = np.flatnonzero(self.position[2] > self._free3)
+        world, place = self.world, self._contact_place
+        # What lies below is known where neither the tool nor the scene has changed since it was found.
+        place[:] = self.position
+        place[2] = self._start_position[2]
+        np.not_equal(place, self._contact_known, self._contact_differs)
+        np.logical_or.reduce(self._contact_differs, axis=0, out=self._contact_unknown)
+        np.logical_and(self._contact_unknown, self._low, self._contact_unknown)
+        if not any_true(self._contact_unknown):
+            return
+        rigs = np.flatnonzero(self._contact_unknown)
+        self._contact_known[:, rigs] = place[:, rigs]
         tip = self.tool(rigs)
         bottom = self._l1[rigs] - self._start_position[2, rigs] - world.held_height[rigs]
         x, y = world.footprint_centre(rigs, tip)
         below = world.contact(rigs, x, y, bottom)
-        self._upper[2] = self._stop[2]
         self._upper[2, rigs] = np.minimum(self._stop[2, rigs], self._l1[rigs] - world.held_height[rigs] - below)
 
-    def _impact(self) -> None:
+    def _impact(self, effort: Floats) -> None:
         """Stop joints 1 and 2 at their limits: at the time within the step at which they get there."""
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
@@ -284,9 +303,9 @@ class Plant:
             arms = [self._arms[rig] for rig in rigs]
             dynamics = ReducedDynamics(arms)
             dynamics.set_payload(self.dynamics.payload[rigs])
-            effort = self._effort[:, rigs]
+            acting = effort[:, rigs]
             plane, plane_rate = q0.copy(), v0.copy()
-            FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, effort)
+            FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, acting)
             arriving = outside & (shares == first)
             np.copyto(plane[:2], limit, where=arriving)
             side = np.where(arriving, np.sign(limit - q0[:2]), 0.0)
@@ -294,12 +313,12 @@ class Plant:
             self._stop_plane(dynamics, plane, plane_rate, side)
             # The rest of the step goes on from the stop, pressed onto it or leaving it.
             rest = FixedStep(dynamics, self._tableau, (1.0 - first) * self._step)
-            rates = rest.accelerations(plane, plane_rate, effort)
+            rates = rest.accelerations(plane, plane_rate, acting)
             mass = dynamics.mass_matrix_12(plane[1])
             resting = np.where(plane_rate[:2] == 0, side, 0.0)
             _, _, held1, held2 = stop_outward(rates[0], rates[1], resting[0], resting[1], mass)
             dynamics.hold(held1, held2)
-            rest.advance(plane, plane_rate, effort)
+            rest.advance(plane, plane_rate, acting)
             # Joints 3 and 4 had the whole step already.
             position[:2, rigs], velocity[:2, rigs] = plane[:2], plane_rate[:2]
         # What is at a stop at the end, by a second impact in one step or since before, does not move outwards.
@@ -312,10 +331,16 @@ class Plant:
         mass = dynamics.mass_matrix_12(position[1])
         velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
 
-    def _update_flags(self, speed: Floats | None = None) -> None:
-        """Restate the limit flags, and tell of the limits that were hit since."""
-        np.less(self._upper[2], self._stop[2], out=self._below)
-        for rig in np.flatnonzero(self._at_any.any(axis=0) | (np.asarray(self._flags) != 0)):
+    def _update_flags(self, arriving: Floats | None) -> None:
+        """Restate the limit flags where they changed, and tell of the limits that were hit at velocities `arriving`."""
+        np.less(self._upper[2], self._stop[2], self._below)
+        key = self._at_lower.tobytes() + self._at_upper.tobytes() + self._below.tobytes()
+        if key == self._flag_key:
+            return
+        self._flag_key = key
+        self._flagged = False
+        touching = self._at_lower.any(axis=0) | self._at_upper.any(axis=0)
+        for rig in np.flatnonzero(touching | (np.asarray(self._flags) != 0)):
             flags = 0
             for joint in range(4):
                 if self._at_lower[joint, rig]:
@@ -324,32 +349,41 @@ class Plant:
                     flags |= TOOL_CONTACT_FLAG if joint == 2 and self._below[rig] else 1 << (4 + joint)
             new = flags & ~self._flags[rig]
             self._flags[rig] = flags
-            if new and speed is not None:
-                self._tell_hits(int(rig), new, speed)
+            self._flagged |= flags != 0
+            if new and arriving is not None:
+                self._tell_hits(int(rig), new, arriving)
 
-    def _tell_hits(self, rig: int, new: int, speed: Floats) -> None:
+    def _tell_hits(self, rig: int, new: int, arriving: Floats) -> None:
         for joint in range(4):
             for upper in (False, True):
                 if new & (1 << (4 * upper + joint)):
-                    hit = PlantEvent(Happening.LIMIT_HIT, rig, joint + 1, upper, abs(float(speed[joint, rig])))
+                    hit = PlantEvent(Happening.LIMIT_HIT, rig, joint + 1, upper, abs(float(arriving[joint, rig])))
                     self._events.append(hit)
         if new & TOOL_CONTACT_FLAG:
-            self._events.append(PlantEvent(Happening.LIMIT_HIT, rig, 0, True, abs(float(speed[2, rig]))))
+            self._events.append(PlantEvent(Happening.LIMIT_HIT, rig, 0, True, abs(float(arriving[2, rig]))))
 
     def _begin_anew(self) -> None:
+        """Derive everything from position, velocity and the world's parts."""
         self.dynamics.set_payload(self.world.payload())
-        self._refresh_free()
-        self._upper[2] = self._stop[2]
-        if (self.position[2] > self._free3).any():
+        self._world_changed()
+        np.greater(self.position[2], self._free3, self._low)
+        if any_true(self._low):
             self._start_position[:] = self.position
             self._find_contact()
-        np.less_equal(self.position, self._lower, out=self._at_lower)
-        np.greater_equal(self.position, self._upper, out=self._at_upper)
-        np.logical_or(self._at_lower, self._at_upper, out=self._at_any)
-        self._touching = bool(self._at_any.any())
-        self._update_flags()
+        np.less_equal(self.position, self._lower, self._at_lower)
+        np.greater_equal(self.position, self._upper, self._at_upper)
+        self._touching_plane = bool(self._at_lower[:2].any() or self._at_upper[:2].any())
+        self._update_flags(None)
 
-    def _refresh_free(self) -> None:
+    def _world_changed(self) -> None:
+        """Forget what was known of what lies below the tools."""
+        self._contact_known.fill(np.nan)
+        self._upper[2] = self._stop[2]
         np.subtract(self._l1, self.world.held_height, out=self._free3)
         np.subtract(self._free3, self.world.highest, out=self._free3)
         np.subtract(self._free3, TOUCHING, out=self._free3)
+
+
+def any_true(mask: Bools) -> bool:
+    """Whether any element is true: for a few elements, ten times as fast as `mask.any()`."""
+    return _TRUE in mask.tobytes()

@@ -5,7 +5,8 @@ positions are sums of the stages' velocities: the same method on fewer rows. Eac
 one reduction along the first axis, whose order of additions is the same for any number of rigs.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,30 @@ from hilrig_sim.dynamics import STAGE_ROWS, ReducedDynamics, StageViews, stage_v
 from hilrig_sim.integrators import Tableau
 
 Floats = NDArray[np.float64]
+
+
+FEW_RIGS: Final = 64
+"""Up to so many, weights are stored once a rig: the same products, without the cost of broadcasting."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sum:
+    """A weighted sum over stages; `values`, `weights` and `products` are (terms, 5, N), or broadcast to it."""
+
+    values: Floats
+    weights: Floats
+    products: Floats
+    first: Floats
+    second: Floats | None = None
+
+    def into(self, out: Floats, multiply: Any = np.multiply, add: Any = np.add, total: Any = np.add.reduce) -> None:
+        multiply(self.values, self.weights, self.products)
+        if self.second is None:
+            out[:] = self.first
+        elif len(self.products) == 2:
+            add(self.first, self.second, out)
+        else:
+            total(self.products, 0, None, out)
 
 
 class FixedStep:
@@ -28,68 +53,54 @@ class FixedStep:
         self._states = np.zeros((stages, STAGE_ROWS, count))
         self._products = np.empty((1 + stages, STAGE_ROWS, count))
         self._drive = np.empty((4, count))
-        self._start_velocity, self._start_theta2 = self._slots[0, :4], self._slots[0, 4]
-        self._first = self._states[0]
         self._start = self._slots[0]
+        self._start_velocity, self._start_theta2 = self._start[:4], self._start[4]
+        self._first = self._states[0]
+        self._result = np.empty((STAGE_ROWS, count))
+        self._result4 = self._result[:4]
 
-        def coefficients(weights: tuple[float, ...]) -> Floats:
-            scaled = [np.asarray(w * lengths) * np.ones(count if np.ndim(lengths) else 1) for w in weights]
-            return np.array(scaled)[:, np.newaxis, :]
+        def weights(row: tuple[float, ...], *, with_start: bool) -> Floats:
+            scaled = [np.asarray(1.0)] * with_start + [np.asarray(w * lengths) for w in row]
+            table = np.stack([np.broadcast_to(w, (1, count if w.ndim else 1)) for w in np.broadcast_arrays(*scaled)])
+            if count <= FEW_RIGS:
+                return np.broadcast_to(table, (len(scaled), STAGE_ROWS, count)).copy()
+            return table
 
-        def with_start(weights: tuple[float, ...]) -> Floats:
-            scaled = coefficients(weights)
-            return np.concatenate([np.ones((1, 1, scaled.shape[2])), scaled])
+        def terms(row: tuple[float, ...], values: Floats, *, with_start: bool) -> _Sum:
+            number = len(row) + with_start
+            products = self._products[:number]
+            return _Sum(values[:number], weights(row, with_start=with_start), products, *products[:2])
 
         self._stages: list[StageViews] = [stage_views(self._states[i], self._slots[1 + i]) for i in range(stages)]
-        self._combinations = [
-            (self._slots[: 1 + i], with_start(tableau.a[i]), self._products[: 1 + i], self._states[i])
+        self._following = [
+            (terms(tableau.a[i], self._slots, with_start=True), self._states[i], self._stages[i])
             for i in range(1, stages)
         ]
-        self._final = (self._slots[:, :4], with_start(tableau.b), self._products[:, :4])
-        velocities, products = self._states[:, :4], self._products[:stages, :4]
-        self._quadrature = (velocities, coefficients(tableau.b), products)
-        self._error = (velocities, coefficients(tableau.error_weights), products) if tableau.embedded else None
-        self._change = np.empty((4, count))
+        self._end = terms(tableau.b, self._slots, with_start=True)
+        self._quadrature = terms(tableau.b, self._states, with_start=False)
+        self._error = terms(tableau.error_weights, self._states, with_start=False) if tableau.embedded else None
 
-    def advance(
-        self,
-        position: Floats,
-        velocity: Floats,
-        effort: Floats,
-        error: Floats | None = None,
-        multiply: Any = np.multiply,
-        add: Any = np.add,
-        total: Any = np.add.reduce,
-    ) -> None:
+    def advance(self, position: Floats, velocity: Floats, effort: Floats, error: Floats | None = None) -> None:
         """Move `position` and `velocity`, (4, N), on by one step under constant `effort`, (4, N).
 
         `error`, (4, N), gets the embedded estimate of the position's error; a method without one leaves it.
         """
-        dynamics, drive = self._dynamics, self._drive
-        dynamics.drive(effort, drive)
+        rates, drive, result, result4 = self._dynamics.rates, self._drive, self._result, self._result4
+        self._dynamics.drive(effort, drive)
         self._start_velocity[:] = velocity
         self._start_theta2[:] = position[1]
         self._first[:] = self._start
-        rates = dynamics.rates
-        stages = self._stages
-        rates(stages[0], drive)
-        following = iter(stages)
-        next(following)
-        for (slots, weights, products, state), stage in zip(self._combinations, following, strict=True):
-            multiply(slots, weights, out=products)
-            total(products, axis=0, out=state)
+        rates(self._stages[0], drive)
+        for terms, state, stage in self._following:
+            terms.into(state)
             rates(stage, drive)
-        values, weights, products = self._quadrature
-        multiply(values, weights, out=products)
-        total(products, axis=0, out=self._change)
-        add(position, self._change, out=position)
+        self._quadrature.into(result)
+        np.add(position, result4, position)
         if error is not None and self._error is not None:
-            values, weights, products = self._error
-            multiply(values, weights, out=products)
-            total(products, axis=0, out=error)
-        values, weights, products = self._final
-        multiply(values, weights, out=products)
-        total(products, axis=0, out=velocity)
+            self._error.into(result)
+            error[:] = result4
+        self._end.into(result)
+        velocity[:] = result4
 
     def accelerations(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
         """Joint accelerations, (4, N), at a state and under an effort, (4, N) each; valid until the next call."""

@@ -68,6 +68,13 @@ class World:
         self._surfaces = _Surfaces(scenes)
         self.moving = np.zeros(count, dtype=np.bool_)
         """Where a part moved in the last step, (N,)."""
+        self._any_moving = False
+        self.holds = np.zeros(count, dtype=np.bool_)
+        """Where a magnet holds a part, (N,)."""
+        self.holding = False
+        """Whether any does."""
+        self.falling = False
+        """Whether any part of any rig is on its way down."""
         for rig in range(count):
             self.reset(rig)
 
@@ -77,15 +84,17 @@ class World:
             self.x[row, rig], self.y[row, rig], self.z[row, rig] = part.position
             self.yaw[row, rig] = part.yaw
         self._falling[:, rig] = False
+        self.falling = bool(self._falling.any())
         self._fall_speed[:, rig] = 0.0
         self._let_go(np.array([rig]))
-        self.moving[rig] = True
+        self._moved(rig)
 
     def place(self, rig: int, poses: Sequence[tuple[float, float, float, float]], held: int, tip: Floats) -> None:
         """Set a rig's parts to (x, y, z, yaw) each, at rest, `held` on the magnet at `tip` (x, y, z, yaw), (4,)."""
         for row, pose in enumerate(poses):
             self.x[row, rig], self.y[row, rig], self.z[row, rig], self.yaw[row, rig] = pose
         self._falling[:, rig] = False
+        self.falling = bool(self._falling.any())
         rigs = np.array([rig])
         self._let_go(rigs)
         if held != NONE:
@@ -93,9 +102,11 @@ class World:
         else:
             self._refresh_highest(rigs)
 
-    def any_falling(self) -> bool:
-        """Whether any part is on its way down."""
-        return bool(self._falling.any())
+    def begin_step(self) -> None:
+        """Nothing has moved in this step so far."""
+        if self._any_moving:
+            self.moving[:] = False
+            self._any_moving = False
 
     def at_rest(self, rig: int) -> bool:
         """Whether each part of a rig is held or lies on something."""
@@ -105,6 +116,7 @@ class World:
     def release(self, rigs: Ints) -> None:
         """Switch the magnets of these rigs, which hold something, off: their parts fall from rest."""
         self._falling[self.held[rigs], rigs] = True
+        self.falling = True
         self._fall_speed[self.held[rigs], rigs] = 0.0
         self._let_go(rigs)
 
@@ -136,6 +148,7 @@ class World:
         # What stood on the part that is gone now falls.
         self._falling[:, taken] = True
         self._falling[self.held[taken], taken] = False
+        self.falling = bool(self._falling.any())
         self._fall_speed[:, taken] = 0.0
         return taken
 
@@ -170,11 +183,11 @@ class World:
         self.x[rows, rigs], self.y[rows, rigs] = self.footprint_centre(rigs, tip)
         self.z[rows, rigs] = tip[2] - self.half_height[rows, rigs]
         self.yaw[rows, rigs] = tip[3] + self._grip[2, rigs]
-        self.moving[rigs] = True
+        self._moved(rigs)
 
     def fall(self, duration: float) -> None:
         """Let what is falling fall for `duration`, s, and come to rest on what is below it."""
-        for row, rig in np.argwhere(self._falling):
+        for row, rig in np.argwhere(self._falling).tolist():
             bottom = self._bottom(row, rig)
             support = self._support_of(row, rig)
             speed = self._fall_speed[row, rig]
@@ -184,8 +197,9 @@ class World:
                 self._falling[row, rig] = False
             self._fall_speed[row, rig] = speed + GRAVITY * duration if lower > support else 0.0
             self.z[row, rig] = lower + self.half_height[row, rig]
-            self.moving[rig] = True
+            self._moved(rig)
             self._refresh_highest(np.array([rig]))
+        self.falling = bool(self._falling.any())
 
     def _take(self, rigs: Ints, rows: Ints, tip: Floats) -> None:
         x, y, z, yaw = tip
@@ -198,7 +212,8 @@ class World:
         self.held_height[rigs] = 2 * self.half_height[rows, rigs]
         self._held_radius[rigs] = self._radius[rows, rigs]
         self.z[rows, rigs] = z - self.half_height[rows, rigs]
-        self.moving[rigs] = True
+        self._hold_changed()
+        self._moved(rigs)
         self._refresh_highest(rigs)
 
     def _let_go(self, rigs: Ints) -> None:
@@ -206,8 +221,17 @@ class World:
         self.held_height[rigs] = 0.0
         self._held_radius[rigs] = 0.0
         self._grip[:, rigs] = 0.0
-        self.moving[rigs] = True
+        self._hold_changed()
+        self._moved(rigs)
         self._refresh_highest(rigs)
+
+    def _moved(self, rigs: Ints | int) -> None:
+        self.moving[rigs] = True
+        self._any_moving = True
+
+    def _hold_changed(self) -> None:
+        np.not_equal(self.held, NONE, out=self.holds)
+        self.holding = bool(self.holds.any())
 
     def _refresh_highest(self, rigs: Ints) -> None:
         top = self.z[:, rigs] + self.half_height[:, rigs]
