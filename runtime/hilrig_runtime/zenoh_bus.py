@@ -17,12 +17,11 @@ import zenoh.ext
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
 from hilrig_schemas.topics import Traffic
 
 MESH_ORDER: Final = ("sim", "edge", "recorder")
 
-RECORDING_CACHE_BATCHES: Final = 500
-"""What a log stream can repeat after an outage: 10 s at 50 batches a second."""
 _HEARTBEAT_S: Final = 0.25
 _PRIORITIES: Final = {
     Traffic.CONTROL: zenoh.Priority.REAL_TIME,
@@ -123,7 +122,7 @@ class ZenohBus(Bus):
                     # gives back what was dropped.
                     congestion_control=zenoh.CongestionControl.DROP,
                     priority=_PRIORITIES[traffic],
-                    cache=zenoh.ext.CacheConfig(RECORDING_CACHE_BATCHES),
+                    cache=zenoh.ext.CacheConfig(CACHE_SAMPLES),
                     sample_miss_detection=zenoh.ext.MissDetectionConfig(
                         heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S
                     ),
@@ -145,15 +144,7 @@ class ZenohBus(Bus):
 
     def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:
         """See `Bus.subscribe_recording`."""
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            self.session,
-            key_expr,
-            _deliver(on_message),
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=RECORDING_CACHE_BATCHES),
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        losses = subscriber.sample_miss_listener(lambda miss: on_loss(miss.nb))
-        return _Declared(subscriber, losses)
+        return CompleteStream(self.session, key_expr, on_message, on_loss)
 
     def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.serve`."""
