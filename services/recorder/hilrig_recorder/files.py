@@ -17,7 +17,7 @@ from typing import Final
 
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.disk import Disk
-from hilrig_recorder.recover import Tail, read_tail
+from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
 from hilrig_recorder.sessions import SECOND_NS, Recording, Sink
 from hilrig_recorder.writer import RunWriter, part_path
 from hilrig_runtime.clock import Clock
@@ -102,7 +102,7 @@ class Files:
         folder = self.folder / recording.rig
         number, previous = self._next_number(folder, recording.session)
         if previous is not None:
-            tail = self._tail(previous)
+            tail = self._tail_of_session(folder, recording.session, number - 1)
             if tail.end == "ended":
                 return None
             recording.seen, recording.last = tail.keys, tail.last
@@ -187,13 +187,25 @@ class Files:
 
     # -- files ------------------------------------------------------------------------------------------------------
 
+    def _tail_of_session(self, folder: Path, session: str, number: int) -> Tail:
+        """The last seconds of a session's files up to a number: a recorder may have been restarted often."""
+        tail = self._tail(folder / file_name(session, number))
+        last_ns = tail.last_ns
+        while number > 1 and (not last_ns or last_ns - tail.last_ns < TAIL_NS):
+            number -= 1
+            before = self._tail(folder / file_name(session, number))
+            last_ns = last_ns or before.last_ns
+            reached_ns = before.last_ns or tail.last_ns
+            tail = Tail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
+        return tail
+
     @staticmethod
     def _tail(previous: Path) -> Tail:
         # It may get its name just now, from the disk's thread or because it is recovered.
         for path in (previous, part_path(previous), previous):
             with contextlib.suppress(InputError):
                 return read_tail(path)
-        return Tail("", set(), {})
+        return Tail("", set(), {}, 0)
 
     def _next_number(self, folder: Path, session: str) -> tuple[int, Path | None]:
         number, previous = 1, None

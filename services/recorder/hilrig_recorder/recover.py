@@ -53,6 +53,8 @@ class Tail:
     """Channel, sequence and publish time of its last messages."""
     last: dict[int, tuple[int, int]]
     """Sequence and publish time of the last message of each channel."""
+    last_ns: int
+    """Arrival of the last message, wall clock, ns; 0: there is none."""
 
 
 def map_file(path: Path) -> memoryview:
@@ -85,15 +87,15 @@ def read_tail(path: Path) -> Tail:
             end = item.metadata.get("ended", "")
         elif isinstance(item, Chunk):
             chunks.append(item)
-    horizon = max((chunk.last_ns for chunk in chunks), default=0) - TAIL_NS
+    last_ns = max((chunk.last_ns for chunk in chunks), default=0)
     for chunk in chunks:
-        if chunk.last_ns >= horizon:
+        if chunk.last_ns >= last_ns - TAIL_NS:
             with contextlib.suppress(DamagedError):
                 for message in open_chunk(chunk):
                     if isinstance(message, Message):
                         keys.add((message.channel_id, message.sequence, message.publish_time))
                         last[message.channel_id] = (message.sequence, message.publish_time)
-    return Tail(end, keys, last)
+    return Tail(end, keys, last, last_ns)
 
 
 def session_of(path: Path) -> dict[str, str]:
