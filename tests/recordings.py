@@ -14,38 +14,18 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
+from hilrig_runtime.config import LabConfig, RigSettings
 from hilrig_schemas import Event, JointState, ModbusRequest, ModbusTraffic, PartState, TorqueCommand
 from hilrig_schemas.topics import RECORDED
+from hilrig_sim.configured import rig_parameters
+from hilrig_sim.urdf import urdf
 
 START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
 EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
 MS = 1_000_000
 CONTROLLER = "192.0.2.7:40001"
-
-URDF = """<robot name="arm">
-  <material name="steel"><color rgba="0.6 0.6 0.65 1"/></material>
-  <material name="orange"><color rgba="0.9 0.45 0.1 1"/></material>
-  <link name="base"><visual><origin xyz="0 0 0.06"/><geometry><cylinder radius="0.05" length="0.12"/></geometry>
-    <material name="steel"/></visual></link>
-  <link name="link1"><visual><origin xyz="0.15 0 0"/><geometry><box size="0.3 0.06 0.04"/></geometry>
-    <material name="orange"/></visual></link>
-  <link name="link2"><visual><origin xyz="0.15 0 0.04"/><geometry><box size="0.3 0.05 0.04"/></geometry>
-    <material name="orange"/></visual></link>
-  <link name="quill"><visual><origin xyz="0 0 0.11"/><geometry><cylinder radius="0.012" length="0.22"/></geometry>
-    <material name="steel"/></visual></link>
-  <link name="tool"><visual><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.02" length="0.02"/></geometry>
-    <material name="steel"/></visual></link>
-  <joint name="theta1" type="revolute"><parent link="base"/><child link="link1"/><origin xyz="0 0 0.139"/>
-    <axis xyz="0 0 1"/><limit lower="-2.4" upper="2.4" effort="30" velocity="10"/></joint>
-  <joint name="theta2" type="revolute"><parent link="link1"/><child link="link2"/><origin xyz="0.3 0 0"/>
-    <axis xyz="0 0 1"/><limit lower="-2.7" upper="2.7" effort="30" velocity="10"/></joint>
-  <joint name="d3" type="prismatic"><parent link="link2"/><child link="quill"/><origin xyz="0.3 0 0"/>
-    <axis xyz="0 0 -1"/><limit lower="0" upper="0.2" effort="30" velocity="2"/></joint>
-  <joint name="theta4" type="revolute"><parent link="quill"/><child link="tool"/>
-    <axis xyz="0 0 1"/><limit lower="-6.3" upper="6.3" effort="30" velocity="10"/></joint>
-</robot>
-"""
+PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
 
 @dataclass(frozen=True)
@@ -109,7 +89,10 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
     newest: _Write | None = None
     sampled: dict[int, int] = {}
     held = 0
-    parts = [PartState(name=f"part{n}", x=0.35, y=-0.15 + 0.1 * n, z=-0.04) for n in range(4)] if script.parts else []
+    parts = [
+        PartState(name=part.name, x=part.position[0], y=part.position[1], z=part.position[2], yaw=part.yaw)
+        for part in (PARAMETERS.scene.parts if script.parts else ())
+    ]
     for step, (tick_ns, lateness_ns, missed) in ticks.items():
         seconds = tick_ns / 1e9
         sampled[step] = tick_ns
@@ -133,7 +116,7 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
             state.command_arrived_ns = fresh.arrives_ns + START_WALL_NS + SIM_FROM_WALL_NS
             state.loop_latency_ns = tick_ns - sampled[fresh.command.basis_step]
         if parts and (step - 1) % 50 == 0:
-            parts[held].x = 0.35 + 0.002 * (step // 50)
+            parts[held].x += 0.002
             state.parts.extend(parts)
         made.append(Made("state", state.wall_ns, state))
         if missed:
@@ -290,8 +273,13 @@ def write(
                 "start": "2026-01-01T00:00:00Z",
             },
         )
-        writer.add_metadata("hilrig.config", {"rig": rig, "step_ns": str(round(script.step_ms * MS))})
-        writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", URDF.encode())
+        configuration = {
+            "rig": rig,
+            "step_ns": str(round(script.step_ms * MS)),
+            "parameters_json": PARAMETERS.to_json(),
+        }
+        writer.add_metadata("hilrig.config", configuration)
+        writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
         sequences = dict.fromkeys(RECORDED, 0)
         for one in made:
             sequences[one.topic] += 1

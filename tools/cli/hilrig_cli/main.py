@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from hilrig_cli.commands import check, demo, latency, recover, runs, services, up
+from hilrig_cli.commands import check, demo, latency, lease, recover, replay, registers, runs, services, up
 from hilrig_runtime.lifecycle import run_main
 
 app = typer.Typer(
@@ -27,11 +27,14 @@ REVIEW = "Review what was recorded"
 app.command(rich_help_panel=RUN)(up.up)
 app.command(rich_help_panel=RUN)(demo.demo)
 app.command(rich_help_panel=RUN)(check.check)
+app.command(rich_help_panel=RUN)(lease.lease)
+app.command(rich_help_panel=RUN)(registers.registers)
 app.command(rich_help_panel=SERVICES)(services.sim)
 app.command(rich_help_panel=SERVICES)(services.edge)
 app.command(rich_help_panel=SERVICES)(services.recorder)
 app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
+app.command(rich_help_panel=REVIEW)(replay.replay)
 app.command(rich_help_panel=REVIEW)(recover.recover)
 
 

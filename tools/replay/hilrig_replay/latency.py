@@ -5,13 +5,14 @@ state that the controller had last been served. Five stages are differences of t
 both ways over the bus, is what remains. So the six add up exactly, and no clocks are compared (docs/timing.md).
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.columns import Rows
+from hilrig_replay.columns import COMMAND, STATE, Rows
 from hilrig_replay.diagnosis import Evidence, Finding, diagnose
 from hilrig_replay.fitness import FitnessWatch, Lost
 from hilrig_replay.run import Run
@@ -108,45 +109,42 @@ class LatencyReport:
 class Matcher:
     """Finds the command behind each sample, from blocks in which the one can come before or after the other."""
 
+    WINDOW: Final = 4096
+    """At least so many rows before a block are still looked at."""
+
     def __init__(self) -> None:
-        self.unmatched = 0
-        """Samples whose command is not in the recording, count; complete after `finish`."""
-        self._commands: list[Rows] = []
-        self._waiting: Rows | None = None
-        self._found: list[NDArray[np.void]] = []
+        self._commands = np.empty(0, COMMAND)
+        self._waiting = np.empty(0, STATE)
+        self._given_up = 0
 
-    def add(self, states: Rows, commands: Rows) -> None:
-        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`."""
-        effective = states[states["basis_step"] != 0]
-        old = self._waiting
-        samples = effective if old is None else np.concatenate((old, effective))
-        known = np.concatenate((*self._commands, commands))
-        rows, found = _join(samples, known)
-        self._found.append(_stages(samples[found], known[rows[found]]))
-        # What came with this block waits for one more; what has waited is not there.
-        missing = ~found
-        waited = 0 if old is None else len(old)
-        self.unmatched += int(missing[:waited].sum())
-        self._waiting = samples[waited:][missing[waited:]]
-        self._commands = [*self._commands[-1:], commands]
+    @property
+    def unmatched(self) -> int:
+        """Samples whose command has not come, count."""
+        return self._given_up + len(self._waiting)
 
-    def finish(self) -> NDArray[np.void]:
-        """Every sample in the order of its state, shape (n,), fields as `SAMPLE`."""
-        if self._waiting is not None:
-            self.unmatched += len(self._waiting)
-            self._waiting = None
-        if not self._found:
-            return np.empty(0, SAMPLE)
-        samples = np.concatenate(self._found)
-        order = np.lexsort((samples["sampled_ns"], samples["incarnation"]))
-        return samples[order]
+    def add(self, states: Rows, commands: Rows) -> NDArray[np.void]:
+        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`; the samples found with it."""
+        effective = np.concatenate((self._waiting, states[states["basis_step"] != 0]))
+        known = np.concatenate((self._commands, commands))
+        rows, found = _join(effective, known)
+        missing = effective[~found]
+        self._waiting = missing[-self.WINDOW :]
+        self._given_up += len(missing) - len(self._waiting)
+        self._commands = known[-max(self.WINDOW, len(commands)) :].copy()
+        return _stages(effective[found], known[rows[found]])
+
+
+def in_order(samples: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
+    """Samples out of several blocks in the order of their states, shape (n,), fields as `SAMPLE`."""
+    if not samples:
+        return np.empty(0, SAMPLE)
+    joined = np.concatenate(samples)
+    return joined[np.lexsort((joined["sampled_ns"], joined["incarnation"]))]
 
 
 def match(states: Rows, commands: Rows) -> NDArray[np.void]:
     """The samples of a whole run, shape (n,), fields as `SAMPLE`."""
-    matcher = Matcher()
-    matcher.add(states, commands)
-    return matcher.finish()
+    return in_order([Matcher().add(states, commands)])
 
 
 def _join(samples: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -193,11 +191,12 @@ def measure(run: Run) -> LatencyReport:
             f"{run.path}: a recording without commands: no controller wrote in this session, so it has no loop latency"
         )
     matcher = Matcher()
+    found = []
     watch = FitnessWatch(run)
     for block in run.blocks(frozenset({"state", "command"})):
-        matcher.add(block.states, block.commands)
+        found.append(matcher.add(block.states, block.commands))
         watch.add(block.states, block.commands)
-    samples = matcher.finish()
+    samples = in_order(found)
     evidence = Evidence(
         run=run,
         samples=samples,

@@ -9,27 +9,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hilrig_replay.latency import STAGES, LatencyReport
+from hilrig_replay.palette import STAGE_COLORS, STAGE_NAMES
 from hilrig_replay.run import Run
 from hilrig_runtime.errors import InputError, OperationError
 
 FORMATS: Final = (".png", ".svg", ".pdf")
-STAGE_NAMES: Final = {
-    "register_wait": "register wait",
-    "controller": "controller",
-    "edge": "edge",
-    "injected": "injected",
-    "tick_wait": "tick wait",
-    "transport": "transport",
-}
-STAGE_COLORS: Final = {
-    "register_wait": "#4c78a8",
-    "controller": "#f58518",
-    "edge": "#54a24b",
-    "injected": "#b279a2",
-    "tick_wait": "#9ecae9",
-    "transport": "#e45756",
-}
-"""One colour a stage, the same in every plot and in the viewer."""
 
 _INK: Final = "#333333"
 _MARK: Final = "#d62728"

@@ -4,67 +4,26 @@ Opening reads what the file says of itself; the arrays are read when they are as
 piece, so that what goes through it once needs the same memory for a minute and for a day; `between` reads a range.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from hilrig_replay.columns import (
-    COMMAND,
-    PART,
-    STATE,
-    TRAFFIC,
-    Names,
-    Rows,
-    Table,
-    command_decoder,
-    joined,
-    state_decoder,
-    traffic_decoder,
-)
+from hilrig_replay.columns import Names, Rows
 from hilrig_replay.recording_file import RecordingFile, damaged, open_recording
+from hilrig_replay.records import Decoder, Records, join_records
+from hilrig_replay.timebase import Timebase
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import Event
-
-EVENT: Final = np.dtype(
-    [
-        ("wall_ns", "<i8"),
-        ("step", "<u8"),
-        ("kind", "O"),
-        ("severity", "O"),
-        ("text", "O"),
-        ("source", "O"),
-        ("message", "O"),
-    ]
-)
-"""One row an `Event`: when, simulation's step (0: not known), kind and severity by name, text, the message whole."""
 
 ALL: Final = frozenset({"state", "command", "event", "traffic"})
 BLOCK_ROWS: Final = 20_000
 _SLACK_NS: Final = 2_000_000_000
 """A message arrives at the recorder at most so long after it was sent, as a rule; a range is read that much wider."""
-
-
-@dataclass(frozen=True, slots=True)
-class Records:
-    """A piece of a run; each array has one row a message, in its sender's order."""
-
-    states: Rows
-    """Shape (n,), fields as `columns.STATE`."""
-    commands: Rows
-    """Shape (n,), fields as `columns.COMMAND`; a repeated command is not recorded again."""
-    events: Rows
-    """Shape (n,), fields as `EVENT`."""
-    traffic: Rows
-    """Shape (n,), fields as `columns.TRAFFIC`: one row a Modbus request."""
-    parts: Rows
-    """Shape (n,), fields as `columns.PART`: where the scene's parts are; only rows in which the sim stated them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,15 +46,18 @@ class Run:
         """As recorded: metadata records by name, then key; all are text."""
         self.names = Names()
         """Texts behind the codes in the arrays."""
-        self._epochs: dict[int, tuple[int, int]] = {}
+        self.timebase = Timebase()
         first = next(iter(self.blocks(frozenset({"state"}), rows=1)), None)
         if first is None:
             raise InputError(
                 f"{self.path}: an empty recording: it holds no state of the arm "
                 f"({sum(file.counts.values())} other messages)"
             )
-        self.start_wall_ns = int(first.states["wall_ns"][0])
+
+    @property
+    def start_wall_ns(self) -> int:
         """The first state on the wall clock, ns since 1970-01-01 UTC."""
+        return self.timebase.start_wall_ns
 
     # -- what it says of itself ------------------------------------------------------------------------------------
 
@@ -135,14 +97,10 @@ class Run:
         durations = np.diff(states["sampled_ns"])[steps == 1]
         return int(np.median(durations)) if durations.size else 20_000_000
 
-    @cached_property
-    def parameters(self) -> Mapping[str, Any]:
-        """The rig's part of the configuration as it was resolved; empty: the file does not say it."""
-        try:
-            said = json.loads(self._said("config", "parameters_json") or "{}")
-        except ValueError:
-            return {}
-        return said if isinstance(said, dict) else {}
+    @property
+    def parameters_json(self) -> str:
+        """The rig's parameters as `hilrig_sim.model.RigParameters` reads them; empty: the file does not say them."""
+        return self._said("config", "parameters_json")
 
     @property
     def urdf(self) -> str:
@@ -197,7 +155,7 @@ class Run:
 
     @cached_property
     def events(self) -> Rows:
-        """Every event, shape (n,), fields as `EVENT`."""
+        """Every event, shape (n,), fields as `records.EVENT`."""
         return self._whole("event").events
 
     @cached_property
@@ -213,8 +171,8 @@ class Run:
         def cut(rows: Rows) -> Rows:
             return rows[(rows["wall_ns"] >= low) & (rows["wall_ns"] < high)]
 
-        whole = _joined(pieces)
-        return Records(*(cut(rows) for rows in _fields(whole)))
+        whole = join_records(pieces)
+        return Records(*(cut(rows) for rows in whole.arrays))
 
     def blocks(
         self,
@@ -232,69 +190,32 @@ class Run:
         Raises:
             InputError: the file is damaged.
         """
-        names = self.names
-        states, commands, traffic, parts = Table(STATE), Table(COMMAND), Table(TRAFFIC), Table(PART)
-        events: list[tuple[Any, ...]] = []
-        decoders = {
-            "state": state_decoder(states, parts, names),
-            "command": command_decoder(commands, names),
-            "event": lambda payload, *_: events.append(_event_row(payload)),
-            "traffic": traffic_decoder(traffic, names),
-        }
-
-        def take() -> Records:
-            rows_of_events = np.array(events, EVENT)
-            events.clear()
-            piece = Records(states.take(), commands.take(), rows_of_events, traffic.take(), parts.take())
-            self._note_epochs(piece.states)
-            return piece
-
+        decoder = Decoder(self.names, self.timebase)
         count = 0
         try:
             for topic, sequence, log_ns, _, payload in self.file.messages(topics, from_ns=from_ns, until_ns=until_ns):
-                decoders[topic](payload, sequence, log_ns)
+                decoder.add(topic, payload, sequence, log_ns)
                 count += 1
                 if count >= rows:
                     count = 0
-                    yield take()
+                    yield decoder.take()
         except DecodeError as error:
             raise damaged(self.path, f"a message can't be decoded: {error}") from error
         if count:
-            yield take()
+            yield decoder.take()
 
     def _whole(self, topic: str) -> Records:
-        return _joined(list(self.blocks(frozenset({topic}))))
+        return join_records(list(self.blocks(frozenset({topic}))))
 
     # -- time ------------------------------------------------------------------------------------------------------
 
     def time_s(self, rows: Rows) -> NDArray[np.float64]:
-        """When the rows were sent, shape as `rows`: seconds from the run's first state.
-
-        States go by the simulation's monotonic clock, and across a restart of the simulation by the wall clock; all
-        else goes by the wall clock.
-        """
+        """When the rows were sent, shape as `rows`: seconds from the run's first state (`timebase`)."""
         return self.time_ns(rows) / 1e9
 
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
         """As `time_s`, in whole ns."""
-        names = rows.dtype.names or ()
-        if "sampled_ns" not in names:
-            return np.asarray(rows["wall_ns"] - self.start_wall_ns)
-        times = rows["sampled_ns"].copy()
-        incarnations = rows["incarnation"]
-        for incarnation, (sampled_ns, wall_ns) in self._epochs.items():
-            offset = wall_ns - self.start_wall_ns - sampled_ns
-            times[incarnations == incarnation] += offset
-        return times
-
-    def _note_epochs(self, states: Rows) -> None:
-        if not len(states):
-            return
-        incarnations = states["incarnation"]
-        changes = np.flatnonzero(np.diff(incarnations) != 0) + 1
-        for at in (0, *changes.tolist()):
-            row = states[at]
-            self._epochs.setdefault(int(row["incarnation"]), (int(row["sampled_ns"]), int(row["wall_ns"])))
+        return self.timebase.time_ns(rows)
 
 
 def open_run(path: Path | str) -> Run:
@@ -304,29 +225,3 @@ def open_run(path: Path | str) -> Run:
         InputError: there is no such file, it is no recording, it is empty, torn or damaged, or a newer hilrig wrote it.
     """
     return Run(open_recording(Path(path)))
-
-
-def _event_row(payload: bytes) -> tuple[Any, ...]:
-    event = Event.FromString(payload)
-    kind = _name(Event.Kind, event.kind)
-    severity = _name(Event.Severity, event.severity)
-    return (event.wall_ns, event.step, kind, severity, event.text, event.source, event)
-
-
-def _name(enum: Any, number: int) -> str:
-    try:
-        return str(enum.Name(number))
-    except ValueError:
-        # A kind that a later minor version added: still worth its line.
-        return str(number)
-
-
-def _fields(records: Records) -> tuple[Rows, Rows, Rows, Rows, Rows]:
-    return records.states, records.commands, records.events, records.traffic, records.parts
-
-
-def _joined(pieces: list[Records]) -> Records:
-    dtypes = (STATE, COMMAND, EVENT, TRAFFIC, PART)
-    return Records(
-        *(joined([_fields(piece)[column] for piece in pieces], dtype) for column, dtype in enumerate(dtypes))
-    )

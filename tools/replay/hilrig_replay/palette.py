@@ -1,0 +1,30 @@
+"""One colour a thing, the same in the viewer, in plots and in reports."""
+
+from typing import Final
+
+STAGE_NAMES: Final = {
+    "register_wait": "register wait",
+    "controller": "controller",
+    "edge": "edge",
+    "injected": "injected",
+    "tick_wait": "tick wait",
+    "transport": "transport",
+}
+STAGE_COLORS: Final = {
+    "register_wait": "#4c78a8",
+    "controller": "#f58518",
+    "edge": "#54a24b",
+    "injected": "#b279a2",
+    "tick_wait": "#72b7b2",
+    "transport": "#e45756",
+}
+JOINT_SYMBOLS: Final = ("θ1", "θ2", "d3", "θ4")
+JOINT_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
+PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")
+EFFORT_SYMBOLS: Final = ("τ1", "τ2", "τ3", "τ4")
+SEVERITY_COLORS: Final = {"INFO": "#9aa5b1", "WARNING": "#f2b134", "ERROR": "#e45756"}
+
+
+def rgb(color: str) -> tuple[int, int, int]:
+    """Red, green, blue of `#rrggbb`, each 0 to 255."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

@@ -1,0 +1,100 @@
+"""How the viewer is laid out when a rig is opened: the arm large on the left, its curves on the right, events below."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumnKind as _Kind
+
+SIM_TIME: Final = "sim_time"
+WALL: Final = "wall"
+STEP: Final = "step"
+
+TRAIL_S: Final = 4.0
+"""How much of the tool's way is drawn behind it, s."""
+LIVE_WINDOW_S: Final = 20.0
+"""What the curves of a running rig show, s."""
+_EYE: Final = (0.80, -0.72, 0.50)
+_LOOK_AT: Final = (0.14, 0.02, 0.02)
+_BACKGROUND: Final = (24, 28, 33)
+
+
+def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint:
+    """The blueprint for rigs under entity paths `roots`; the arms stand in one scene, their curves in one plot each."""
+    trail = [
+        rrb.VisibleTimeRange(
+            timeline,
+            start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+            end=rr.TimeRangeBoundary.cursor_relative(),
+        )
+        for timeline in (SIM_TIME, WALL)
+    ]
+    scene = rrb.Spatial3DView(
+        name="Arm",
+        origin=_path(roots[0], "scene") if len(roots) == 1 else "/",
+        contents=[f"+ {_path(root, 'scene')}/**" for root in roots],
+        background=rrb.Background(color=_BACKGROUND),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=_EYE, look_target=_LOOK_AT, eye_up=(0.0, 0.0, 1.0)
+        ),
+        overrides={_path(root, "scene/trail"): [rrb.VisibleTimeRanges(trail)] for root in roots},
+    )
+
+    def plot(name: str, path: str, *, legend: bool = True) -> rrb.TimeSeriesView:
+        window = rrb.VisibleTimeRange(
+            SIM_TIME,
+            start=rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S),
+            end=rr.TimeRangeBoundary.cursor_relative(),
+        )
+        return rrb.TimeSeriesView(
+            name=name,
+            origin="/",
+            contents=[f"+ {_path(root, path)}/**" for root in roots],
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+            axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+            time_ranges=[window] if live else None,
+        )
+
+    below = rrb.Horizontal(
+        rrb.TextLogView(
+            name="Events",
+            origin="/",
+            contents=[f"+ {_path(root, 'events')}/**" for root in roots],
+            columns=rrb.TextLogColumns(
+                timeline_columns=[SIM_TIME],
+                text_log_columns=[_Kind.LogLevel, _Kind.Body] if len(roots) == 1 else list(_Kind),
+            ),
+        ),
+        rrb.StateTimelineView(
+            name="What was on",
+            origin="/",
+            contents=[f"+ {_path(root, 'lanes')}/**" for root in roots],
+        ),
+    )
+    curves = rrb.Vertical(
+        plot("Positions: θ in °, d3 in mm", "position"),
+        plot("Velocities: θ in °/s, d3 in mm/s", "velocity", legend=False),
+        plot("Efforts: τ1 τ2 τ4 in N·m, τ3 in N (thin: commanded)", "effort", legend=False),
+        plot("Loop latency, made of its stages, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
+        rrb.Tabs(plot("Tick lateness, ms", "lateness", legend=False), plot("Modbus requests per second", "modbus")),
+        row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), curves, column_shares=[1.45, 1.0]),
+        rrb.TimePanel(
+            timeline=SIM_TIME,
+            state="collapsed",
+            play_state="following" if live else "playing",
+            loop_mode=None if live else "all",
+            fps=50.0,
+        ),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )
+
+
+def _path(root: str, path: str) -> str:
+    return f"/{root}/{path}" if root else f"/{path}"

@@ -1,0 +1,66 @@
+"""Runs into the rerun viewer: a file, a window, or a browser on this machine."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import rerun as rr
+
+from hilrig_replay.rerun_layout import layout
+from hilrig_replay.rig_view import APPLICATION, Drawn, RigView
+from hilrig_replay.run import Run
+from hilrig_runtime.errors import InputError, OperationError
+
+_RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#e45756", "#b279a2", "#72b7b2")
+
+
+def drawn(run: Run) -> Drawn:
+    """What a recording says of its rig's looks.
+
+    Raises:
+        InputError: it says something that is not understood.
+    """
+    try:
+        return Drawn.of(run.urdf, run.parameters_json, run.step_ns)
+    except InputError as error:
+        raise InputError(f"{run.path}: {error}") from error
+
+
+def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
+    """Write runs as one rerun recording with its layout; several stand in one scene, side by side in the plots.
+
+    Raises:
+        InputError: a run can't be read.
+        OperationError: the file can't be written.
+    """
+    chosen = [runs] if isinstance(runs, Run) else list(runs)
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
+    identity = chosen[0].session if len(chosen) == 1 else "+".join(run.session for run in chosen)
+    stream = rr.RecordingStream(APPLICATION, recording_id=identity)
+    roots = root_names(chosen)
+    try:
+        stream.save(path, default_blueprint=layout(roots))
+    except Exception as error:
+        raise OperationError(f"{path}: can't be written: {error}") from error
+    with stream:
+        stream.send_recording_name(identity)
+        for number, (run, root) in enumerate(zip(chosen, roots, strict=True)):
+            color = None if len(chosen) == 1 else _RUN_COLORS[number % len(_RUN_COLORS)]
+            write_run(stream, run, root=root, color=color)
+    stream.disconnect()
+
+
+def write_run(stream: rr.RecordingStream, run: Run, *, root: str = "", color: str | None = None) -> None:
+    """Write one run into a rerun recording, a block at a time."""
+    view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
+    for block in run.blocks():
+        view.add(block)
+
+
+def root_names(runs: Sequence[Run]) -> list[str]:
+    """Entity path of each run: none for a single one, else its session."""
+    if len(runs) == 1:
+        return [""]
+    names = [run.session for run in runs]
+    return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, start=1)]

@@ -1,0 +1,341 @@
+"""A rig in the rerun viewer: the arm in three dimensions, its curves, its latency, its events.
+
+`RigView` writes one rig into a rerun recording, block by block and column by column, and does not care whether the
+blocks come out of a file (`replay`) or off the bus (`live`). Everything of a rig is under one entity path, so that
+several runs stand beside each other in one viewer.
+"""
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.urdf import UrdfTree
+
+from hilrig_replay.columns import Names, Rows
+from hilrig_replay.latency import STAGES, Matcher
+from hilrig_replay.palette import (
+    EFFORT_SYMBOLS,
+    JOINT_COLORS,
+    JOINT_SYMBOLS,
+    PALE_JOINT_COLORS,
+    SEVERITY_COLORS,
+    STAGE_COLORS,
+    STAGE_NAMES,
+    rgb,
+)
+from hilrig_replay.records import Records
+from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL
+from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
+from hilrig_replay.timebase import Timebase
+from hilrig_sim.model import PartParameters, RigParameters
+from hilrig_sim.urdf import urdf
+
+APPLICATION: Final = "hilrig"
+_RATE_BIN_NS: Final = 100_000_000
+"""Modbus requests are counted over so long, ns."""
+_SAFE: Final = "safe zero"
+_NOBODY: Final = "nobody"
+_READS: Final = (1, 2, 3, 4, 23, 43)
+_TRAIL_COLOR: Final = "#f2b134"
+_BASELINE_COLOR: Final = "#5b6570"
+_SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""From rad and m to degrees and mm."""
+_REACH_COLOR: Final = "#3f6f8f"
+_PART_COLOR: Final = "#c8ccd0"
+_PART_SIZE: Final = (0.03, 0.03, 0.03)
+_KIND_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What of a rig does not change while it runs."""
+
+    arm: ArmPicture
+    parameters: RigParameters
+    step_ns: int
+
+    @classmethod
+    def of(cls, urdf_text: str, parameters_json: str, step_ns: int) -> "Drawn":
+        """What a recording or a running simulation says of its rig; what it does not say is as by default.
+
+        Raises:
+            InputError: it says something that is not understood.
+        """
+        parameters = parameters_of(parameters_json)
+        return cls(read_arm(urdf_text or urdf(parameters)), parameters, step_ns)
+
+
+class RigView:
+    """Writes one rig; `root` is the entity path that all of it goes under, empty for the only one."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        drawn: Drawn,
+        timebase: Timebase,
+        names: Names,
+        *,
+        root: str = "",
+        color: str | None = None,
+    ) -> None:
+        self._stream = stream
+        self._drawn = drawn
+        self._timebase = timebase
+        self._names = names
+        self._root = root
+        self._color = color
+        self._matcher = Matcher()
+        self._lanes: dict[str, str] = {}
+        self._controller = "controller"
+        self._clients: set[str] = set()
+        self._last_tip: NDArray[np.float64] | None = None
+        self._placed: set[str] = set()
+        self._write_scene()
+        self._write_legends()
+
+    # -- what does not change ---------------------------------------------------------------------------------------
+
+    def _write_scene(self) -> None:
+        self._static("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        scene = self._drawn.parameters.scene
+        self._write_arm(self._drawn.arm)
+        for part in scene.parts:
+            self._place_part(part)
+        outline = reach_outline(self._drawn.parameters.arm, scene.table_height + 0.002)
+        trail = rgb(self._color or _TRAIL_COLOR)
+        self._static("scene/trail", rr.LineStrips3D.from_fields(colors=[trail], radii=[0.002]))
+        self._static("scene/reach", rr.LineStrips3D(outline, colors=[rgb(_REACH_COLOR)], radii=[0.0012]))
+
+    def _write_arm(self, arm: ArmPicture) -> None:
+        frames = self._path("scene").replace("/", "_") + "_"
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "arm.urdf"
+            file.write_text(arm.urdf, encoding="utf-8")
+            tree = UrdfTree.from_file_path(
+                file,
+                entity_path_prefix=self._path("scene"),
+                frame_prefix=frames,
+                static_transform_entity_path=self._path("scene/arm_fixed"),
+            )
+        tree.log_urdf_to_recording(self._stream)
+        # The URDF has named frames, all else the tree of paths: this hangs the arm's root into the scene.
+        self._static(
+            "scene/arm_root",
+            rr.Transform3D(parent_frame=f"tf#/{self._path('scene')}", child_frame=frames + arm.root),
+        )
+        self._frames = frames
+        for link, number, shape in arm.solids:
+            paths = tree.get_visual_geometry_paths(link)
+            if number < len(paths):
+                # As it comes, a primitive is drawn transparent with its edges.
+                solid: Any = {"box": rr.Boxes3D, "cylinder": rr.Cylinders3D, "sphere": rr.Ellipsoids3D}[shape]
+                self._stream.log(paths[number], solid.from_fields(fill_mode="solid"), static=True)
+
+    def _place_part(self, part: PartParameters) -> None:
+        path = f"scene/parts/{part.name}"
+        self._placed.add(part.name)
+        color = rgb(part.colour)
+        if part.shape == "cylinder":
+            shape: Any = rr.Cylinders3D(
+                lengths=[part.size[2]], radii=[part.size[0] / 2], colors=[color], fill_mode="solid"
+            )
+        else:
+            half = tuple(length / 2 for length in part.size)
+            shape = rr.Boxes3D(half_sizes=[half], colors=[color], fill_mode="solid")
+        self._static(path, shape)
+        self._static(path, rr.Transform3D(translation=part.position, rotation=_about_z(part.yaw)))
+
+    def _write_legends(self) -> None:
+        self._legend("position", JOINT_SYMBOLS, JOINT_COLORS)
+        self._legend("velocity", JOINT_SYMBOLS, JOINT_COLORS)
+        self._legend("effort/commanded", [f"{name} commanded" for name in EFFORT_SYMBOLS], PALE_JOINT_COLORS, 0.8)
+        self._legend("effort/applied", [f"{name} applied" for name in EFFORT_SYMBOLS], JOINT_COLORS)
+        ends = ["state sampled", *(f"+ {STAGE_NAMES[stage]}" for stage in STAGES[:-1]), "+ transport = loop"]
+        self._legend("stages", ends, [_BASELINE_COLOR, *(STAGE_COLORS[stage] for stage in STAGES)])
+        self._legend("loop", ["loop latency"], ["#e0e4e8"])
+        for lane, colors in self._lane_colors().items():
+            shades = [rgb(color) for color in colors.values()]
+            self._static(f"lanes/{lane}", rr.StateConfiguration(values=list(colors), colors=shades))
+        self._legend("lateness", ["tick lateness"], ["#e45756"])
+
+    def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
+        shades = [rgb(color) for color in colors] if self._color is None else [rgb(self._color)] * len(names)
+        lines = rr.SeriesLines(names=list(names), colors=shades, widths=[width] * len(names))
+        self._static(path, lines)
+
+    def _lane_colors(self) -> dict[str, dict[str, str]]:
+        parts = {part.name: part.colour for part in self._drawn.parameters.scene.parts}
+        return {
+            "magnet": {"on": "#e45756", "off": "#3a424c"},
+            "part": parts,
+            "torque": {_SAFE: "#e45756", _NOBODY: "#3a424c"},
+        }
+
+    # -- what changes -----------------------------------------------------------------------------------------------
+
+    def add(self, records: Records) -> None:
+        """Write the next piece; its states must be known to the timebase."""
+        if len(records.commands):
+            self._add_commands(records.commands)
+        if len(records.states):
+            self._add_states(records.states)
+        if len(records.parts):
+            self._add_parts(records.parts)
+        samples = self._matcher.add(records.states, records.commands)
+        if len(samples):
+            self._add_latency(samples)
+        if len(records.traffic):
+            self._add_traffic(records.traffic)
+        if len(records.events):
+            self._add_events(records.events)
+
+    def _add_states(self, states: Rows) -> None:
+        times = self._times(states)
+        q = np.ascontiguousarray(states["position"])
+        self._scalars("position", times, q * _SHOWN)
+        self._scalars("velocity", times, states["velocity"] * _SHOWN)
+        self._scalars("effort/applied", times, states["effort"])
+        self._scalars("lateness", times, states["lateness_ns"][:, None] / 1e6)
+        self._add_pose(times, q)
+        self._lane("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
+        self._lane("part", states, self._names.texts(states["held_part"]))
+        self._lane("torque", states, _torque_source(states, self._controller))
+        self._lane("stops", states, _stops(states["limit_flags"]))
+
+    def _add_pose(self, times: list[rr.TimeColumn], q: NDArray[np.float64]) -> None:
+        for joint, values in zip(self._drawn.arm.joints, q.T, strict=True):
+            translations, rotations = joint.transforms(values)
+            columns = rr.Transform3D.columns(
+                translation=translations,
+                quaternion=rotations,
+                parent_frame=[self._frames + joint.parent] * len(values),
+                child_frame=[self._frames + joint.child] * len(values),
+            )
+            self._send(f"scene/joints/{joint.name}", times, columns)
+        points = tips(self._drawn.parameters.arm, q)
+        before = points[:1] if self._last_tip is None else self._last_tip
+        segments = np.stack((np.concatenate((before, points[:-1])), points), axis=1)
+        self._last_tip = points[-1:]
+        self._send("scene/trail", times, rr.LineStrips3D.columns(strips=list(segments)))
+
+    def _add_parts(self, parts: Rows) -> None:
+        for code in np.unique(parts["part"]):
+            name = self._names[int(code)]
+            rows = parts[parts["part"] == code]
+            if name not in self._placed:
+                unknown = PartParameters(name, "box", _PART_SIZE, 0.1, True, _PART_COLOR, (0.0, 0.0, 0.0), 0.0)
+                self._place_part(unknown)
+            half = rows["yaw"] / 2
+            zero = np.zeros(len(rows))
+            self._send(
+                f"scene/parts/{name}",
+                self._times(rows),
+                rr.Transform3D.columns(
+                    translation=np.stack((rows["x"], rows["y"], rows["z"]), axis=1),
+                    quaternion=np.stack((zero, zero, np.sin(half), np.cos(half)), axis=1),
+                ),
+            )
+
+    def _add_commands(self, commands: Rows) -> None:
+        times = self._times(commands)
+        self._scalars("effort/commanded", times, commands["effort"])
+        self._controller = self._names[int(commands["controller"][-1])] or self._controller
+
+    def _add_latency(self, samples: Rows) -> None:
+        times = self._times(samples)
+        self._scalars("loop", times, samples["loop"][:, None] / 1e6)
+        ends = np.cumsum(np.stack([samples[stage] for stage in STAGES], axis=1), axis=1) / 1e6
+        self._scalars("stages", times, np.hstack((np.zeros((len(ends), 1)), ends)))
+
+    def _add_traffic(self, traffic: Rows) -> None:
+        kinds = np.isin(traffic["function"], _READS)
+        for code in np.unique(traffic["controller"]):
+            controller = self._names[int(code)]
+            safe = controller.replace("/", "_") or "unknown"
+            if safe not in self._clients:
+                self._clients.add(safe)
+                for kind, color in _KIND_COLORS.items():
+                    self._static(
+                        f"modbus/{safe}/{kind}",
+                        rr.SeriesLines(names=[f"{controller} {kind}"], colors=[rgb(color)], widths=[1.5]),
+                    )
+            mine = traffic["controller"] == code
+            for kind, chosen in (("reads", mine & kinds), ("writes", mine & ~kinds)):
+                rows = traffic[chosen]
+                if not len(rows):
+                    continue
+                bins = rows["wall_ns"] // _RATE_BIN_NS
+                first, last = int(bins.min()), int(bins.max())
+                counts = np.bincount((bins - first).astype(np.intp), minlength=last - first + 1)
+                at = np.zeros(len(counts), np.dtype([("wall_ns", "<i8")]))
+                at["wall_ns"] = (first + np.arange(len(counts))) * _RATE_BIN_NS
+                self._scalars(f"modbus/{safe}/{kind}", self._times(at), counts[:, None] * (1e9 / _RATE_BIN_NS))
+
+    def _add_events(self, events: Rows) -> None:
+        texts = [
+            f"{kind.replace('_', ' ').lower()}: {text}"
+            for kind, text in zip(events["kind"], events["text"], strict=True)
+        ]
+        levels = ["WARN" if severity == "WARNING" else severity for severity in events["severity"]]
+        colors = [rgb(SEVERITY_COLORS.get(severity, "#9aa5b1")) for severity in events["severity"]]
+        self._send("events", self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
+
+    # -- the recording ----------------------------------------------------------------------------------------------
+
+    def _lane(self, name: str, rows: Rows, values: NDArray[np.object_]) -> None:
+        """A lane of states over time: only its changes are written."""
+        changed = np.ones(len(values), np.bool_)
+        changed[0] = values[0] != self._lanes.get(name)
+        changed[1:] = values[1:] != values[:-1]
+        self._lanes[name] = values[-1]
+        if changed.any():
+            states = [str(value) for value in values[changed]]
+            self._send(f"lanes/{name}", self._times(rows[changed]), rr.StateChange.columns(state=states))
+
+    def _times(self, rows: Rows) -> list[rr.TimeColumn]:
+        return [
+            rr.TimeColumn(SIM_TIME, duration=self._timebase.time_ns(rows).astype("timedelta64[ns]")),
+            rr.TimeColumn(WALL, timestamp=rows["wall_ns"].astype("datetime64[ns]")),
+            rr.TimeColumn(STEP, sequence=self._timebase.steps(rows, self._drawn.step_ns)),
+        ]
+
+    def _scalars(self, path: str, times: list[rr.TimeColumn], values: NDArray[np.floating]) -> None:
+        self._send(path, times, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
+
+    def _send(self, path: str, times: list[rr.TimeColumn], columns: Any) -> None:
+        rr.send_columns(self._path(path), times, columns, recording=self._stream)
+
+    def _static(self, path: str, what: Any) -> None:
+        self._stream.log(self._path(path), what, static=True)
+
+    def _path(self, path: str) -> str:
+        return f"{self._root}/{path}" if self._root else path
+
+
+def _about_z(angle: float) -> Any:
+    return rr.Quaternion(xyzw=[0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))])
+
+
+def _torque_source(states: Rows, controller: str) -> NDArray[np.object_]:
+    source = np.full(len(states), controller, dtype=object)
+    source[states["command_seq"] == 0] = _NOBODY
+    source[states["safe"]] = _SAFE
+    return source
+
+
+def _stops(flags: NDArray[np.uint16]) -> NDArray[np.object_]:
+    unique, inverse = np.unique(flags, return_inverse=True)
+    return np.array([_stop_names(int(value)) for value in unique], dtype=object)[inverse]
+
+
+def _stop_names(flags: int) -> str:
+    found = [f"{symbol} lower" for joint, symbol in enumerate(JOINT_SYMBOLS) if flags >> joint & 1]
+    found += [f"{symbol} upper" for joint, symbol in enumerate(JOINT_SYMBOLS) if flags >> (joint + 4) & 1]
+    if flags >> 8 & 1:
+        found.append("tool on something")
+    return ", ".join(found)
