@@ -3,6 +3,7 @@
 from hilrig_schemas.v1.event_pb2 import Event
 from hilrig_schemas.v1.health_pb2 import Health
 from hilrig_schemas.v1.joint_state_pb2 import JointState, PartState
+from hilrig_schemas.v1.lease_pb2 import LeaseRequest, LeaseStatus
 from hilrig_schemas.v1.log_batch_pb2 import LogBatch, LogEntry, OpenSession
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusRequest, ModbusTraffic
 from hilrig_schemas.v1.rig_config_pb2 import RigConfig
@@ -12,6 +13,8 @@ __all__ = [
     "Event",
     "Health",
     "JointState",
+    "LeaseRequest",
+    "LeaseStatus",
     "LogBatch",
     "LogEntry",
     "ModbusRequest",

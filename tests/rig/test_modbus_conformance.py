@@ -3,13 +3,18 @@
 Each row of `RULES` is a request's PDU and what must come back; `docs/modbus-conformance.md` is made from them.
 """
 
+import gc
+import socket
 import struct
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from conformance import RULES, Rule
+from conformance import NAMED, RULES, Rule, as_markdown
 from edge_rig import EdgeRig, RawClient, counts, running_edge
+from hilrig_modbus_edge.server import Connection
 from waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -153,3 +158,38 @@ def test_every_function_that_is_not_there_says_so_with_its_own_code(client: RawC
     here = {1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43}
     for function in set(range(256)) - here:
         assert client.ask(bytes((function, 0, 0, 0, 1))) == bytes((function | 0x80, 1))
+
+
+def test_answers_are_not_held_back(client: RawClient) -> None:
+    """With Nagle's algorithm, the second of two answers waits for the client's delayed acknowledgement, some 40 ms."""
+    client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    client.read(0, 1)
+    [connection] = [c for c in _sockets() if c.getpeername() == client.socket.getsockname()]
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    begin = time.monotonic()
+    for _ in range(20):
+        client.send(client.frame(b"\x03\x00\x00\x00\x08"))
+        client.send(client.frame(b"\x03\x00\x00\x00\x08"))
+        client.receive()
+        client.receive()
+    assert time.monotonic() - begin < 0.4
+
+
+def _sockets() -> list[socket.socket]:
+    """The edge's ends of the connections; it runs in this process."""
+    found = []
+    for entry in gc.get_objects():
+        if isinstance(entry, Connection) and not entry._transport.is_closing():
+            found.append(entry._transport.get_extra_info("socket"))
+    return found
+
+
+def test_the_page_is_generated_from_these_rules() -> None:
+    page = Path(__file__).parents[2] / "docs/modbus-conformance.md"
+    assert page.read_text() == as_markdown(), "run: python tests/conformance.py > docs/modbus-conformance.md"
+
+
+def test_every_rule_of_the_page_has_its_test() -> None:
+    for _, _, name in NAMED:
+        assert callable(globals()[name])

@@ -5,12 +5,15 @@ and events leave at once. A tick every 20 ms does what can wait that long.
 """
 
 import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge import traffic
 from hilrig_modbus_edge.device import Device, DeviceSettings
 from hilrig_modbus_edge.server import Limits, RigServer, bind
+from hilrig_runtime.bus import Handle
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.service import Service
 from hilrig_schemas import Event, topics
@@ -19,6 +22,8 @@ TICK_NS: Final = 20_000_000
 TRAFFIC_PERIOD_NS: Final = 200_000_000
 FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 """How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
+
+ANSWER_TIMEOUT_S: Final = 1.0
 
 
 def run(service: Service) -> None:
@@ -88,6 +93,7 @@ class Edge:
             self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
         service.counters.rigs = len(lab.rigs)
         self._traffic_due_ns = 0
+        self._leases: list[Handle] = []
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
@@ -98,6 +104,7 @@ class Edge:
         for server in self._servers:
             server.device.begin()
         try:
+            self._answer_leases()
             await self._first_states()
             for server, listening in zip(self._servers, sockets, strict=True):
                 await server.listen(listening)
@@ -112,6 +119,13 @@ class Edge:
         """Tell the log stream which sessions are open."""
         open_sessions = [wire.device.session for wire in self._wires.values() if wire.device.session is not None]
         self.service.log.set_sessions([session.as_message() for session in open_sessions])
+
+    def _answer_leases(self) -> None:
+        loop, bus, lab = asyncio.get_running_loop(), self.service.bus, self.service.lab
+        for rig, wire in self._wires.items():
+            # Asked on a thread of the bus, answered on the loop, which alone touches devices.
+            answer = partial(_on_loop, loop, partial(_answer_lease, wire.device))
+            self._leases.append(bus.serve(topics.LEASE.key(lab.name, rig), answer))
 
     async def _first_states(self) -> None:
         clock, stopping = self.service.clock, self.service.stopping
@@ -156,9 +170,32 @@ class Edge:
 
     def _close(self) -> None:
         now_ns = self.service.clock.monotonic_ns()
+        for lease in self._leases:
+            lease.close()
         for server in self._servers:
             server.device.shut("the edge stops")
             server.close("the edge stops")
             if server.notes:
                 self._send_traffic(server, now_ns)
         self.state_sessions()
+
+
+def _answer_lease(device: Device, payload: bytes) -> bytes:
+    request = LeaseRequest.FromString(payload)
+    released = device.release("released by hand") if request.release else ""
+    status = device.lease_status()
+    status.released = released
+    return status.SerializeToString()
+
+
+def _on_loop(loop: asyncio.AbstractEventLoop, answer: Callable[[bytes], bytes], payload: bytes) -> bytes:
+    done: Future[bytes] = Future()
+
+    def call() -> None:
+        try:
+            done.set_result(answer(payload))
+        except Exception as error:
+            done.set_exception(error)
+
+    loop.call_soon_threadsafe(call)
+    return done.result(ANSWER_TIMEOUT_S)

@@ -23,7 +23,7 @@ from hilrig_modbus_edge.watchdog import Watchdog, WatchdogState
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import EdgeConfig
 from hilrig_runtime.service import Arrival
-from hilrig_schemas import Event, TorqueCommand
+from hilrig_schemas import Event, LeaseStatus, TorqueCommand
 
 MS: Final = 1_000_000
 REFUSAL_PERIOD_NS: Final = 1_000 * MS
@@ -300,6 +300,19 @@ class Device:
             return ""
         self._lose_lease(reason)
         return holder.address
+
+    def lease_status(self) -> LeaseStatus:
+        """How the lease stands."""
+        holder = self.lease.holder
+        return LeaseStatus(
+            rig=self.rig,
+            holder="" if holder is None else holder.address,
+            silent_ns=0 if holder is None else self._monotonic_ns() - holder.last_request_ns,
+            session="" if self.session is None else self.session.id,
+            connections=len(self.clients),
+            watchdog_tripped=self.watchdog.tripped,
+            watchdog_timeout_ns=self.watchdog.timeout_ns,
+        )
 
     # -- inside
 

@@ -1,0 +1,31 @@
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from typing import ClassVar as _ClassVar, Optional as _Optional
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class LeaseRequest(_message.Message):
+    __slots__ = ("release",)
+    RELEASE_FIELD_NUMBER: _ClassVar[int]
+    release: bool
+    def __init__(self, release: _Optional[bool] = ...) -> None: ...
+
+class LeaseStatus(_message.Message):
+    __slots__ = ("rig", "holder", "released", "silent_ns", "session", "connections", "watchdog_tripped", "watchdog_timeout_ns")
+    RIG_FIELD_NUMBER: _ClassVar[int]
+    HOLDER_FIELD_NUMBER: _ClassVar[int]
+    RELEASED_FIELD_NUMBER: _ClassVar[int]
+    SILENT_NS_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
+    WATCHDOG_TRIPPED_FIELD_NUMBER: _ClassVar[int]
+    WATCHDOG_TIMEOUT_NS_FIELD_NUMBER: _ClassVar[int]
+    rig: str
+    holder: str
+    released: str
+    silent_ns: int
+    session: str
+    connections: int
+    watchdog_tripped: bool
+    watchdog_timeout_ns: int
+    def __init__(self, rig: _Optional[str] = ..., holder: _Optional[str] = ..., released: _Optional[str] = ..., silent_ns: _Optional[int] = ..., session: _Optional[str] = ..., connections: _Optional[int] = ..., watchdog_tripped: _Optional[bool] = ..., watchdog_timeout_ns: _Optional[int] = ...) -> None: ...

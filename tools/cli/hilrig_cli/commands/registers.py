@@ -1,0 +1,40 @@
+"""`hilrig registers`: the map of a rig's registers, for people and for PLC tools."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+
+def registers(
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print it as CSV, to import into a PLC tool.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print it as docs/registers.md has it.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print what each register and coil of a rig holds."""
+    from hilrig_modbus_edge import register_tables
+
+    if as_csv:
+        print(register_tables.as_csv(), end="")
+    elif as_markdown:
+        print(register_tables.as_markdown(), end="")
+    elif as_json:
+        print(json.dumps(register_tables.as_rows()))
+    else:
+        _print_table(register_tables.as_rows())
+
+
+def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "what it is")
+    for row in rows:
+        table.add_row(
+            *(str(row[key]) for key in ("table", "number", "address", "name", "type", "unit", "scale")),
+            "controller" if row["writable"] else "rig",
+            str(row["text"]),
+        )
+    Console().print(table)
