@@ -18,6 +18,7 @@ from typing import Final
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.disk import Disk
 from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
+from hilrig_recorder.reserve import Reserve
 from hilrig_recorder.sessions import SECOND_NS, Recording, Sink
 from hilrig_recorder.writer import RunWriter, part_path
 from hilrig_runtime.clock import Clock
@@ -84,6 +85,8 @@ class Files:
         self._space_due_ns = 0
         self._full = False
         self._bytes_closed = 0
+        self._reserve = Reserve(self.folder)
+        self._reserve.hold()
 
     @property
     def trouble(self) -> str:
@@ -180,6 +183,10 @@ class Files:
                 self._end_failed(file, OSError(errno.ENOSPC, "the disk is nearly full"))
             elif self._is_due(file, now_ns):
                 self._rotate(file)
+
+    def release(self) -> None:
+        """Give back what was set aside: the recorder ends."""
+        self._reserve.release()
 
     def forget_trouble(self, about: str) -> None:
         """A trouble is over."""
@@ -336,6 +343,10 @@ class Files:
         if file.failure is not None:
             return
         file.failure = error
+        if error.errno == errno.ENOSPC:
+            # Every file on this disk ends now, while the space set aside is enough for all of them.
+            self._reserve.release()
+            self._full = True
         recording = file.recording
 
         def lose(channel_id: int, log_time: int, record: bytes) -> None:  # noqa: ARG001
@@ -361,12 +372,17 @@ class Files:
     def _watch_space(self, now_ns: int) -> None:
         if now_ns < self._space_due_ns:
             return
+        # A file that just failed for want of space ends before space is looked at again.
+        if any(file.failure is not None for file in self._files.values()):
+            return
         self._space_due_ns = now_ns + _FREE_SPACE_PERIOD_NS
         try:
             free = shutil.disk_usage(self.folder).free
         except OSError:
             return
         was_full, self._full = self._full, free < self._config.min_free_mib * _MIB
+        if not self._full:
+            self._reserve.hold()
         if self._full and not was_full:
             text = (
                 f"{self.folder}: only {free // _MIB} MiB are free, {self._config.min_free_mib} are kept: no recording"

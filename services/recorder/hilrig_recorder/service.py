@@ -296,3 +296,4 @@ class Recorder:
         if not self._disk.close(_FINISH_TIMEOUT_S):
             logger.error("the disk is too slow: some files keep their .part name, to be recovered")
         self._housekeeping.close()
+        self._files.release()

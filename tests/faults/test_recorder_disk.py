@@ -1,0 +1,133 @@
+"""A disk that is full, or slow, or fails: the file ends whole, the operator is told, the other rigs' files go on."""
+
+import contextlib
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas import Health
+from hilrig_schemas.topics import HEALTH
+from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
+from waiting import eventually
+
+
+@contextmanager
+def tmpfs(folder: Path, size_kib: int) -> Iterator[Path]:
+    """A file system of so many KiB."""
+    if os.name != "posix" or os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("needs root, to mount a small file system")
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size_kib}k", "tmpfs", str(folder)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    if mounted.returncode:
+        pytest.skip(f"a small file system can't be mounted here: {mounted.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def fill(path: Path) -> None:
+    """Write until there is no space left."""
+    with path.open("wb", buffering=0) as stream, contextlib.suppress(OSError):
+        while stream.write(bytes(4096)):
+            pass
+
+
+class Troubles:
+    """What the recorder's health says, as it comes."""
+
+    def __init__(self, lab: LabConfig) -> None:
+        self.heard: list[str] = []
+        self._bus = ZenohBus(lab.bus, "tool")
+        self._bus.subscribe(HEALTH.key(lab.name, "recorder", "*"), self._on_health)
+
+    def _on_health(self, _key: str, payload: bytes) -> None:
+        self.heard.append(Health.FromString(payload).trouble)
+
+    def close(self) -> None:
+        self._bus.close()
+
+
+@pytest.mark.rig
+def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_again(tmp_path: Path) -> None:
+    config, lab = make_lab(tmp_path, rigs=2, extra="recorder.min_free_mib = 0")
+    rigs = [rig.name for rig in lab.rigs]
+    with tmpfs(tmp_path / "recordings", 600) as folder, sending(lab, rigs) as senders:
+        ballast = folder / "ballast"
+        with RecorderProcess(config) as recorder:
+            wait_ready(lab, recorder)
+            troubles = Troubles(lab)
+            try:
+                for rig in rigs:
+                    senders.begin(rig)
+                eventually(lambda: all(senders.count(rig) > 100 for rig in rigs))
+                fill(ballast)
+                for rig in rigs:
+                    eventually(lambda rig=rig: files_of(lab, rig), timeout_s=30)
+                eventually(lambda: any("No space left" in text for text in troubles.heard))
+                full = {rig: files_of(lab, rig)[0] for rig in rigs}
+                for rig in rigs:
+                    summary = metadata(full[rig])["hilrig.summary"]
+                    assert summary["ended"] == "disk full"
+                    found = recorded([full[rig]])
+                    assert set(found) & set(senders.sent[rig])
+                    assert len(found) == len(set(found))
+                ballast.unlink()
+                # Tried again ten seconds after it failed.
+                for rig in rigs:
+                    eventually(lambda rig=rig: files_of(lab, rig, "*.part"), timeout_s=30)
+                eventually(lambda: troubles.heard and not troubles.heard[-1])
+                for rig in rigs:
+                    senders.end(rig)
+                for rig in rigs:
+                    eventually(lambda rig=rig: len(files_of(lab, rig)) == 2, timeout_s=30)
+            finally:
+                troubles.close()
+        for rig in rigs:
+            last = files_of(lab, rig)[-1]
+            assert metadata(last)["hilrig.session"]["previous"] == full[rig].name
+            # The gap between the two files is known, and stands in the second.
+            lost = int(metadata(last)["hilrig.summary"]["lost_recorder"])
+            found = recorded(files_of(lab, rig))
+            numbers = {sequence for channel, sequence, _ in found if channel == "/state"}
+            assert lost >= max(numbers) - min(numbers) + 1 - len(numbers) > 0
+
+
+@pytest.mark.rig
+def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path: Path) -> None:
+    config, lab = make_lab(tmp_path, extra="recorder.min_free_mib = 2")
+    with tmpfs(tmp_path / "recordings", 4096) as folder, sending(lab, ["rig1"]) as senders:
+        with RecorderProcess(config) as recorder:
+            wait_ready(lab, recorder)
+            senders.begin("rig1")
+            eventually(lambda: files_of(lab, "rig1", "*.part"))
+            (folder / "ballast").write_bytes(bytes(2_600_000))
+            [path] = eventually(lambda: files_of(lab, "rig1"), timeout_s=15)
+            assert recorder.process.poll() is None
+        assert metadata(path)["hilrig.summary"]["ended"] == "disk full"
+        assert "nearly full" in metadata(path)["hilrig.summary"]["reason"]
+    assert "only" in recorder.log.read_text()
+
+
+@pytest.mark.rig
+def test_a_folder_that_can_not_be_written_is_one_line_and_exit_3(tmp_path: Path) -> None:
+    config, _ = make_lab(tmp_path)
+    (tmp_path / "recordings").write_text("in the way")
+    with RecorderProcess(config) as recorder:
+        assert recorder.process.wait(30) == 3
+    errors = [line for line in recorder.log.read_text().splitlines() if "error" in line]
+    assert len(errors) == 1
+    assert "recordings can't be written there" in errors[0]
+    assert "Traceback" not in recorder.log.read_text()
