@@ -136,7 +136,7 @@ class Connection(asyncio.BufferedProtocol):
                 self._server.refuse(host, port, reason)
             transport.abort()
             return
-        keep_alive(transport.get_extra_info("socket"))
+        tune(transport.get_extra_info("socket"))
         self.client = self._device.connect(host, port)
         self._server.connections.add(self)
         self._server.counters.connections += 1
@@ -251,8 +251,10 @@ def bind(rig: str, host: str, port: int) -> socket.socket:
         ) from error
 
 
-def keep_alive(connected: socket.socket) -> None:
-    """Let the system find out within some 10 s that a peer is gone without a word."""
+def tune(connected: socket.socket) -> None:
+    """Send each answer at once, and let the system find out within some 10 s that a peer is gone without a word."""
+    # asyncio sets this on sockets that it made itself; it does not recognise one from `socket.create_server`.
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     # The names that a system does not have it does not need: macOS says TCP_KEEPALIVE for TCP_KEEPIDLE.
     for name, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPALIVE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):

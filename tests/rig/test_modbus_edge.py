@@ -1,0 +1,299 @@
+"""The edge on real sockets: leases, sessions, watchdog, limits, stamps, the record of its traffic, and its end."""
+
+import struct
+import threading
+import time
+
+import pytest
+
+from edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
+from hilrig_modbus_edge.bridge import run
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.memory_bus import MemoryBus
+from hilrig_runtime.service import Service
+from hilrig_schemas import Event, LeaseRequest, LeaseStatus, topics
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+
+# -- the loop: stamps
+
+
+def test_a_write_is_published_with_stamps_in_the_order_of_time() -> None:
+    with running_edge() as rig, rig.client() as client:
+        began_ns = now_ns()
+        state = rig.state()
+        assert client.read(4, 4) == counts()
+        client.write(0, 1000, -1000, 0, 5)
+        command = rig.commands[-1]
+        assert list(command.effort) == [1.0, -1.0, 0.0, 0.005]
+        assert (command.basis_incarnation, command.basis_step) == (state.incarnation, state.step)
+        stamps = [
+            began_ns,
+            command.state_arrived_ns,
+            command.state_served_ns,
+            command.write_arrived_ns,
+            command.sent_ns,
+            now_ns(),
+        ]
+        assert stamps == sorted(stamps)
+        assert command.controller == client.address
+
+
+def test_pipelined_reads_and_writes_never_give_a_negative_stage() -> None:
+    with running_edge() as rig, rig.client() as client:
+        read = client.frame(b"\x03\x00\x04\x00\x04")
+        write = client.frame(bytes.fromhex("10 00 00 00 01 02 00 01"))
+        for _ in range(200):
+            rig.state()
+            client.send(read + write + read + write)
+            for _ in range(4):
+                client.receive()
+        measured = [command for command in rig.commands if command.basis_step]
+        assert len(measured) > 300
+        for command in measured:
+            assert 0 < command.state_arrived_ns <= command.state_served_ns
+            assert command.state_served_ns <= command.write_arrived_ns <= command.sent_ns
+
+
+def test_what_was_sent_is_on_the_record_byte_for_byte() -> None:
+    with running_edge() as rig, rig.client() as client:
+        client.write(0, 7)
+        client.read(4, 4)
+        client.write(8, 1)
+        asked = eventually(lambda: len(r := [q for t in rig.traffic for q in t.requests]) == 3 and r)
+        assert [(q.function, q.address, q.count, q.exception) for q in asked] == [
+            (16, 0, 1, 0),
+            (3, 4, 4, 0),
+            (16, 8, 1, 2),
+        ]
+        assert all(q.controller == client.address and q.arrived_ns <= q.answered_ns for q in asked)
+
+
+# -- one writer
+
+
+def test_two_controllers_one_writes_and_both_read() -> None:
+    with running_edge() as rig, rig.client() as holder, rig.client() as other:
+        holder.write(0, 500)
+        assert other.write(0, 900).hex() == "9006"
+        assert other.ask("05 00 00 FF 00").hex() == "8506"
+        assert other.read(0, 1) == [500]
+        refusal = rig.event(Event.LEASE_REFUSED)
+        assert (refusal.controller_data.controller, refusal.controller_data.holder) == (other.address, holder.address)
+        holder.close()
+        eventually(lambda: other.write(0, 900).hex() == "1000000001")
+        assert rig.kinds().count("LEASE_GRANTED") == 2
+
+
+def test_the_teacher_sees_and_frees_a_lease() -> None:
+    with running_edge() as rig, rig.client() as holder, MemoryBus(rig.hub) as teacher:
+        key = topics.LEASE.key(rig.lab.name, "rig1")
+
+        def ask(release: bool = False) -> LeaseStatus:
+            [answer] = teacher.ask(key, LeaseRequest(release=release).SerializeToString())
+            return LeaseStatus.FromString(answer.payload)
+
+        assert ask().holder == ""
+        holder.write(0, 1)
+        assert (ask().holder, ask().connections) == (holder.address, 1)
+        assert (released := ask(release=True)).released == holder.address
+        assert released.holder == ""
+        assert ask(release=True).released == ""
+        # It was not banned: whoever writes next gets the rig.
+        holder.write(0, 1)
+        assert ask().holder == holder.address
+
+
+# -- sessions
+
+
+def test_a_session_lasts_over_reconnects_and_ends_after_its_grace() -> None:
+    with running_edge(session_grace_ms=300) as rig:
+        for _ in range(3):
+            with rig.client() as client:
+                client.write(0, 0)
+        eventually(lambda: "SESSION_END" in rig.kinds())
+        assert [kind for kind in rig.kinds() if "SESSION" in kind] == ["SESSION_START", "SESSION_END"]
+        session = rig.event(Event.SESSION_START).session
+        assert session
+        assert {command.session for command in rig.commands} == {session, ""}
+        assert rig.commands[-1].session == ""
+        eventually(lambda: not rig.sessions)
+
+
+def test_the_log_stream_states_the_open_sessions() -> None:
+    with running_edge() as rig, rig.client() as client:
+        client.write(0, 0)
+        eventually(lambda: rig.sessions == [rig.event(Event.SESSION_START).session])
+
+
+def test_an_orderly_end_leaves_no_torque_and_no_session() -> None:
+    with running_edge() as rig, rig.client() as client:
+        client.write(0, 1000)
+        rig.service.stop()
+        eventually(lambda: rig.commands[-1].safe)
+        assert list(rig.commands[-1].effort) == [0, 0, 0, 0]
+        eventually(lambda: "SESSION_END" in rig.kinds())
+        assert client.closed()
+    assert rig.sessions == []
+
+
+# -- watchdog
+
+
+@pytest.mark.parametrize("how", ["closes", "is silent", "reads on"])
+def test_torque_is_zero_within_the_time_out(how: str) -> None:
+    timeout_ms = 200
+    with running_edge(watchdog_ms=timeout_ms) as rig, rig.client() as client:
+        client.write(0, 1000)
+        write = rig.commands[-1]
+        if how == "closes":
+            client.close()
+        while not rig.commands[-1].safe:
+            if how == "reads on":
+                client.read(4, 4)
+            else:
+                time.sleep(0.001)
+        safe = rig.commands[-1]
+        silent_ms = (safe.sent_ns - write.write_arrived_ns) / 1e6
+        assert timeout_ms <= silent_ms < timeout_ms + 20
+        why = {"closes": "is gone", "is silent": "is silent", "reads on": "reads but does not write"}[how]
+        assert why in rig.event(Event.WATCHDOG_TRIP).text
+
+
+def test_the_time_out_by_register_holds_at_once() -> None:
+    with running_edge() as rig, rig.client() as client:
+        client.write(0, 1000)
+        client.write(101, 100)
+        eventually(lambda: rig.commands[-1].safe, timeout_s=0.5)
+
+
+def test_the_standing_command_is_repeated_while_the_controller_thinks() -> None:
+    with running_edge(repeat_ms=50) as rig, rig.client() as client:
+        client.write(0, 1000)
+        seq = rig.commands[-1].seq
+        eventually(lambda: [repeat.seq for repeat in rig.repeats].count(seq) >= 3)
+
+
+# -- who may connect, and how long
+
+
+def test_connections_are_limited_and_the_operator_sees_it() -> None:
+    with running_edge(max_connections=2, max_connections_per_host=5) as rig:
+        with rig.client() as one, rig.client() as two:
+            one.read(0, 1)
+            two.read(0, 1)
+            with rig.client() as three:
+                assert three.closed()
+            refusal = rig.event(Event.CONNECTION_REFUSED)
+            assert "max_connections" in refusal.text
+            assert rig.service.counters.refused == 1
+            assert one.read(0, 1) == [0]
+        with rig.client() as four:
+            assert four.read(0, 1) == [0]
+
+
+def test_connections_of_one_host_are_limited() -> None:
+    with running_edge(max_connections=5, max_connections_per_host=1) as rig, rig.client() as one:
+        one.read(0, 1)
+        with rig.client() as two:
+            assert two.closed()
+        assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
+
+
+def test_only_allowed_networks_may_connect() -> None:
+    with running_edge(allow=["10.0.0.0/8"]) as rig:
+        with rig.client() as client:
+            assert client.closed()
+        assert "networks" in rig.event(Event.CONNECTION_REFUSED).text
+    with running_edge(allow=["10.0.0.0/8", "127.0.0.0/8"]) as rig, rig.client() as client:
+        assert client.read(0, 1) == [0]
+
+
+def test_an_idle_connection_is_closed_and_a_used_one_is_not() -> None:
+    with running_edge(idle_timeout_s=0.3) as rig, rig.client() as idle, rig.client() as used:
+        closed = threading.Event()
+        threading.Thread(target=lambda: idle.closed() and closed.set(), daemon=True).start()
+        begin = time.monotonic()
+        while not closed.wait(0.01):
+            used.read(0, 1)
+        assert 0.25 < time.monotonic() - begin < 3
+        used.read(0, 1)
+
+
+def test_half_a_request_does_not_keep_a_connection_open() -> None:
+    with running_edge(idle_timeout_s=0.3) as rig, rig.client() as client:
+        client.send(client.frame(b"\x03\x00\x00\x00\x01")[:9])
+        assert client.closed()
+
+
+def test_who_does_not_read_his_answers_does_not_hurt_his_neighbour() -> None:
+    with running_edge() as rig, rig.client() as deaf, rig.client() as good:
+        deaf.socket.settimeout(0.2)
+        request = deaf.frame(b"\x04\x00\x00\x00\x24") * 400
+        sent = 0
+        try:
+            while sent < 200_000_000:
+                sent += deaf.socket.send(request)
+        except TimeoutError:
+            pass
+        # It was not read from any more, long before all memory was used.
+        assert sent < 100_000_000
+        times = []
+        for _ in range(200):
+            begin = time.monotonic()
+            good.read(4, 4)
+            times.append(time.monotonic() - begin)
+        assert sorted(times)[197] < 0.005
+
+
+# -- where it listens
+
+
+def test_a_port_in_use_names_the_rig_and_the_address() -> None:
+    [port] = free_ports(1)
+    lab = LabConfig.model_validate({"rigs": [{"name": "left", "port": port}]})
+    with running_edge() as other:
+        lab = LabConfig.model_validate({"rigs": [{"name": "left", "port": other.port}]})
+        with Service("edge", lab, MemoryBus()) as service, pytest.raises(OperationError) as refusal:
+            run(service)
+    text = str(refusal.value)
+    assert "'left'" in text
+    assert f"127.0.0.1:{other.port}" in text
+    assert "lab.toml" in text
+
+
+def test_each_rig_has_a_port_and_a_life_of_its_own() -> None:
+    with running_edge(rigs=("left", "right")) as rig, rig.client("left") as left, rig.client("right") as right:
+        left.write(0, 100)
+        right.write(0, 200)
+        assert (left.read(0, 1), right.read(0, 1)) == ([100], [200])
+        assert {command.rig: command.effort[0] for command in rig.commands} == {"left": 0.1, "right": 0.2}
+
+
+def test_a_controller_that_connects_before_the_first_state_is_served_when_it_comes() -> None:
+    [port] = free_ports(1)
+    lab = LabConfig.model_validate({"rigs": [{"port": port}]})
+    with Service("edge", lab, MemoryBus()) as service:
+        rig = EdgeRig(lab, service.bus.hub, service)
+        thread = threading.Thread(target=run, args=(service,))
+        thread.start()
+        try:
+            client = eventually(lambda: _connect(port))
+            with client:
+                client.send(client.frame(struct.pack(">BHH", 3, 4, 4)))
+                rig.state()
+                assert client.receive()[2] == struct.pack(">BB4H", 3, 8, *counts())
+        finally:
+            service.stop()
+            thread.join(10)
+
+
+def _connect(port: int) -> RawClient | None:
+    try:
+        return RawClient("127.0.0.1", port)
+    except ConnectionRefusedError:
+        return None
