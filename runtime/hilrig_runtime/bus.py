@@ -67,6 +67,13 @@ class Bus(Handle):
         """Receive what is sent on the keys that `key_expr` matches: `*` is one part, `**` any number of parts."""
 
     @abstractmethod
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:
+        """As `subscribe`, but at most `waiting` messages wait for their turn: the newest ones, older ones are dropped.
+
+        For control: a reader that was held up goes on with what holds now, not with what has piled up.
+        """
+
+    @abstractmethod
     def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:
         """Receive `Traffic.RECORDING` completely and in order, including what was sent shortly before.
 

@@ -91,6 +91,10 @@ class MemoryBus(Bus):
         """See `Bus.subscribe`."""
         return self._keep(self.hub.subscribers, (key_expr, on_message))
 
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:  # noqa: ARG002
+        """See `Bus.subscribe_newest`; delivery is at once, so nothing ever waits."""
+        return self.subscribe(key_expr, on_message)
+
     def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:  # noqa: ARG002
         """See `Bus.subscribe_recording`; nothing is ever lost here."""
         with self.hub.lock:

@@ -134,7 +134,11 @@ class Service:
     def latest(self, topic: RigTopic[MessageT], rig: str = "*") -> LatestValues:
         """The newest messages on a topic, of every rig or of one."""
         values = LatestValues(self.clock, self.counters)
-        self._closing.enter_context(self.bus.subscribe(topic.key(self.lab.name, rig), values.on_message))
+        # Room for one message of each rig: what waits is never older than a step.
+        waiting = len(self.lab.rigs) if rig == "*" else 1
+        self._closing.enter_context(
+            self.bus.subscribe_newest(topic.key(self.lab.name, rig), values.on_message, waiting)
+        )
         return values
 
     def emit(self, event: Event) -> None:
