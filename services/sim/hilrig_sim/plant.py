@@ -108,6 +108,8 @@ class Plant:
         self._flagged = False
         self._flag_key = b""
         self._touching_plane = False
+        self._nothing_held = (np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_))
+        self._held = self._nothing_held
         self._events: list[PlantEvent] = []
         self.position[:] = np.array([arm.start for arm in self._arms]).T
         self._begin_anew()
@@ -213,6 +215,7 @@ class Plant:
 
     def _substep(self, effort: Floats) -> None:
         position, velocity = self.position, self.velocity
+        self._held = self._nothing_held
         held = self._touching_plane and self._hold_pressed(effort)
         self._start_position[:] = position
         self._start_velocity[:] = velocity
@@ -248,23 +251,16 @@ class Plant:
 
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
-        side1, side2 = self._sides()
-        if not (side1.any() or side2.any()):
-            return False
         rates = self._integrator.accelerations(self.position, self.velocity, effort)
         mass = self.dynamics.mass_matrix_12(self.position[1])
         # Only what rests on a stop can be held there; what moves off it is free.
-        side1 = np.where(self.velocity[0] == 0, side1, 0.0)
-        side2 = np.where(self.velocity[1] == 0, side2, 0.0)
-        _, _, held1, held2 = stop_outward(rates[0], rates[1], side1, side2, mass)
-        if not (held1.any() or held2.any()):
+        side = np.where(self.velocity[:2] == 0, _sides(self.position, self._lower, self._stop), 0.0)
+        _, _, held1, held2 = stop_outward(rates[0], rates[1], side[0], side[1], mass)
+        self._held = held1, held2
+        if not (any_true(held1) or any_true(held2)):
             return False
         self.dynamics.hold(held1, held2)
         return True
-
-    def _sides(self) -> tuple[Floats, Floats]:
-        sides = (self.position[:2] >= self._stop[:2]).astype(np.float64) - (self.position[:2] <= self._lower[:2])
-        return sides[0], sides[1]
 
     def _find_contact(self) -> None:
         """Raise the quill's stop to what lies below the tool, where it may reach it."""
@@ -303,13 +299,13 @@ class Plant:
             arms = [self._arms[rig] for rig in rigs]
             dynamics = ReducedDynamics(arms)
             dynamics.set_payload(self.dynamics.payload[rigs])
+            dynamics.hold(self._held[0][rigs], self._held[1][rigs])
             acting = effort[:, rigs]
             plane, plane_rate = q0.copy(), v0.copy()
             FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, acting)
             arriving = outside & (shares == first)
             np.copyto(plane[:2], limit, where=arriving)
-            side = np.where(arriving, np.sign(limit - q0[:2]), 0.0)
-            side = np.where(arriving & (side == 0), np.sign(q1[:2] - limit), side)
+            side = _sides(plane, self._lower[:, rigs], self._stop[:, rigs])
             self._stop_plane(dynamics, plane, plane_rate, side)
             # The rest of the step goes on from the stop, pressed onto it or leaving it.
             rest = FixedStep(dynamics, self._tableau, (1.0 - first) * self._step)
@@ -324,7 +320,7 @@ class Plant:
         # What is at a stop at the end, by a second impact in one step or since before, does not move outwards.
         np.maximum(position[:2], self._lower[:2], out=position[:2])
         np.minimum(position[:2], self._stop[:2], out=position[:2])
-        self._stop_plane(self.dynamics, position, velocity, np.array(self._sides()))
+        self._stop_plane(self.dynamics, position, velocity, _sides(position, self._lower, self._stop))
 
     @staticmethod
     def _stop_plane(dynamics: ReducedDynamics, position: Floats, velocity: Floats, side: Floats) -> None:
@@ -382,6 +378,11 @@ class Plant:
         np.subtract(self._l1, self.world.held_height, out=self._free3)
         np.subtract(self._free3, self.world.highest, out=self._free3)
         np.subtract(self._free3, TOUCHING, out=self._free3)
+
+
+def _sides(position: Floats, lower: Floats, upper: Floats) -> Floats:
+    """+1 where joints 1 and 2 are on their upper stops, -1 on their lower ones, else 0, (2, N)."""
+    return (position[:2] >= upper[:2]).astype(np.float64) - (position[:2] <= lower[:2])
 
 
 def any_true(mask: Bools) -> bool:

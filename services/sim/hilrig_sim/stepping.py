@@ -47,7 +47,7 @@ class FixedStep:
     def __init__(self, dynamics: ReducedDynamics, tableau: Tableau, length: float | Floats) -> None:
         count, stages = dynamics.count, tableau.stages
         self._dynamics = dynamics
-        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), (count,)) if np.ndim(length) else length
+        lengths = np.asarray(length, dtype=np.float64).reshape(1, -1)
         # Slot 0 holds the state at the step's start, slot i the rates of stage i.
         self._slots = np.zeros((1 + stages, STAGE_ROWS, count))
         self._states = np.zeros((stages, STAGE_ROWS, count))
@@ -60,11 +60,10 @@ class FixedStep:
         self._result4 = self._result[:4]
 
         def weights(row: tuple[float, ...], *, with_start: bool) -> Floats:
-            scaled = [np.asarray(1.0)] * with_start + [np.asarray(w * lengths) for w in row]
-            table = np.stack([np.broadcast_to(w, (1, count if w.ndim else 1)) for w in np.broadcast_arrays(*scaled)])
-            if count <= FEW_RIGS:
-                return np.broadcast_to(table, (len(scaled), STAGE_ROWS, count)).copy()
-            return table
+            scaled = np.array(row)[:, np.newaxis, np.newaxis] * lengths
+            table = np.concatenate([np.ones_like(scaled[:1]), scaled]) if with_start else scaled
+            few = count <= FEW_RIGS
+            return np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy() if few else table
 
         def terms(row: tuple[float, ...], values: Floats, *, with_start: bool) -> _Sum:
             number = len(row) + with_start
