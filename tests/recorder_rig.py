@@ -4,6 +4,7 @@ import os
 import random
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
-from labs import HILRIG, write_lab
+from labs import HILRIG, free_ports, write_lab
 from waiting import eventually
 
 Key = tuple[str, int, bytes]
@@ -162,6 +163,24 @@ def sending(lab: LabConfig, rigs: list[str], **options: float) -> Iterator[Sende
     assert not thread.is_alive()
     if errors:
         raise errors[0]
+
+
+@contextmanager
+def router() -> Iterator[str]:
+    """A zenoh router as a process; gives its endpoint."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)}"
+    command = [sys.executable, str(Path(__file__).with_name("zenoh_router.py")), "--listen", endpoint]
+    command.append("--no-multicast-scouting")
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        assert process.stdout.readline().strip() == "ready"
+        yield endpoint
+    finally:
+        process.stdin.close()
+        process.wait(10)
+        process.stdout.close()
 
 
 def make_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> tuple[Path, LabConfig]:

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from hilrig_cli.commands import check, demo, latency, lease, recover, replay, registers, runs, services, up
+from hilrig_cli.commands import check, demo, latency, lease, live, record, recover, replay, registers, runs, services, up
 from hilrig_runtime.lifecycle import run_main
 
 app = typer.Typer(
@@ -26,9 +26,11 @@ REVIEW = "Review what was recorded"
 
 app.command(rich_help_panel=RUN)(up.up)
 app.command(rich_help_panel=RUN)(demo.demo)
+app.command(rich_help_panel=RUN)(live.live)
 app.command(rich_help_panel=RUN)(check.check)
 app.command(rich_help_panel=RUN)(lease.lease)
 app.command(rich_help_panel=RUN)(registers.registers)
+app.add_typer(record.app, name="record", rich_help_panel=RUN)
 app.command(rich_help_panel=SERVICES)(services.sim)
 app.command(rich_help_panel=SERVICES)(services.edge)
 app.command(rich_help_panel=SERVICES)(services.recorder)

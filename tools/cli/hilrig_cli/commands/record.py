@@ -1,0 +1,69 @@
+"""`hilrig record start RIG`, `hilrig record stop RIG`: a session by hand, beside those that controllers begin."""
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson, Config
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hilrig_schemas import Event
+
+ANSWER_TIMEOUT_S = 5.0
+"""How long a recorder is looked for: a tool needs a moment to be linked to it."""
+
+app = typer.Typer(help="Record a rig by hand, whether a controller is there or not.", no_args_is_help=True)
+
+Rig = Annotated[str, typer.Argument(help="Name of the rig.")]
+
+
+@app.command()
+def start(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
+    """Begin to record a rig."""
+    from hilrig_schemas import Event
+
+    event = _ask(config, Event(kind=Event.SESSION_START, rig=rig))
+    _print(event, f"recording {event.session}: `hilrig record stop {rig}` ends it", as_json)
+
+
+@app.command()
+def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
+    """End the recording of a rig that was begun by hand."""
+    from hilrig_schemas import Event
+
+    event = _ask(config, Event(kind=Event.SESSION_END, rig=rig))
+    _print(event, f"recorded {event.session}", as_json)
+
+
+def _ask(config: "Path | None", request: "Event") -> "Event":
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import OperationError
+    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_schemas.topics import CONTROL
+
+    lab = load_lab(config)
+    key = CONTROL.key(lab.name, "recorder", "*")
+    deadline_s = time.monotonic() + ANSWER_TIMEOUT_S
+    with ZenohBus(lab.bus, "tool") as bus:
+        while time.monotonic() < deadline_s:
+            # Asked first who is there: a request must not be heard twice.
+            if not bus.ask(key, timeout_s=0.3):
+                time.sleep(0.05)
+                continue
+            for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
+                if answer.error:
+                    raise OperationError(answer.error)
+                return CONTROL.decode(answer.payload)
+    raise OperationError(f"no recorder answers in lab {lab.name}: is `hilrig up` running with this lab.toml?")
+
+
+def _print(event: "Event", text: str, as_json: bool) -> None:
+    if as_json:
+        import json
+
+        print(json.dumps({"rig": event.rig, "session": event.session}))
+    else:
+        print(text)
