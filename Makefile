@@ -31,6 +31,8 @@ check: .venv/ready ## format, lint, types, floors
 gen: .venv/ready ## generated code and tables, from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
 	$(BIN)/python docs/make_configuration.py
+	$(BIN)/hilrig registers --markdown > docs/registers.md
+	$(BIN)/python tests/conformance.py > docs/modbus-conformance.md
 
 bench: .venv/ready system ## every benchmark; writes the tables of docs/performance.md
 	$(BIN)/python bench/run_all.py

@@ -16,7 +16,7 @@ from hilrig_modbus_edge.server import Limits, RigServer, bind
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, LeaseRequest, TorqueCommand, topics
+from hilrig_schemas import Event, LeaseRequest, topics
 
 TICK_NS: Final = 20_000_000
 TRAFFIC_PERIOD_NS: Final = 200_000_000
