@@ -10,14 +10,22 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from hilrig_cli.lab import POLL_S, running_lab
 from hilrig_cli.supervisor import own_process_group
+from hilrig_replay.latency import LatencyReport, measure
+from hilrig_replay.latency_plot import save_plot
+from hilrig_replay.rerun_view import save_rrd
+from hilrig_replay.run import Run, open_run
+from hilrig_replay.task import TaskResult, placed_parts
+from hilrig_replay.verify import Verification, verify
 from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.errors import OperationError
+from hilrig_schemas import PartState
+from hilrig_sim.model import RigParameters
 
 CONTROLLER: Final = "pick_and_place.py"
 CONTROLLER_GRACE_S: Final = 15.0
@@ -74,7 +82,9 @@ def run_demo(duration_s: float, out: Path, say: Callable[[str], None], tick: Cal
         said = _run_controller(lab, config, duration_s, supervisor.poll, tick)
     found = sorted(recordings.rglob("*.mcap"))
     if not found:
-        raise OperationError(f"{recordings}: nothing was recorded: did the controller connect? It said: {said or 'nothing'}")
+        raise OperationError(
+            f"{recordings}: nothing was recorded: did the controller connect? It said: {said or 'nothing'}"
+        )
     return DemoRun(found[-1], said)
 
 
@@ -142,3 +152,71 @@ def _is_free(port: int) -> bool:
         except OSError:
             return False
     return True
+
+
+@dataclass(frozen=True, slots=True)
+class Review:
+    """What a demo's recording tells."""
+
+    run: DemoRun
+    latency: LatencyReport
+    verification: Verification
+    task: TaskResult
+    plot: Path
+    rrd: Path
+
+    @property
+    def closed(self) -> bool:
+        """Whether torques came back that answered states, and re-simulation gives the states that were recorded."""
+        return self.latency.samples > 0 and self.verification.same
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return {
+            "recording": str(self.run.recording),
+            "rrd": str(self.rrd),
+            "plot": str(self.plot),
+            "latency": self.latency.as_dict(),
+            "verify": self.verification.as_dict(),
+            "task": {
+                "parts": [asdict(part) for part in self.task.parts],
+                "placed": self.task.placed,
+                "largest_error_mm": self.task.largest_error_mm,
+            },
+            "controller": self.run.controller,
+        }
+
+    def sentences(self) -> list[str]:
+        """What a person reads below the table of latency."""
+        error_mm = self.task.largest_error_mm
+        placed = f"placed: {self.task.placed} of {len(self.task.parts)} parts stand in the tray"
+        return [
+            f"verified: {self.verification.sentence()}",
+            placed if error_mm is None else f"{placed}, at most {error_mm:.2f} mm from their places",
+            f"recording: {self.run.recording}",
+            f"3D run:    {self.rrd}  (look at it: hilrig replay {self.run.recording})",
+            f"plot:      {self.plot}",
+        ]
+
+
+def review(recorded: DemoRun, out: Path) -> Review:
+    """Measure, verify and draw what a demo recorded.
+
+    Raises:
+        HilrigError: the recording holds no loop, or a result can't be written.
+    """
+    run = open_run(recorded.recording)
+    latency = measure(run)
+    plot, rrd = out / "latency.png", out / "run.rrd"
+    save_plot(latency, run, plot)
+    save_rrd(run, rrd)
+    return Review(recorded, latency, verify(recorded.recording), _judge(run), plot, rrd)
+
+
+def _judge(run: Run) -> TaskResult:
+    """Where the parts are at the end of a run."""
+    parts = run.parts
+    last = parts[parts["step"] == parts["step"][-1]] if len(parts) else parts
+    poses = [PartState(name=run.names[row["part"]], x=row["x"], y=row["y"], z=row["z"], yaw=row["yaw"]) for row in last]
+    held = run.names[run.states["held_part"][-1]]
+    return placed_parts(RigParameters.from_json(json.dumps(dict(run.parameters))).scene, poses, held=held)

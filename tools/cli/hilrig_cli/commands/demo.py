@@ -1,7 +1,6 @@
 """`hilrig demo`: the whole rig with a controller over real Modbus TCP, then everything that a recording tells."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -18,31 +17,29 @@ def demo(
     """Run the whole rig with the example controller, then measure, verify and draw what was recorded.
 
     The controller, examples/pick_and_place.py, is a process of its own that speaks Modbus TCP. Exit code 1: the loop
-    never closed, or the run could not be verified.
+    never closed, or the recording could not be verified.
     """
     from rich.console import Console
     from rich.progress import Progress, TimeElapsedColumn
 
-    from hilrig_cli.demo import run_demo
-    from hilrig_replay.latency import measure
-    from hilrig_replay.latency_plot import save_plot
-    from hilrig_replay.rerun_view import save_rrd
-    from hilrig_replay.run import open_run
+    from hilrig_cli.commands.latency import print_report
+    from hilrig_cli.demo import review, run_demo
 
     console = Console(stderr=True, quiet=as_json)
+
+    def say(line: str) -> None:
+        console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
+
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("controller", total=1.0)
-        result = run_demo(
-            duration,
-            out,
-            say=lambda line: console.print(f"hilrig: {line}", highlight=False),
-            tick=lambda share: progress.update(task, completed=share),
-        )
-    run = open_run(result.recording)
-    report = measure(run)
-    plot, rrd = out / "latency.png", out / "run.rrd"
-    save_plot(report, run, plot)
-    save_rrd(run, rrd)
+        recorded = run_demo(duration, out, say, lambda share: progress.update(task, completed=share))
+    with console.status("measuring, verifying and drawing the run"):
+        found = review(recorded, out)
     if as_json:
-        print(json.dumps({"recording": str(result.recording), "rrd": str(rrd), "plot": str(plot), "latency": report.as_dict()}))
-    sys.exit(0)
+        print(json.dumps(found.as_dict()))
+    else:
+        print_report(found.latency)
+        for line in found.sentences():
+            print(line)
+    if not found.closed:
+        raise typer.Exit(1)
