@@ -197,8 +197,9 @@ class LabConfig(Section):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"two rigs are called {name!r}: names must be distinct")
-        ports = list(self.ports.values())
-        for rig, port in self.ports.items():
+        all_ports = [*self.ports.items(), *self.tls_ports.items()]
+        ports = [port for _, port in all_ports]
+        for rig, port in all_ports:
             if ports.count(port) > 1:
                 raise ValueError(f"rig {rig!r}: port {port} is taken by another rig: ports must be distinct")
             if port > 65535:
@@ -220,6 +221,12 @@ class LabConfig(Section):
             ports[rig.name] = candidate
             candidate += 1
         return ports
+
+    @property
+    def tls_ports(self) -> dict[str, int]:
+        """Modbus/TCP Security port of each rig, from `edge.tls.first_port` on; none without TLS."""
+        tls = self.edge.tls
+        return {} if tls is None else {rig.name: tls.first_port + index for index, rig in enumerate(self.rigs)}
 
     @property
     def express(self) -> bool:

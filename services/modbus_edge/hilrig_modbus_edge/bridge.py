@@ -5,14 +5,17 @@ and events leave at once. A tick every 20 ms does what can wait that long.
 """
 
 import asyncio
+import socket
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge import traffic
 from hilrig_modbus_edge.device import Device, DeviceSettings
 from hilrig_modbus_edge.server import Limits, RigServer, bind
+from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.service import Service
@@ -97,23 +100,41 @@ class Edge:
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
-        service, lab = self.service, self.service.lab
+        service = self.service
         # Sockets listen before the first state is there: whoever connects early is served as soon as it can be done.
-        sockets = [bind(rig.name, lab.edge.host, lab.ports[rig.name]) for rig in lab.rigs]
+        sockets = self._bind()
         self.state_sessions()
         for server in self._servers:
             server.device.begin()
         try:
             self._answer_leases()
             await self._first_states()
-            for server, listening in zip(self._servers, sockets, strict=True):
-                await server.listen(listening)
+            for server, listening, policy in sockets:
+                await server.listen(listening, policy)
             service.ready()
             await self._tick()
         finally:
             self._close()
-            for listening in sockets:
+            for _, listening, _ in sockets:
                 listening.close()
+
+    def _bind(self) -> list[tuple[RigServer, socket.socket, TlsPolicy | None]]:
+        edge, lab = self.service.lab.edge, self.service.lab
+        policy = None if edge.tls is None else TlsPolicy(edge.tls)
+        with ExitStack() as bound:
+            sockets: list[tuple[RigServer, socket.socket, TlsPolicy | None]] = []
+            for server in self._servers:
+                rig = server.device.rig
+                if edge.plain:
+                    listening = bound.enter_context(bind(rig, edge.host, lab.ports[rig]))
+                    sockets.append((server, listening, None))
+                if policy is not None:
+                    port = lab.tls_ports[rig]
+                    listening = bound.enter_context(bind(rig, edge.host, port, "edge.tls.first_port"))
+                    sockets.append((server, listening, policy))
+            # All or none: a rig without its port must not leave the others' open.
+            bound.pop_all()
+            return sockets
 
     def state_sessions(self) -> None:
         """Tell the log stream which sessions are open."""

@@ -21,6 +21,7 @@ from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, MAX_LENGTH, MIN_LENGTH
 from hilrig_modbus_edge.pdu import answer, exception
 from hilrig_modbus_edge.registers import UNIT_IDS
 from hilrig_modbus_edge.throttle import Throttle
+from hilrig_modbus_edge.tls import TlsGate, TlsPolicy
 from hilrig_modbus_edge.traffic import Note
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
@@ -59,21 +60,54 @@ class RigServer:
         self.notes: list[Note] = []
         """Requests since they were last taken."""
         self.connections: set[Connection] = set()
+        self.gates: set[TlsGate] = set()
+        """Connections whose TLS handshake is going on."""
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._throttle = Throttle(REFUSAL_PERIOD_NS)
         self._servers: list[asyncio.Server] = []
 
-    async def listen(self, listening: socket.socket) -> None:
-        """Take connections from a socket that listens; what has connected already is served now."""
+    async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
+        """Take connections from a socket that listens, with TLS where there is a policy for it.
+
+        What has connected already is served now.
+        """
+
+        def accept() -> asyncio.BaseProtocol:
+            return Doorstep(self) if policy is None else TlsGate(self, policy)
+
         loop = asyncio.get_running_loop()
-        self._servers.append(await loop.create_server(lambda: Connection(self), sock=listening, backlog=BACKLOG))
+        self._servers.append(await loop.create_server(accept, sock=listening, backlog=BACKLOG))
+
+    def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
+        """Who connected, if he may; else None, and the connection is closed."""
+        peer = transport.get_extra_info("peername")
+        # A peer that is gone already has no name.
+        if peer:
+            host, port = peer[:2]
+            reason = self.why_refused(host)
+            if not reason:
+                tune(transport.get_extra_info("socket"))
+                return host, port
+            self.refuse(host, port, reason)
+        transport.abort()
+        return None
+
+    def take(
+        self, transport: asyncio.Transport, host: str, port: int, *, may_write: bool = True, early: bytes = b""
+    ) -> None:
+        """Serve a controller from now on; `early` are bytes of his that have come already."""
+        connection = Connection(self, transport, self.device.connect(host, port, may_write=may_write))
+        self.connections.add(connection)
+        self.counters.connections += 1
+        transport.set_protocol(connection)
+        connection.feed(early)
 
     def why_refused(self, host: str) -> str:
         """Why a host may not connect now, for people; empty: it may."""
         limits = self.limits
         if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
             return "its address is not in the rig's networks (allow in lab.toml)"
-        if len(self.connections) >= limits.connections:
+        if len(self.connections) + len(self.gates) >= limits.connections:
             return f"the rig has {limits.connections} connections already (edge.max_connections)"
         if self.device.connections_of(host) >= limits.connections_per_host:
             return f"its host has {limits.connections_per_host} connections already (edge.max_connections_per_host)"
@@ -98,18 +132,33 @@ class RigServer:
         """Stop listening and close every connection."""
         for server in self._servers:
             server.close()
+        for gate in list(self.gates):
+            gate.close()
         for connection in list(self.connections):
             connection.close(reason)
+
+
+class Doorstep(asyncio.Protocol):
+    """A connection that has just been made without TLS."""
+
+    def __init__(self, server: RigServer) -> None:
+        self._server = server
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """See `asyncio.BaseProtocol`."""
+        assert isinstance(transport, asyncio.Transport)
+        peer = self._server.admit(transport)
+        if peer is not None:
+            self._server.take(transport, *peer)
 
 
 class Connection(asyncio.BufferedProtocol):
     """One controller's connection."""
 
-    client: Client
-    _transport: asyncio.Transport
-
-    def __init__(self, server: RigServer) -> None:
+    def __init__(self, server: RigServer, transport: asyncio.Transport, client: Client) -> None:
+        self.client = client
         self._server = server
+        self._transport = transport
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._buffer = bytearray(BUFFER_BYTES)
@@ -122,24 +171,6 @@ class Connection(asyncio.BufferedProtocol):
         self._reason = ""
 
     # -- called by asyncio
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.BaseProtocol`."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        peer = transport.get_extra_info("peername")
-        # A peer that is gone already has no name.
-        host, port = peer[:2] if peer else ("", 0)
-        reason = self._server.why_refused(host) if peer else "gone"
-        if reason:
-            if peer:
-                self._server.refuse(host, port, reason)
-            transport.abort()
-            return
-        tune(transport.get_extra_info("socket"))
-        self.client = self._device.connect(host, port)
-        self._server.connections.add(self)
-        self._server.counters.connections += 1
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.BaseProtocol`."""
@@ -158,7 +189,7 @@ class Connection(asyncio.BufferedProtocol):
         """See `asyncio.BufferedProtocol`."""
         now_ns = self._monotonic_ns()
         filled = self._filled + nbytes
-        if filled >= HEADER.size and not self._filled:
+        if filled >= HEADER.size and not self._filled and not self._waiting:
             # By far the most common: exactly one request. It takes the short way; what it means is the same.
             transaction, protocol, length, unit = HEADER.unpack_from(self._buffer)
             if filled == 6 + length and not protocol and MIN_LENGTH <= length <= MAX_LENGTH:
@@ -172,16 +203,18 @@ class Connection(asyncio.BufferedProtocol):
             self._buffer[: self._filled] = self._buffer[used:filled]
         if requests:
             self.client.heard(now_ns)
-        if len(requests) <= SLICE:
+        if len(requests) <= SLICE and not self._waiting:
             self._answer(requests, now_ns)
             if malformed:
                 self._close_malformed(malformed)
             return
-        self._waiting = requests
+        going_on = bool(self._waiting)
+        self._waiting += requests
         self._arrived_ns = now_ns
         self._malformed = malformed
         self._transport.pause_reading()
-        self._go_on()
+        if not going_on:
+            self._go_on()
 
     def pause_writing(self) -> None:
         """See `asyncio.BaseProtocol`."""
@@ -193,12 +226,21 @@ class Connection(asyncio.BufferedProtocol):
         self._blocked = False
         self._go_on()
 
-    # -- inside
+    # -- called by the server
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes that came before this connection was there."""
+        for start in range(0, len(data), MAX_FRAME):
+            part = data[start : start + MAX_FRAME]
+            self._buffer[self._filled : self._filled + len(part)] = part
+            self.buffer_updated(len(part))
 
     def close(self, reason: str) -> None:
         """Close the connection and say why."""
         self._reason = reason
         self._transport.abort()
+
+    # -- inside
 
     def _go_on(self) -> None:
         if self._blocked or self._transport.is_closing():
@@ -234,8 +276,8 @@ class Connection(asyncio.BufferedProtocol):
         self._transport.close()
 
 
-def bind(rig: str, host: str, port: int) -> socket.socket:
-    """A socket that listens for a rig's controllers.
+def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> socket.socket:
+    """A socket that listens for a rig's controllers; `setting` of lab.toml is where its port comes from.
 
     Raises:
         OperationError: the address can't be had; it names the rig, the address, and what to do.
@@ -246,8 +288,8 @@ def bind(rig: str, host: str, port: int) -> socket.socket:
     except OSError as error:
         reason = error.strerror or str(error)
         raise OperationError(
-            f"rig {rig!r} can't listen on {host}:{port}: {reason}; stop what listens there, or choose another "
-            f"edge.first_port, or a port for the rig, in lab.toml"
+            f"rig {rig!r} can't listen on {host}:{port}: {reason}; stop what listens there, or choose another port in "
+            f"lab.toml ({setting}, or the rig's own)"
         ) from error
 
 

@@ -8,7 +8,21 @@ import sys
 
 import typer
 
-from hilrig_cli.commands import check, demo, latency, lease, live, record, recover, replay, registers, runs, services, up
+from hilrig_cli.commands import (
+    certs,
+    check,
+    demo,
+    latency,
+    lease,
+    live,
+    record,
+    recover,
+    registers,
+    replay,
+    runs,
+    services,
+    up,
+)
 from hilrig_runtime.lifecycle import run_main
 
 app = typer.Typer(
@@ -30,6 +44,7 @@ app.command(rich_help_panel=RUN)(live.live)
 app.command(rich_help_panel=RUN)(check.check)
 app.command(rich_help_panel=RUN)(lease.lease)
 app.command(rich_help_panel=RUN)(registers.registers)
+app.command(rich_help_panel=RUN)(certs.certs)
 app.add_typer(record.app, name="record", rich_help_panel=RUN)
 app.command(rich_help_panel=SERVICES)(services.sim)
 app.command(rich_help_panel=SERVICES)(services.edge)

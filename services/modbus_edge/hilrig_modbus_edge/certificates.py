@@ -1,0 +1,161 @@
+"""Certificates for Modbus/TCP Security: an authority of the lab's own, the edge's certificate, the controllers'.
+
+The specification puts a client's role into its certificate, as a UTF-8 string in the extension `ROLE_OID`. Elliptic
+keys on P-256, for they are small and every TLS library has them.
+"""
+
+import ipaddress
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+ROLE_OID: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
+_UTF8_STRING: Final = 0x0C
+_CLOCK_SKEW: Final = timedelta(minutes=5)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A certificate with its private key."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @property
+    def certificate_pem(self) -> bytes:
+        """The certificate, PEM."""
+        return self.certificate.public_bytes(serialization.Encoding.PEM)
+
+    @property
+    def key_pem(self) -> bytes:
+        """The private key, PEM, not encrypted."""
+        return self.key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+
+
+def load(certificate_pem: bytes, key_pem: bytes) -> Identity:
+    """An identity that was written before.
+
+    Raises:
+        ValueError: this is no certificate, or no key of the kind that is made here.
+    """
+    key = serialization.load_pem_private_key(key_pem, password=None)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ValueError("not an elliptic key")
+    return Identity(x509.load_pem_x509_certificate(certificate_pem), key)
+
+
+def make_authority(name: str, now: datetime, days: int) -> Identity:
+    """A self-signed authority that signs nothing but leaves."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = _name(name)
+    builder = (
+        _builder(subject, subject, key.public_key(), now, days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(sign_certificates=True), critical=True)
+    )
+    return Identity(builder.sign(key, hashes.SHA256()), key)
+
+
+def issue_server(authority: Identity, hosts: Sequence[str], now: datetime, days: int) -> Identity:
+    """A certificate for the edge; `hosts` are the names and addresses by which clients reach it."""
+    names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
+    return _issue(authority, hosts[0], ExtendedKeyUsageOID.SERVER_AUTH, names, now, days)
+
+
+def issue_client(authority: Identity, name: str, role: str, now: datetime, days: int) -> Identity:
+    """A certificate for a controller; an empty role is left out."""
+    extension = x509.UnrecognizedExtension(ROLE_OID, _utf8_string(role)) if role else None
+    return _issue(authority, name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, now, days)
+
+
+def role_of(certificate_der: bytes) -> str:
+    """The role in a client's certificate; empty: it names none that can be read."""
+    extensions = x509.load_der_x509_certificate(certificate_der).extensions
+    try:
+        value = extensions.get_extension_for_oid(ROLE_OID).value
+    except x509.ExtensionNotFound:
+        return ""
+    return _text_of(value.value) if isinstance(value, x509.UnrecognizedExtension) else ""
+
+
+def _issue(
+    authority: Identity,
+    name: str,
+    purpose: x509.ObjectIdentifier,
+    extension: x509.ExtensionType | None,
+    now: datetime,
+    days: int,
+) -> Identity:
+    key = ec.generate_private_key(ec.SECP256R1())
+    issuer = authority.certificate
+    builder = (
+        _builder(_name(name), issuer.subject, key.public_key(), now, days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(sign_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), critical=False)
+    )
+    if extension is not None:
+        builder = builder.add_extension(extension, critical=False)
+    return Identity(builder.sign(authority.key, hashes.SHA256()), key)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, days: int
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCK_SKEW)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _usage(*, sign_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not sign_certificates,
+        key_cert_sign=sign_certificates,
+        crl_sign=sign_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _utf8_string(text: str) -> bytes:
+    data = text.encode()
+    if len(data) > 127:
+        raise ValueError(f"a role has at most 127 bytes, found {len(data)}")
+    return bytes((_UTF8_STRING, len(data))) + data
+
+
+def _text_of(der: bytes) -> str:
+    if len(der) < 2 or der[0] != _UTF8_STRING or der[1] != len(der) - 2 or der[1] > 127:
+        return ""
+    return der[2:].decode(errors="replace")
