@@ -1,1 +1,429 @@
-"""placeholder"""
+"""Pick every part and place it in the tray: a controller for hilrig, as a good student would write it.
+
+It needs nothing of hilrig but the address: positions come and torques go through the rig's Modbus registers (holding
+registers 1-4 torques, 5-8 positions, coil 1 the magnet). What it knows is the arm's data sheet and the task, that is
+where the parts lie and where they belong.
+
+    python pick_and_place.py --host 127.0.0.1 --port 5020 --duration 20
+
+How it works, from the outside in:
+- a plan of moves from pose to pose (inverse kinematics gives the joints);
+- each move follows an S-curve (quintic polynomial), so that acceleration never jumps;
+- torque = what the model says the motion needs (inertia, friction, gravity with what the magnet holds)
+         + PD on the error, which has to clean up only what the model got wrong.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ModbusException
+
+# The arm's data sheet: metres, kilograms, newtons.
+L1, L2, L3 = 0.139, 0.300, 0.300
+M1, M2, M3, J4 = 1.0, 1.0, 0.5, 0.005
+FRICTION = np.array([2.0, 2.0, 5.0, 0.05])
+GRAVITY = 9.81
+LOWER = np.array([math.radians(-133), math.radians(-153), 0.0, math.radians(-327)])
+UPPER = np.array([math.radians(133), math.radians(153), 0.200, math.radians(327)])
+LARGEST_EFFORT = 32.767  # what the registers can say
+
+# How fast a move may be.
+SPEED = np.array([4.5, 4.5, 0.70, 9.0])
+ACCELERATION = np.array([20.0, 20.0, 9.0, 50.0])
+
+# Feedback: with stiffness w(B + wM) and damping 2wM, an error vanishes at the rates w and w + friction/inertia.
+RATE = 4.0
+ERROR_FILTER_S = 0.03
+STALE_S = 0.025  # positions that stay the same for so long are new ones all the same
+LEAD_S = 0.02  # an effort acts that much later than it is written: until the rig's next step, and half of it
+LAG_SHARE = 0.15  # of what is seen of the lag is learnt at a time
+LARGEST_LAG_S = 0.25
+
+PERIOD_S = 0.010
+CLEARANCE_Z = 0.025  # height of the tip while it travels: what it carries passes over everything
+HOVER = 0.001  # distance at which parts are taken and set down
+SETTLED = np.array([math.radians(0.05), math.radians(0.05), 0.0008, math.radians(1.0)])
+SETTLE_S = 0.04
+SETTLE_TIMEOUT_S = 2.0
+GRIP_S = 0.10
+
+HOME = np.array([0.0, 0.0, L1 - CLEARANCE_Z, 0.0])
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part as the task describes it: middle of its footprint, m; yaw, rad; kg."""
+
+    name: str
+    x: float
+    y: float
+    yaw: float
+    height: float
+    mass: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a part belongs: m, rad."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """What lies where, and where it belongs."""
+
+    parts: tuple[Part, ...]
+    places: tuple[Place, ...]
+    table: float = -0.060
+
+
+DEFAULT_SCENE = {
+    "parts": [
+        {"name": "red", "mass_kg": 0.20, "position_mm": [376, 137]},
+        {"name": "blue", "mass_kg": 0.30, "position_mm": [328, 229], "yaw_deg": 35},
+        {"name": "green", "mass_kg": 0.15, "position_mm": [257, 306]},
+        {"name": "yellow", "mass_kg": 0.25, "position_mm": [169, 363], "yaw_deg": 65},
+    ],
+    "trays": [{"name": "tray", "position_mm": [320, -220], "yaw_deg": -35}],
+}
+
+
+def task_of(scene: dict) -> Task:
+    """The task, from the `[scene]` of a lab's file; what it leaves out is as in hilrig's defaults."""
+    table = scene.get("table", {}).get("height_mm", -60.0) / 1000
+    parts = []
+    for part in scene.get("parts", DEFAULT_SCENE["parts"]):
+        x, y = part["position_mm"]
+        height = part.get("size_mm", [40, 40, 30])[2] / 1000
+        yaw = math.radians(part.get("yaw_deg", 0.0))
+        if part.get("ferromagnetic", True):
+            parts.append(Part(part["name"], x / 1000, y / 1000, yaw, height, part.get("mass_kg", 0.2)))
+    places = []
+    for tray in scene.get("trays", DEFAULT_SCENE["trays"]):
+        x, y = tray["position_mm"]
+        yaw = math.radians(tray.get("yaw_deg", 0.0))
+        rows, columns, pitch = tray.get("rows", 2), tray.get("columns", 2), tray.get("pitch_mm", 70.0)
+        top = table + tray.get("size_mm", [150, 150, 8])[2] / 1000
+        for row in range(rows):
+            for column in range(columns):
+                u, v = (row - (rows - 1) / 2) * pitch, (column - (columns - 1) / 2) * pitch
+                across, along = math.cos(yaw) * u - math.sin(yaw) * v, math.sin(yaw) * u + math.cos(yaw) * v
+                places.append(Place((x + across) / 1000, (y + along) / 1000, top, yaw))
+    return Task(tuple(parts), tuple(places), table)
+
+
+# --- The arm ---------------------------------------------------------------------------------------------------------
+
+
+def joints_for(x: float, y: float, z: float, yaw: float, near: np.ndarray) -> np.ndarray:
+    """Joints that bring the tool to a pose: of the two elbows, the one that is nearer to the joints `near`."""
+    cosine = (x * x + y * y - L2 * L2 - L3 * L3) / (2 * L2 * L3)
+    if abs(cosine) > 1:
+        raise ValueError(f"({x:.3f}, {y:.3f}) m is out of the arm's reach")
+    best = None
+    for theta2 in (math.acos(cosine), -math.acos(cosine)):
+        theta1 = math.atan2(y, x) - math.atan2(L3 * math.sin(theta2), L2 + L3 * math.cos(theta2))
+        theta1 = math.remainder(theta1, 2 * math.pi)
+        theta4 = yaw - theta1 - theta2
+        theta4 = near[3] + math.remainder(theta4 - near[3], 2 * math.pi)
+        joints = np.array([theta1, theta2, L1 - z, theta4])
+        if np.all((joints >= LOWER) & (joints <= UPPER)):
+            way = np.abs(joints - near)[:2].max()
+            if best is None or way < best[0]:
+                best = (way, joints)
+    if best is None:
+        raise ValueError(f"({x:.3f}, {y:.3f}, {z:.3f}) m is not within the joints' limits")
+    return best[1]
+
+
+def efforts_for(
+    joints: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, held_mass: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Efforts that the model needs for a motion, and the mass matrix with which feedback is scaled."""
+    mass = M2 + M3 + held_mass
+    p, ps = mass * L2 * L3 * math.cos(joints[1]), mass * L2 * L3 * math.sin(joints[1])
+    a22 = mass * L3 * L3
+    matrix = np.diag([L2 * L2 * (M1 + mass) + 2 * p + a22, a22, M3 + held_mass, J4])
+    matrix[0, 1] = matrix[1, 0] = p + a22
+    coriolis = np.array([-ps * speed[1] * (2 * speed[0] + speed[1]), ps * speed[0] ** 2, 0.0, 0.0])
+    gravity = np.array([0.0, 0.0, -GRAVITY * (M3 + held_mass), 0.0])
+    return matrix @ acceleration + coriolis + FRICTION * speed + gravity, matrix
+
+
+class Move:
+    """An S-curve from joints to joints: all start and arrive together, at rest."""
+
+    def __init__(self, start: np.ndarray, goal: np.ndarray) -> None:
+        self.start, self.goal = start, goal
+        way = np.abs(goal - start)
+        # Peaks of the quintic: 15/8 of the mean speed, 10/sqrt(3) ways over the time squared.
+        self.duration = max(0.1, float(max((1.875 * way / SPEED).max(), np.sqrt(5.774 * way / ACCELERATION).max())))
+
+    def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Joints, their speeds and accelerations."""
+        way, duration = self.goal - self.start, self.duration
+        s = min(max(time_s / duration, 0.0), 1.0)
+        position = s**3 * (10 - 15 * s + 6 * s * s)
+        speed = 30 * s * s * (1 - s) ** 2 / duration
+        acceleration = 60 * s * (1 - s) * (1 - 2 * s) / duration**2
+        return self.start + way * position, way * speed, way * acceleration
+
+
+# --- The plan --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Go to the goal; switch the magnet there, once it is reached exactly, and give it time."""
+
+    text: str
+    goal: np.ndarray
+    switches: bool = False
+    magnet: bool = False
+    held_mass: float = 0.0
+    placed: int = 0
+
+
+def plan(task: Task, start: np.ndarray) -> Iterator[Stage]:
+    """The stages of the work from the joints `start` on, one part after the other."""
+    here = np.array([start[0], start[1], HOME[2], start[3]])
+    yield Stage("up", here)
+    for number, (part, place) in enumerate(zip(task.parts, task.places, strict=False), start=1):
+        top = task.table + part.height
+        above = joints_for(part.x, part.y, CLEARANCE_Z, part.yaw, here)
+        at = joints_for(part.x, part.y, top + HOVER, part.yaw, above)
+        yield Stage(f"over {part.name}", above)
+        yield Stage(f"take {part.name}", at, switches=True, magnet=True, held_mass=part.mass)
+        yield Stage(f"lift {part.name}", above, magnet=True, held_mass=part.mass)
+        above_place = joints_for(place.x, place.y, CLEARANCE_Z, place.yaw, above)
+        at_place = joints_for(place.x, place.y, place.z + part.height + HOVER, place.yaw, above_place)
+        yield Stage(f"carry {part.name}", above_place, magnet=True, held_mass=part.mass)
+        yield Stage(f"set down {part.name}", at_place, switches=True, placed=number)
+        yield Stage("up", above_place, placed=number)
+        here = above_place
+    yield Stage("home", HOME, placed=min(len(task.parts), len(task.places)))
+
+
+class Controller:
+    """From positions to efforts: knows the plan, not how the numbers travel."""
+
+    def __init__(self, task: Task, say: Callable[[str], None] = lambda _: None) -> None:
+        self._task = task
+        self._stages: Iterator[Stage] = iter(())
+        self._say = say
+        self._move: Move | None = None
+        self._began_s = 0.0
+        self._switched_s: float | None = None
+        self._near_s = 0.0
+        self._held_mass = 0.0
+        self._seen: np.ndarray | None = None
+        self._seen_s = 0.0
+        self._error = np.zeros(4)
+        self._error_rate = np.zeros(4)
+        self._filtered = np.zeros(4)
+        self._last_s = self._cycle_s = 0.0
+        self.magnet = False
+        self.placed = 0
+        self.done = False
+        self.largest_error = np.zeros(4)
+        self.lag_s = LEAD_S
+        """How late the arm is seen to follow: the loop's latency, learnt while it moves."""
+
+    def update(self, now_s: float, joints: np.ndarray) -> np.ndarray:
+        """Efforts for positions read at `now_s`: N·m, N·m, N, N·m from rad, rad, m, rad."""
+        self._cycle_s = min(max(0.0, now_s - self._last_s), 0.1)
+        self._last_s = now_s
+        if self._move is None:
+            self._stages = plan(self._task, joints)
+            self._stage = next(self._stages)
+            self._begin(now_s, joints)
+        self._advance(now_s, joints)
+        assert self._move is not None
+        # What is asked for acts a little later.
+        coming, speed, acceleration = self._move.at(now_s - self._began_s + LEAD_S)
+        feedforward, matrix = efforts_for(coming, speed, acceleration, self._held_mass)
+        self._compare(now_s, joints)
+        feedback = RATE * (FRICTION * self._error + matrix @ (RATE * self._error + 2 * self._error_rate))
+        return np.clip(feedforward + feedback, -LARGEST_EFFORT, LARGEST_EFFORT)
+
+    def _compare(self, now_s: float, joints: np.ndarray) -> None:
+        """The error, and how fast it changes, whenever the rig has made a step.
+
+        Between its steps the rig answers with the same positions: to hold these against a reference that goes on would
+        show errors that are none. And positions answer to what was asked a while ago: the lag.
+        """
+        assert self._move is not None
+        since_s = now_s - self._seen_s
+        if self._seen is not None and np.array_equal(joints, self._seen) and since_s < STALE_S:
+            return
+        self._seen, self._seen_s = joints, now_s
+        then, speed, _ = self._move.at(now_s - self._began_s - self.lag_s)
+        self._error = then - joints
+        self.largest_error = np.maximum(self.largest_error, np.abs(self._error))
+        share = 1.0 - math.exp(-min(since_s, STALE_S) / ERROR_FILTER_S)
+        self._filtered += share * (self._error - self._filtered)
+        self._error_rate = (self._error - self._filtered) / ERROR_FILTER_S
+        # An error along the motion is a delay: on a curve that is right, the arm is only late.
+        fast = float(speed[:2] @ speed[:2])
+        if fast > 0.5:
+            late_s = float(self._error[:2] @ speed[:2]) / fast
+            self.lag_s = min(max(self.lag_s + LAG_SHARE * late_s, 0.0), LARGEST_LAG_S)
+
+    def _begin(self, now_s: float, start: np.ndarray) -> None:
+        self._move = Move(start, self._stage.goal)
+        self._began_s = now_s
+        self._switched_s = None
+        self._say(self._stage.text)
+
+    def _advance(self, now_s: float, joints: np.ndarray) -> None:
+        stage, move = self._stage, self._move
+        assert move is not None
+        over_s = now_s - self._began_s - move.duration
+        if self.done or over_s < 0:
+            return
+        if stage.switches and self._switched_s is None:
+            self._near_s = self._near_s + self._cycle_s if np.all(np.abs(joints - stage.goal) < SETTLED) else 0.0
+            settled = self._near_s >= SETTLE_S
+            if settled or over_s > SETTLE_TIMEOUT_S:
+                self._switched_s = now_s
+                self.magnet, self._held_mass = stage.magnet, stage.held_mass
+            return
+        if stage.switches and now_s - self._switched_s < GRIP_S:
+            return
+        self.placed = stage.placed
+        following = next(self._stages, None)
+        if following is None:
+            self.done = True
+        else:
+            self._stage = following
+            self._begin(now_s, stage.goal)
+
+
+# --- The registers ---------------------------------------------------------------------------------------------------
+
+
+class Rig:
+    """The rig as the paper's registers show it."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._client = ModbusTcpClient(host, port=port, timeout=1.0, retries=0)
+        if not self._client.connect():
+            raise ConnectionError(f"no rig answers at {host}:{port}")
+
+    def read(self) -> np.ndarray:
+        """Joint positions: rad, rad, m, rad, from degrees and millimetres times 100."""
+        answer = self._client.read_holding_registers(4, count=4)
+        if answer.isError():
+            raise ConnectionError(f"the rig refused to be read: {answer}")
+        values = np.array(answer.registers, dtype=np.uint16).astype(np.int16) / 100
+        return np.array([math.radians(values[0]), math.radians(values[1]), values[2] / 1000, math.radians(values[3])])
+
+    def write(self, efforts: np.ndarray) -> None:
+        """Efforts: N·m, N·m, N, N·m, as thousandths."""
+        registers = np.rint(efforts * 1000).astype(np.int16).view(np.uint16)
+        answer = self._client.write_registers(0, [int(value) for value in registers])
+        if answer.isError():
+            raise ConnectionError(f"the rig refused a torque: {answer}")
+
+    def switch(self, magnet: bool) -> None:
+        """The magnet, on or off."""
+        answer = self._client.write_coil(0, magnet)
+        if answer.isError():
+            raise ConnectionError(f"the rig refused to switch the magnet: {answer}")
+
+    def close(self) -> None:
+        """Leave the rig without torque."""
+        try:
+            self.write(np.zeros(4))
+        except (ConnectionError, ModbusException):
+            pass
+        finally:
+            self._client.close()
+
+
+def control(rig: Rig, controller: Controller, duration_s: float) -> dict:
+    """Close the loop every `PERIOD_S` for `duration_s`; says how it went."""
+    began_s = time.monotonic()
+    deadline_s, cycles, magnet, done_s = began_s, 0, False, None
+    while (now_s := time.monotonic()) - began_s < duration_s:
+        efforts = controller.update(now_s, rig.read())
+        rig.write(efforts)
+        if controller.magnet != magnet:
+            magnet = controller.magnet
+            rig.switch(magnet)
+        if controller.done and done_s is None:
+            done_s = now_s - began_s
+        cycles += 1
+        deadline_s = max(deadline_s + PERIOD_S, time.monotonic() - PERIOD_S)
+        time.sleep(max(0.0, deadline_s - time.monotonic()))
+    return {
+        "placed": controller.placed,
+        "done_s": done_s,
+        "duration_s": time.monotonic() - began_s,
+        "cycles": cycles,
+        "cycles_per_s": cycles / (time.monotonic() - began_s),
+        "largest_error_deg_mm": [
+            float(value)
+            for value in controller.largest_error * [math.degrees(1), math.degrees(1), 1e3, math.degrees(1)]
+        ],
+    }
+
+
+def main() -> int:
+    """Run it; exit code 0: every part is placed, 1: not all, 2: the task is wrong, 3: no rig."""
+    parser = argparse.ArgumentParser(description="Pick every part and place it in the tray.")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the rig")
+    parser.add_argument("--port", type=int, default=5020, help="Modbus TCP port of the rig")
+    parser.add_argument("--duration", type=float, default=20.0, help="seconds to run")
+    parser.add_argument("--scene", type=Path, help="lab.toml whose [scene] is the task; default: hilrig's own scene")
+    parser.add_argument("--json", action="store_true", help="one JSON object at the end, on standard output")
+    options = parser.parse_args()
+    try:
+        scene = tomllib.loads(options.scene.read_text(encoding="utf-8")).get("scene", {}) if options.scene else {}
+        task = task_of(scene)
+        list(plan(task, HOME))
+    except (OSError, ValueError, KeyError) as error:
+        print(f"the task is not understood: {error}", file=sys.stderr)
+        return 2
+    goal = min(len(task.parts), len(task.places))
+    out = sys.stderr if options.json else sys.stdout
+    began_s = time.monotonic()
+    controller = Controller(
+        task, lambda text: print(f"{time.monotonic() - began_s:6.2f} s  {text}", file=out, flush=True)
+    )
+    try:
+        rig = Rig(options.host, options.port)
+        try:
+            result = control(rig, controller, options.duration)
+        finally:
+            rig.close()
+    except (ConnectionError, ModbusException) as error:
+        print(f"the rig is gone: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 1
+    result = {"parts": goal, **result}
+    if options.json:
+        print(json.dumps(result))
+    else:
+        done = "" if result["done_s"] is None else f" in {result['done_s']:.1f} s"
+        print(f"{result['placed']} of {goal} parts placed{done}; {result['cycles_per_s']:.0f} cycles a second")
+    return 0 if result["placed"] == goal else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
