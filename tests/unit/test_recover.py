@@ -154,7 +154,7 @@ def test_a_foreign_file_is_recovered_too(tmp_path: Path, compression: Compressio
         found = [
             (schema.name, channel.topic, m.data) for schema, channel, m in reader.iter_messages(log_time_order=False)
         ]
-        assert {record.name for record in reader.iter_metadata()} == {"hilrig.recovery"}
+        assert {record.name for record in reader.iter_metadata()} == {"hilrig.recovered"}
     assert sorted(found) == sorted(
         (f"pkg/Type{number}", f"/topic{number}", b"%d" % sequence) for number in range(3) for sequence in range(100)
     )
@@ -169,7 +169,7 @@ def test_a_recovered_recording_says_what_it_is(tmp_path: Path) -> None:
     with (tmp_path / "run.mcap").open("rb") as stream:
         names = [record.name for record in make_reader(stream).iter_metadata()]
     assert "hilrig.session" in names
-    assert "hilrig.recovery" in names
+    assert "hilrig.recovered" in names
 
 
 def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path: Path) -> None:

@@ -259,7 +259,7 @@ class _Copy:
     def _last_words(self, ours: bool) -> dict[str, dict[str, str]]:
         recovery = self._recovery
         words = {
-            "hilrig.recovery": {
+            "hilrig.recovered": {
                 "from": recovery.source.name,
                 "messages": str(recovery.messages),
                 "chunks": str(recovery.chunks),

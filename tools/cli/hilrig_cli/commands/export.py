@@ -1,0 +1,39 @@
+"""`hilrig export`: a recording for other tools."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
+    foxglove: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.MCAP", help="Write an MCAP in which Foxglove and rerun draw the arm.", show_default=False
+        ),
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write tables as CSV into a folder.", show_default=False)
+    ] = None,
+    parquet: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write tables as Parquet into a folder.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a recording for other tools; what was written is printed, a line a file."""
+    from hilrig_replay.export import export_foxglove, export_tables
+    from hilrig_replay.run import open_run
+    from hilrig_runtime.errors import InputError
+
+    if foxglove is None and csv is None and parquet is None:
+        raise InputError("nothing to write: give --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
+    opened = open_run(run)
+    written: list[Path] = []
+    if foxglove is not None:
+        written.append(export_foxglove(opened, foxglove))
+    for folder, kind in ((csv, "csv"), (parquet, "parquet")):
+        if folder is not None:
+            written += export_tables(opened, folder, kind)
+    sys.stdout.writelines(f"{path}\n" for path in written)

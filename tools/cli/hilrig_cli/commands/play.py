@@ -1,0 +1,67 @@
+"""`hilrig play`: a recording back on the bus, as if its rig ran."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import Config
+
+if TYPE_CHECKING:
+    from hilrig_runtime.bus import Bus
+    from hilrig_runtime.config import LabConfig
+
+
+def play(
+    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
+    config: Config = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="How many times its own speed.")] = 1.0,
+    start: Annotated[float, typer.Option(min=0.0, help="Where to begin, s.")] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
+    rig: Annotated[str, typer.Option(help="Play it as this rig; default: the rig that was recorded.")] = "",
+) -> None:
+    """Put a recording back on the bus with its own timing, so that whatever follows a running rig follows it."""
+    import threading
+
+    from hilrig_replay.player import Player, play_on, rig_config
+    from hilrig_replay.run import open_run
+    from hilrig_runtime.clock import SYSTEM_CLOCK
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.lifecycle import stop_on_signals
+    from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
+
+    lab = load_lab(config)
+    opened = open_run(run)
+    name = rig or opened.rig
+    if not is_name(name) or name in RESERVED_RIG_NAMES:
+        raise InputError(f"--rig {name!r} is no name for a rig")
+    player = Player(opened.file, speed=speed, start_s=start, loop=loop)
+    stopping = threading.Event()
+    stop_on_signals(stopping)
+    with _bus(lab, name) as bus:
+        bus.serve(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
+        played = play_on(bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name)
+    print(f"played {played} messages of {opened.session} as {name} in lab {lab.name}", file=sys.stderr)
+
+
+def _bus(lab: "LabConfig", rig: str) -> "Bus":
+    """The bus, in the simulation's place: where none runs, that is who tools on this host look for."""
+    from hilrig_runtime.errors import OperationError
+    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_schemas.topics import CONFIG
+
+    if lab.bus.topology == "mesh":
+        try:
+            return ZenohBus(lab.bus, "sim")
+        except OperationError as error:
+            raise OperationError(
+                f"a lab runs here already (bus.first_port {lab.bus.first_port}): stop it first, or play with a --config "
+                "whose bus.first_port is another"
+            ) from error
+    bus = ZenohBus(lab.bus, "tool")
+    if bus.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
+        bus.close()
+        raise OperationError(f"rig {rig} runs in lab {lab.name}: play it as another with --rig")
+    return bus

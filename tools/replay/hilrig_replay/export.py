@@ -1,0 +1,259 @@
+"""A recording for other tools: an MCAP that draws itself in Foxglove and rerun, tables for pandas and MATLAB."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
+
+from hilrig_recorder.channels import encode_message, file_descriptor_set
+from hilrig_recorder.writer import RunWriter
+from hilrig_replay import foxglove_messages as foxglove
+from hilrig_replay.columns import Rows
+from hilrig_replay.run import Run
+from hilrig_replay.scene import ArmPicture, read_arm
+from hilrig_replay.shapes import Solid, fixed_joints, solids_of
+from hilrig_runtime.errors import InputError, OperationError
+from hilrig_schemas import Event
+
+WORLD: Final = "world"
+_TOPICS: Final = ("/tf", "/scene", "/points", "/log")
+_STILL_PERIOD: Final = 50
+"""What does not move is said again every so many states, for players that start in the middle."""
+_VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
+
+TABLES: Final[dict[str, Callable[[Run], Rows]]] = {
+    "state": lambda run: run.states,
+    "command": lambda run: run.commands,
+    "event": lambda run: run.events,
+    "traffic": lambda run: run.traffic,
+}
+"""Tables of a recording, by name."""
+_TEXT_CODES: Final = frozenset({"session", "held_part", "controller", "part"})
+
+
+# -- tables ---------------------------------------------------------------------------------------------------------
+
+
+def table(run: Run, name: str) -> pa.Table:
+    """One of `TABLES` with a column a number: SI units as in the schemas, `time_s` from the run's first state.
+
+    A joint vector becomes four columns, named after the joints.
+    """
+    rows = TABLES[name](run)
+    columns: dict[str, Any] = {"time_s": run.time_s(rows)}
+    for field in rows.dtype.names or ():
+        values = rows[field]
+        if field == "message":
+            continue
+        if field in _TEXT_CODES:
+            columns[field] = pa.array(run.names.texts(values).tolist(), pa.string())
+        elif values.ndim == 2:
+            for number, joint in enumerate(_VECTOR_NAMES):
+                columns[f"{field}_{joint}"] = np.ascontiguousarray(values[:, number])
+        elif values.dtype == object:
+            columns[field] = pa.array(values.tolist(), pa.string())
+        else:
+            columns[field] = np.ascontiguousarray(values)
+    return pa.table(columns)
+
+
+def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
+    """Write `state`, `command`, `event` and `traffic` tables as `csv` or `parquet` into a folder.
+
+    Raises:
+        OperationError: the folder can't be written.
+    """
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in TABLES:
+            path = folder / f"{name}.{kind}"
+            if kind == "csv":
+                pyarrow.csv.write_csv(table(run, name), path)
+            else:
+                pyarrow.parquet.write_table(table(run, name), path)
+            written.append(path)
+    except OSError as error:
+        raise OperationError(f"{folder}: can't be written: {error.strerror or error}") from error
+    return written
+
+
+# -- a file that draws itself ---------------------------------------------------------------------------------------
+
+
+def export_foxglove(run: Run, path: Path) -> Path:
+    """Copy a recording, message by message, and add what Foxglove's 3D panel and rerun's MCAP loader draw.
+
+    `/tf` (foxglove.FrameTransforms, one a state), `/scene` (foxglove.SceneUpdate: the arm's solids), `/points`
+    (foxglove.PointCloud: the same as points, for viewers that draw no solids) and `/log` (foxglove.Log: the events).
+
+    Raises:
+        InputError: the recording has no URDF, or the file exists.
+        OperationError: the file can't be written.
+    """
+    if not run.urdf:
+        raise InputError(f"{run.path}: has no URDF attached: without it there is no arm to draw")
+    if path.exists():
+        raise InputError(f"{path}: exists; choose another name")
+    arm, solids = read_arm(run.urdf), solids_of(run.urdf)
+    try:
+        with run.path.open("rb") as stream:
+            reader = SeekingReader(stream)
+            summary = reader.get_summary()
+            if summary is None:
+                raise InputError(f"{run.path}: has no index; `hilrig recover` makes one")
+            writer = RunWriter(path, schemas=(), channels=(), library="hilrig export")
+            try:
+                drawing = _Drawing(writer, run, arm, solids, max(summary.schemas, default=0), max(summary.channels))
+                for schema in summary.schemas.values():
+                    writer.add_schema(schema)
+                for channel in summary.channels.values():
+                    writer.add_channel(channel)
+                drawing.declare()
+                for record in reader.iter_metadata():
+                    writer.add_metadata(record.name, record.metadata)
+                for item in reader.iter_attachments():
+                    writer.add_attachment(
+                        item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
+                    )
+                _copy(run, writer, drawing, {channel.topic: channel.id for channel in summary.channels.values()})
+                writer.finish()
+                writer.publish()
+            except BaseException:
+                writer.discard()
+                raise
+    except OSError as error:
+        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+    return path
+
+
+def _copy(run: Run, writer: RunWriter, drawing: "_Drawing", channel_ids: dict[str, int]) -> None:
+    topics = frozenset({"state", "command", "event", "traffic"})
+    for topic, sequence, log_ns, publish_ns, payload in run.file.messages(topics):
+        channel_id = channel_ids[f"/{topic}"]
+        writer.add(channel_id, log_ns, encode_message(channel_id, sequence, log_ns, publish_ns, payload))
+        if topic == "state":
+            drawing.state(log_ns)
+        elif topic == "event":
+            drawing.event(log_ns, Event.FromString(payload))
+
+
+class _Drawing:
+    """What is added to the messages, as they go by in the order of the file."""
+
+    def __init__(
+        self, writer: RunWriter, run: Run, arm: ArmPicture, solids: list[Solid], last_schema: int, last_channel: int
+    ) -> None:
+        self._writer = writer
+        self._arm = arm
+        self._solids = solids
+        self._ids = {topic: last_channel + number for number, topic in enumerate(_TOPICS, start=1)}
+        self._schema_ids = {topic: last_schema + number for number, topic in enumerate(_TOPICS, start=1)}
+        self._sequences = dict.fromkeys(_TOPICS, 0)
+        self._still = fixed_joints(run.urdf)
+        positions = run.states["position"]
+        self._moved = [joint.transforms(positions[:, number]) for number, joint in enumerate(arm.joints)]
+        self._stamps = run.states["wall_ns"]
+        self._next = 0
+
+    def declare(self) -> None:
+        """Write the schemas and channels."""
+        for topic, message in zip(_TOPICS, foxglove.EXPORTED, strict=True):
+            schema_id = self._schema_ids[topic]
+            name = message.DESCRIPTOR.full_name
+            self._writer.add_schema(Schema(schema_id, file_descriptor_set(message), "protobuf", name))
+            self._writer.add_channel(Channel(self._ids[topic], topic, "protobuf", {}, schema_id))
+
+    def state(self, log_ns: int) -> None:
+        """Draw the next state."""
+        at, self._next = self._next, self._next + 1
+        stamp = int(self._stamps[at])
+        message = foxglove.FrameTransforms()
+        for joint, (translations, quaternions) in zip(self._arm.joints, self._moved, strict=True):
+            _transform(message, stamp, joint.parent, joint.child, translations[at], quaternions[at])
+        if at % _STILL_PERIOD == 0:
+            nowhere, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+            if self._arm.root != WORLD:
+                _transform(message, stamp, WORLD, self._arm.root, nowhere, unturned)
+            for parent, child, translation, rotation in self._still:
+                _transform(message, stamp, parent, child, translation, rotation)
+            self._put("/scene", log_ns, stamp, self._scene(stamp))
+            for cloud in self._clouds(stamp):
+                self._put("/points", log_ns, stamp, cloud)
+        self._put("/tf", log_ns, stamp, message)
+
+    def event(self, log_ns: int, event: Event) -> None:
+        """Tell an event."""
+        level = foxglove.LOG_LEVELS.get(Event.Severity.Name(event.severity), 0)
+        message = foxglove.Log(level=level, message=event.text, name=event.source)
+        _stamp(message.timestamp, event.wall_ns)
+        self._put("/log", log_ns, event.wall_ns, message)
+
+    def _put(self, topic: str, log_ns: int, stamp: int, message: Any) -> None:
+        self._sequences[topic] += 1
+        channel_id = self._ids[topic]
+        payload = message.SerializeToString()
+        self._writer.add(channel_id, log_ns, encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
+
+    def _scene(self, stamp: int) -> Any:
+        message = foxglove.SceneUpdate()
+        for number, solid in enumerate(self._solids):
+            entity = message.entities.add(frame_id=solid.link, id=f"{solid.link}-{number}", frame_locked=True)
+            _stamp(entity.timestamp, stamp)
+            shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}[solid.kind]
+            shape = shapes.add()
+            _set(shape.pose.position, solid.translation)
+            _set(shape.pose.orientation, solid.rotation)
+            _set(shape.size, np.array(solid.size))
+            shape.color.r, shape.color.g, shape.color.b, shape.color.a = solid.color
+            if solid.kind == "cylinder":
+                shape.bottom_scale = shape.top_scale = 1.0
+        return message
+
+    def _clouds(self, stamp: int) -> Iterator[Any]:
+        links = dict.fromkeys(solid.link for solid in self._solids)
+        packed = np.dtype([("xyz", "<f4", (3,)), ("rgba", "u1", (4,))])
+        for link in links:
+            pieces = []
+            for solid in self._solids:
+                if solid.link == link:
+                    points = solid.points()
+                    rows = np.empty(len(points), packed)
+                    rows["xyz"] = points
+                    rows["rgba"] = np.round(np.array(solid.color) * 255)
+                    pieces.append(rows)
+            message = foxglove.PointCloud(
+                frame_id=link, point_stride=packed.itemsize, data=np.concatenate(pieces).tobytes()
+            )
+            _stamp(message.timestamp, stamp)
+            message.pose.orientation.w = 1.0
+            for number, name in enumerate(("x", "y", "z")):
+                message.fields.add(name=name, offset=4 * number, type=foxglove.FLOAT32)
+            for number, name in enumerate(("red", "green", "blue", "alpha")):
+                message.fields.add(name=name, offset=12 + number, type=foxglove.UINT8)
+            yield message
+
+
+def _transform(
+    message: Any, stamp: int, parent: str, child: str, translation: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> None:
+    transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+    _stamp(transform.timestamp, stamp)
+    _set(transform.translation, translation)
+    _set(transform.rotation, rotation)
+
+
+def _stamp(timestamp: Any, wall_ns: int) -> None:
+    timestamp.seconds, timestamp.nanos = divmod(wall_ns, 1_000_000_000)
+
+
+def _set(vector: Any, values: NDArray[np.float64]) -> None:
+    for name, value in zip("xyzw", values.tolist(), strict=False):
+        setattr(vector, name, value)
