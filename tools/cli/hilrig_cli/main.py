@@ -12,9 +12,11 @@ from hilrig_cli.commands import (
     certs,
     check,
     demo,
+    export,
     latency,
     lease,
     live,
+    play,
     record,
     recover,
     registers,
@@ -53,6 +55,8 @@ app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
 app.command(rich_help_panel=REVIEW)(replay.replay)
 app.command(rich_help_panel=REVIEW)(recover.recover)
+app.command(rich_help_panel=REVIEW)(play.play)
+app.command(rich_help_panel=REVIEW)(export.export)
 
 
 def _version(wanted: bool) -> None:

@@ -101,9 +101,8 @@ def _described() -> descriptor_pb2.FileDescriptorProto:
             enum = message.enum_type.add(name=enum_name)
             for number, value in enumerate(values):
                 enum.value.add(name=value, number=number)
-        for field_name, number, kind in fields:
-            repeated = kind.startswith("[")
-            kind = kind.strip("[]")
+        for field_name, number, said in fields:
+            repeated, kind = said.startswith("["), said.strip("[]")
             label = _FIELD.LABEL_REPEATED if repeated else _FIELD.LABEL_OPTIONAL
             field = message.field.add(name=field_name, number=number, label=label)
             if kind == "enum":

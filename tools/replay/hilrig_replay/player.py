@@ -1,7 +1,8 @@
 """A recording in its own time: which message is due when, at any speed, from any point, over and over.
 
-`Player` is pure and says what is due; `play_on` waits and sends. A message is due by the time at which it was published, as its sender's clock had
-it; the distances of what was sent are what comes back, whatever the way to the recorder did to them.
+`Player` is pure and says what is due; `play_on` waits and sends. A message is due by the time at which it was
+published, as its sender's clock had it: the distances of what was sent come back, whatever the way to the recorder
+did to them.
 """
 
 import heapq

@@ -48,11 +48,8 @@ def solids_of(urdf: str) -> list[Solid]:
     """
     try:
         robot = ElementTree.fromstring(urdf)
-        colors = {
-            material.attrib["name"]: _color(material)
-            for material in robot.iter("material")
-            if "name" in material.attrib and material.find("color") is not None
-        }
+        named = (material for material in robot.iter("material") if material.find("color") is not None)
+        colors = {material.attrib.get("name", ""): _color(material) for material in named}
         return [
             solid
             for link in robot.iter("link")

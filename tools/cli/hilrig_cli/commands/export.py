@@ -11,9 +11,7 @@ def export(
     run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
     foxglove: Annotated[
         Path | None,
-        typer.Option(
-            metavar="OUT.MCAP", help="Write an MCAP in which Foxglove and rerun draw the arm.", show_default=False
-        ),
+        typer.Option(metavar="OUT.MCAP", help="An MCAP in which Foxglove and rerun draw the arm.", show_default=False),
     ] = None,
     csv: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write tables as CSV into a folder.", show_default=False)

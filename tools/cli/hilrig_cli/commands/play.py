@@ -57,8 +57,8 @@ def _bus(lab: "LabConfig", rig: str) -> "Bus":
             return ZenohBus(lab.bus, "sim")
         except OperationError as error:
             raise OperationError(
-                f"a lab runs here already (bus.first_port {lab.bus.first_port}): stop it first, or play with a --config "
-                "whose bus.first_port is another"
+                f"a lab runs here already (bus.first_port {lab.bus.first_port}): stop it first, or play with "
+                "a --config whose bus.first_port is another"
             ) from error
     bus = ZenohBus(lab.bus, "tool")
     if bus.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
