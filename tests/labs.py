@@ -113,7 +113,7 @@ class RunningLab:
 
         def up() -> bool:
             assert self.process.poll() is None, self.output()
-            return "running" in self.output()
+            return "running; Ctrl-C ends it" in self.output()
 
         try:
             eventually(up, timeout_s=60)

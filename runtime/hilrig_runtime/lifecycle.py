@@ -57,7 +57,7 @@ def run_service(
     with Service(name, lab, bus, instance=instance, stopping=stopping) as service:
         gc.collect()
         gc.freeze()
-        logger.info("running as %s", service.source)
+        logger.debug("running as %s", service.source)
         run(service)
 
 

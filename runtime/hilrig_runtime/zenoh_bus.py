@@ -249,8 +249,9 @@ def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
         return f"no zenoh router answers at {bus.router} (bus.router in lab.toml)"
     if service not in MESH_ORDER:
         return f"can't join the bus: {error}"
-    endpoint = mesh_endpoint(bus, service)
+    # zenoh's text holds paths of its own sources; the system's reason stands before its error number.
+    reason = str(error).partition(" (os error")[0].rpartition(": ")[2].lstrip("[")
     return (
-        f"can't listen on {endpoint} for the bus: is another hilrig running here? "
-        f"Choose another bus.first_port in lab.toml ({error})"
+        f"can't listen on {mesh_endpoint(bus, service)} for the bus ({reason}): is another hilrig running here? "
+        "End it, or choose another bus.first_port in lab.toml"
     )

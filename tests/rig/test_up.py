@@ -24,6 +24,11 @@ def lab(tmp_path: Path) -> Iterator[RunningLab]:
         yield running
 
 
+def registers(*values: int) -> list[int]:
+    """Signed values as Modbus registers."""
+    return [value & 0xFFFF for value in values]
+
+
 def alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -78,7 +83,7 @@ def test_a_signal_ends_everything_in_three_seconds_with_a_readable_file(
     lab: RunningLab, number: signal.Signals
 ) -> None:
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
-        client.write_registers(0, [500, 0, -4905, 0])
+        client.write_registers(0, registers(500, 0, -4905, 0))
         eventually(lambda: client.read_holding_registers(4, count=4).registers[0] > 0)
         children = lab.service_pids()
         assert len(children) == 3
@@ -98,7 +103,7 @@ def test_a_killed_sim_is_restarted_and_the_loop_goes_on(lab: RunningLab) -> None
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
 
         def angle(torque: int) -> int:
-            assert not client.write_registers(0, [torque, 0, -4905, 0]).isError()
+            assert not client.write_registers(0, registers(torque, 0, -4905, 0)).isError()
             return int(client.read_holding_registers(4, count=4).registers[0])
 
         eventually(lambda: angle(1000) > 500, every_s=0.02)

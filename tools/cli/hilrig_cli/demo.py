@@ -3,18 +3,16 @@
 import importlib.util
 import json
 import shutil
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_cli.lab import POLL_S, running_lab
+from hilrig_cli.lab import POLL_S, running_lab, why_not_free
 from hilrig_cli.supervisor import own_process_group
 from hilrig_replay.latency import LatencyReport, measure
 from hilrig_replay.latency_plot import save_plot
@@ -137,21 +135,9 @@ def controller_path() -> Path:
 def free_ports(wanted: int, count: int = 1) -> int:
     """First of `count` neighbouring ports that are free on loopback, from `wanted` on."""
     first = wanted
-    while not all(_is_free(port) for port in range(first, first + count)):
+    while any(why_not_free("127.0.0.1", port) for port in range(first, first + count)):
         first += count
     return first
-
-
-def _is_free(port: int) -> bool:
-    with closing(socket.socket()) as probe:
-        if sys.platform != "win32":
-            # As the services do: a port that only waits for its last connection to fade counts as free.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,7 @@
 """A lab on this host: services supervised, ready when controllers can connect, watched while it runs."""
 
+import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +12,7 @@ from typing import Final
 from hilrig_cli.supervisor import START_ORDER, Supervisor
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.zenoh_bus import MESH_ORDER, ZenohBus
 from hilrig_schemas.topics import alive_key
 
 POLL_S: Final = 0.05
@@ -29,11 +31,42 @@ def running_lab(
     Raises:
         HilrigError: a service could not start; it said why on standard error.
     """
+    _check_ports(lab)
     with Supervisor(config, say) as supervisor:
         supervisor.start()
         _wait_until_ready(lab, supervisor, stopping)
         supervisor.settled()
         yield supervisor
+
+
+def _check_ports(lab: LabConfig) -> None:
+    """Say at once, and once, what each service would say: whoever else has the ports is heard on the bus like ours."""
+    wanted = [
+        (f"rig {rig!r}", lab.edge.host, port, "edge.first_port or the rig's port") for rig, port in lab.ports.items()
+    ]
+    if lab.bus.topology == "mesh":
+        ports = range(lab.bus.first_port, lab.bus.first_port + len(MESH_ORDER))
+        wanted += [("the bus", lab.bus.host, port, "bus.first_port") for port in ports]
+    for what, host, port, key in wanted:
+        if (reason := why_not_free(host, port)) is not None:
+            raise OperationError(
+                f"{what}: can't listen on {host}:{port} ({reason}): is another hilrig running here? "
+                f"End what has the port, or choose another {key} in lab.toml"
+            )
+
+
+def why_not_free(host: str, port: int) -> str | None:
+    """Why nobody can listen on a TCP port of this machine now; None: somebody can."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            if sys.platform != "win32":
+                # As the services do: a port that only waits for its last connection to fade counts as free.
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 def _wait_until_ready(lab: LabConfig, supervisor: Supervisor, stopping: threading.Event) -> None:
