@@ -24,7 +24,7 @@ from hilrig_schemas import Event
 
 WORLD: Final = "world"
 _TOPICS: Final = ("/tf", "/scene", "/points", "/log")
-_STILL_PERIOD: Final = 50
+_STILL_PERIOD: Final = 500
 """What does not move is said again every so many states, for players that start in the middle."""
 _VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
 
@@ -158,6 +158,8 @@ class _Drawing:
         self._schema_ids = {topic: last_schema + number for number, topic in enumerate(_TOPICS, start=1)}
         self._sequences = dict.fromkeys(_TOPICS, 0)
         self._still = fixed_joints(run.urdf)
+        self._scene = _scene(solids)
+        self._clouds = list(_clouds(solids))
         positions = run.states["position"]
         self._moved = [joint.transforms(positions[:, number]) for number, joint in enumerate(arm.joints)]
         self._stamps = run.states["wall_ns"]
@@ -184,8 +186,11 @@ class _Drawing:
                 _transform(message, stamp, WORLD, self._arm.root, nowhere, unturned)
             for parent, child, translation, rotation in self._still:
                 _transform(message, stamp, parent, child, translation, rotation)
-            self._put("/scene", log_ns, stamp, self._scene(stamp))
-            for cloud in self._clouds(stamp):
+            for entity in self._scene.entities:
+                _stamp(entity.timestamp, stamp)
+            self._put("/scene", log_ns, stamp, self._scene)
+            for cloud in self._clouds:
+                _stamp(cloud.timestamp, stamp)
                 self._put("/points", log_ns, stamp, cloud)
         self._put("/tf", log_ns, stamp, message)
 
@@ -202,43 +207,42 @@ class _Drawing:
         payload = message.SerializeToString()
         self._writer.add(channel_id, log_ns, encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
 
-    def _scene(self, stamp: int) -> Any:
-        message = foxglove.SceneUpdate()
-        for number, solid in enumerate(self._solids):
-            entity = message.entities.add(frame_id=solid.link, id=f"{solid.link}-{number}", frame_locked=True)
-            _stamp(entity.timestamp, stamp)
-            shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}[solid.kind]
-            shape = shapes.add()
-            _set(shape.pose.position, solid.translation)
-            _set(shape.pose.orientation, solid.rotation)
-            _set(shape.size, np.array(solid.size))
-            shape.color.r, shape.color.g, shape.color.b, shape.color.a = solid.color
-            if solid.kind == "cylinder":
-                shape.bottom_scale = shape.top_scale = 1.0
-        return message
 
-    def _clouds(self, stamp: int) -> Iterator[Any]:
-        links = dict.fromkeys(solid.link for solid in self._solids)
-        packed = np.dtype([("xyz", "<f4", (3,)), ("rgba", "u1", (4,))])
-        for link in links:
-            pieces = []
-            for solid in self._solids:
-                if solid.link == link:
-                    points = solid.points()
-                    rows = np.empty(len(points), packed)
-                    rows["xyz"] = points
-                    rows["rgba"] = np.round(np.array(solid.color) * 255)
-                    pieces.append(rows)
-            message = foxglove.PointCloud(
-                frame_id=link, point_stride=packed.itemsize, data=np.concatenate(pieces).tobytes()
-            )
-            _stamp(message.timestamp, stamp)
-            message.pose.orientation.w = 1.0
-            for number, name in enumerate(("x", "y", "z")):
-                message.fields.add(name=name, offset=4 * number, type=foxglove.FLOAT32)
-            for number, name in enumerate(("red", "green", "blue", "alpha")):
-                message.fields.add(name=name, offset=12 + number, type=foxglove.UINT8)
-            yield message
+def _scene(solids: list[Solid]) -> Any:
+    message = foxglove.SceneUpdate()
+    for number, solid in enumerate(solids):
+        entity = message.entities.add(frame_id=solid.link, id=f"{solid.link}-{number}", frame_locked=True)
+        shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}[solid.kind]
+        shape = shapes.add()
+        _set(shape.pose.position, solid.translation)
+        _set(shape.pose.orientation, solid.rotation)
+        _set(shape.size, np.array(solid.size))
+        shape.color.r, shape.color.g, shape.color.b, shape.color.a = solid.color
+        if solid.kind == "cylinder":
+            shape.bottom_scale = shape.top_scale = 1.0
+    return message
+
+
+def _clouds(solids: list[Solid]) -> Iterator[Any]:
+    packed = np.dtype([("xyz", "<f4", (3,)), ("rgba", "u1", (4,))])
+    for link in dict.fromkeys(solid.link for solid in solids):
+        pieces = []
+        for solid in solids:
+            if solid.link == link:
+                points = solid.points()
+                rows = np.empty(len(points), packed)
+                rows["xyz"] = points
+                rows["rgba"] = np.round(np.array(solid.color) * 255)
+                pieces.append(rows)
+        message = foxglove.PointCloud(
+            frame_id=link, point_stride=packed.itemsize, data=np.concatenate(pieces).tobytes()
+        )
+        message.pose.orientation.w = 1.0
+        for number, name in enumerate(("x", "y", "z")):
+            message.fields.add(name=name, offset=4 * number, type=foxglove.FLOAT32)
+        for number, name in enumerate(("red", "green", "blue", "alpha")):
+            message.fields.add(name=name, offset=12 + number, type=foxglove.UINT8)
+        yield message
 
 
 def _transform(

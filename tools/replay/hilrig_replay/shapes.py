@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.scene import multiply, rotate
+from hilrig_replay.scene import multiply
 from hilrig_runtime.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,8 @@ class Solid:
     def points(self) -> Floats:
         """Points on its surface in the link's frame, m, (n, 3)."""
         local = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}[self.kind](np.array(self.size))
-        turned = np.array([rotate(self.rotation, point) for point in local])
+        u, w = self.rotation[:3], self.rotation[3]
+        turned = local + 2 * np.cross(u, np.cross(u, local) + w * local)
         return np.asarray(turned + self.translation)
 
 
