@@ -205,4 +205,4 @@ def _judge(run: Run) -> TaskResult:
     last = parts[parts["step"] == parts["step"][-1]] if len(parts) else parts
     poses = [PartState(name=run.names[row["part"]], x=row["x"], y=row["y"], z=row["z"], yaw=row["yaw"]) for row in last]
     held = run.names[run.states["held_part"][-1]]
-    return placed_parts(RigParameters.from_json(json.dumps(dict(run.parameters))).scene, poses, held=held)
+    return placed_parts(RigParameters.from_json(run.parameters_json).scene, poses, held=held)
