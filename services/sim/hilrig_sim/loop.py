@@ -6,7 +6,6 @@ start of its step.
 """
 
 import gc
-import platform
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,6 +18,7 @@ from hilrig_runtime.service import Service
 from hilrig_schemas import JointState, RigConfig, topics
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.configured import rig_parameters
+from hilrig_sim.machine import machine_name
 from hilrig_sim.model import RigParameters
 from hilrig_sim.plant import Plant
 from hilrig_sim.reports import Reporter
@@ -217,5 +217,5 @@ def _configuration(service: Service, rig: str, parameters: RigParameters) -> Rig
         urdf=urdf(parameters, rig),
         lab_toml=service.lab.source,
         software_version=version("hilrig"),
-        machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        machine=machine_name(),
     )

@@ -13,6 +13,7 @@ from hilrig_cli.commands import (
     check,
     demo,
     export,
+    figures,
     latency,
     lease,
     live,
@@ -24,6 +25,7 @@ from hilrig_cli.commands import (
     runs,
     services,
     up,
+    verify,
 )
 from hilrig_runtime.lifecycle import run_main
 
@@ -54,6 +56,8 @@ app.command(rich_help_panel=SERVICES)(services.recorder)
 app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
 app.command(rich_help_panel=REVIEW)(replay.replay)
+app.command(rich_help_panel=REVIEW)(verify.verify)
+app.command(rich_help_panel=REVIEW)(figures.figures)
 app.command(rich_help_panel=REVIEW)(recover.recover)
 app.command(rich_help_panel=REVIEW)(play.play)
 app.command(rich_help_panel=REVIEW)(export.export)

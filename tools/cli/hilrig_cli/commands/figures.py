@@ -1,0 +1,41 @@
+"""`hilrig figures`: the paper's figures 4, 5 and 6, and whether the numbers behind them come out."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+
+def figures(
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("figures"),
+    step_ms: Annotated[float, typer.Option(help="Step of the fixed-step methods, ms.")] = 20.0,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat the paper's experiment by Euler, Dormand–Prince and Runge–Kutta–Fehlberg, and draw its figures.
+
+    Exit code 1: a number is not what is expected at the paper's step of 20 ms.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from hilrig_replay.figures import compute, draw
+
+    found = compute(step_ms)
+    files = draw(found, out)
+    if as_json:
+        print(json.dumps(found.as_dict() | {"files": [str(path) for path in files]}))
+    else:
+        console = Console()
+        table = Table(title="Experiment (44) of the paper", title_justify="left", title_style="bold")
+        for column in ("", "expected", "came out", "agrees"):
+            table.add_column(column)
+        for what, expected, came_out, holds in found.checks():
+            table.add_row(what, expected, came_out, "yes" if holds else "no", style=None if holds else "red")
+        console.print(table)
+        for path in files:
+            console.print(str(path), soft_wrap=True)
+    if not all(holds for *_, holds in found.checks()):
+        raise typer.Exit(1)
