@@ -272,6 +272,20 @@ def test_the_teacher_can_free_a_rig(bench: Bench) -> None:
     assert bench.events[-1].controller_data.reason == "by the teacher"
 
 
+def test_a_controller_that_lost_the_rig_to_the_teacher_does_not_get_it_back_at_once(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(holder, 0, 5)
+    bench.device.release("by the teacher")
+    with pytest.raises(ModbusError) as refusal:
+        bench.write(holder, 0, 6)
+    assert refusal.value.code == 6
+    bench.write(other, 0, 7)
+    bench.device.disconnect(other, "done")
+    bench.wait(5000)
+    bench.write(holder, 0, 8)
+    assert bench.device.lease.holder is holder
+
+
 def test_an_observer_reads_and_its_writes_are_an_illegal_function(bench: Bench) -> None:
     observer = bench.connect(may_write=False)
     assert bench.read(observer, 0, 1) == [0]

@@ -27,6 +27,8 @@ class Client:
     host: Host
     may_write: bool = True
     last_request_ns: int = 0
+    barred_until_ns: int = 0
+    """Until when it may not take the lease again, because it was taken from it; ns."""
     served: Served | None = None
     basis: Served | None = None
     """What it had been shown when its newest bytes came: they can't have been written knowing more."""

@@ -294,10 +294,14 @@ class Device:
             self._send_own_command()
 
     def release(self, reason: str) -> str:
-        """Take the rig from its controller, for the teacher: who held it; empty: nobody."""
+        """Take the rig from its controller, for the teacher: who held it; empty: nobody.
+
+        For the lease's time-out that connection does not get it back: others could not be faster than its next write.
+        """
         holder = self.lease.holder
         if holder is None:
             return ""
+        holder.barred_until_ns = self._monotonic_ns() + self.settings.lease_ns
         self._lose_lease(reason)
         return holder.address
 
@@ -320,6 +324,8 @@ class Device:
         if not client.may_write:
             self._refuse(client, now_ns, "its certificate lets it read only", ExcCodes.ILLEGAL_FUNCTION)
         if self.lease.holder is not client:
+            if now_ns < client.barred_until_ns:
+                self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
             if not self.lease.take(client):
                 self._refuse(client, now_ns, "another controller holds the rig", ExcCodes.DEVICE_BUSY)
             self._open_session(client)

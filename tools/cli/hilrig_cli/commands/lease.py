@@ -22,7 +22,7 @@ def lease(
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which controller holds a rig, or take the rig from it: the next to write gets it.
+    """Say which controller holds a rig, or take the rig from it: the next other one to write gets it.
 
     Exit code 1 with --release when nobody held it.
     """
@@ -95,4 +95,4 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
     console.print(table)
     if release:
         taken = statuses[0].released
-        console.print(f"taken from {taken}: the next to write gets it" if taken else "nobody held it")
+        console.print(f"taken from {taken}: the next other controller to write gets it" if taken else "nobody held it")

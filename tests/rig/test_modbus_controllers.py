@@ -1,0 +1,154 @@
+"""Controllers that people start from, and clients that nobody here wrote, against the whole rig.
+
+Python, C and Node.js run as a student runs them; each must move the arm to two poses and end with it where it was
+sent.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from clients import mbpoll_read, mbpoll_write, require_mbpoll
+from edge_rig import EdgeRig, running_edge
+from labs import RunningLab, write_lab
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SECONDS = "7.8"
+"""Nearly both poses' time: the arm stands in the second one when the program ends."""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
+    with RunningLab(write_lab(tmp_path_factory.mktemp("lab"), rigs=3)) as lab:
+        yield lab
+
+
+@pytest.fixture(scope="module")
+def in_c(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
+        pytest.skip("needs gcc and pkg-config (Debian's packages of these names)")
+    flags = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "libmodbus"], check=False, capture_output=True, text=True
+    )
+    if flags.returncode:
+        pytest.skip("needs libmodbus (Debian's package libmodbus-dev)")
+    program = tmp_path_factory.mktemp("c") / "hold_position"
+    source = EXAMPLES / "hold_position.c"
+    warnings = ["-O2", "-Wall", "-Wextra", "-Werror"]
+    command = ["gcc", *warnings, "-o", str(program), str(source), *flags.stdout.split(), "-lm"]
+    subprocess.run(command, check=True)
+    return program
+
+
+@pytest.fixture(scope="module")
+def in_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if shutil.which("node") is None or shutil.which("npm") is None:
+        pytest.skip("needs node and npm (Debian's packages nodejs and npm)")
+    folder = tmp_path_factory.mktemp("node")
+    for name in ("package.json", "hold_position.js"):
+        shutil.copy(EXAMPLES / name, folder)
+    command = ["npm", "install", "--omit=optional", "--no-audit", "--no-fund", "--loglevel=error"]
+    done = subprocess.run(command, cwd=folder, check=False, capture_output=True, text=True, timeout=60)
+    if done.returncode:
+        pytest.skip(f"npm can't install modbus-serial here: {done.stderr.strip().splitlines()[-1:]}")
+    return folder / "hold_position.js"
+
+
+def test_the_examples_hold_and_move_the_arm(lab: RunningLab, in_c: Path, in_node: Path) -> None:
+    """All three at once, each on a rig of its own."""
+    port = {rig.name: str(lab.lab.ports[rig.name]) for rig in lab.lab.rigs}
+    commands = {
+        "Python": [sys.executable, EXAMPLES / "hold_position.py", "--port", port["rig1"], "--duration", SECONDS],
+        "C": [in_c, "127.0.0.1", port["rig2"], SECONDS],
+        "Node.js": ["node", in_node, "127.0.0.1", port["rig3"], SECONDS],
+    }
+    running = {
+        name: subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for name, command in commands.items()
+    }
+    outputs = {name: process.communicate(timeout=60)[0] for name, process in running.items()}
+    for name, process in running.items():
+        assert process.returncode == 0, f"{name}: {outputs[name]}"
+        assert "error at the end" in outputs[name]
+
+
+@pytest.mark.parametrize("name", ["Python", "C", "Node.js"])
+def test_an_example_without_a_rig_says_so(name: str, request: pytest.FixtureRequest) -> None:
+    commands = {
+        "Python": lambda: [sys.executable, EXAMPLES / "hold_position.py", "--port", "1"],
+        "C": lambda: [request.getfixturevalue("in_c"), "127.0.0.1", "1"],
+        "Node.js": lambda: ["node", request.getfixturevalue("in_node"), "127.0.0.1", "1"],
+    }
+    done = subprocess.run(commands[name](), check=False, capture_output=True, text=True, timeout=30)
+    assert done.returncode == 3
+    assert "rig" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_two_foreign_clients_at_once_and_the_lease_between_them(in_c: Path) -> None:
+    """libmodbus holds the rig; mbpoll reads beside it and is refused when it writes."""
+    require_mbpoll()
+    with running_edge() as rig, moving(rig):
+        with subprocess.Popen(
+            [in_c, "127.0.0.1", str(rig.port), "3"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        ) as holder:
+            eventually(lambda: "LEASE_GRANTED" in rig.kinds())
+            assert len(mbpoll_read(rig.port, 5, 4)) == 4
+            with pytest.raises(subprocess.CalledProcessError) as refusal:
+                mbpoll_write(rig.port, 1, 1000)
+            assert "busy" in refusal.value.stderr.lower()
+            assert all(command.controller == rig.commands[1].controller for command in rig.commands[1:])
+            assert holder.wait(30) in (0, 1)
+        # It is gone: mbpoll gets the rig.
+        eventually(lambda: rig.kinds().count("LEASE_GRANTED") == rig.kinds().count("LEASE_LOST"))
+        mbpoll_write(rig.port, 1, 1000)
+        assert rig.commands[-1].effort[0] == 1.0
+        mbpoll_write(rig.port, 1, 1, kind="coil")
+        assert rig.commands[-1].magnet
+
+
+@contextmanager
+def moving(rig: EdgeRig) -> Iterator[None]:
+    """States at 50 Hz while it lasts."""
+    over = threading.Event()
+
+    def send_states() -> None:
+        while not over.wait(0.02):
+            rig.state()
+
+    thread = threading.Thread(target=send_states)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_the_plc_project_speaks_of_registers_that_exist() -> None:
+    """OpenPLC is not run here; its files are held against the map."""
+    config = dict(
+        re.findall(r'^device0\.(\w+) = "([^"]*)"', (EXAMPLES / "openplc/mbconfig.cfg").read_text(), re.MULTILINE)
+    )
+    program = (EXAMPLES / "openplc/hold_position.st").read_text()
+    with running_edge() as rig, rig.client() as client:
+        read, count = int(config["Holding_Registers_Read_Start"]), int(config["Holding_Registers_Read_Size"])
+        assert (read, count) == (4, 4)
+        assert len(client.read(read, count)) == count == len(re.findall(r"AT %IW10[0-3] : INT;", program))
+        write, count = int(config["Holding_Registers_Start"]), int(config["Holding_Registers_Size"])
+        assert (write, count) == (0, 4)
+        assert client.write(write, *range(count)).hex() == "1000000004"
+        assert count == len(re.findall(r"AT %QW10[0-3] : INT;", program))
+        assert client.ask("0F 00 00 00 01 01 01").hex() == "0f00000001"
+        assert config["Coils_Size"] == "1" and "AT %QX100.0 : BOOL;" in program  # noqa: PT018
+    assert 10 <= int(re.search(r'Polling_Period = "(\d+)"', (EXAMPLES / "openplc/mbconfig.cfg").read_text())[1]) <= 20
