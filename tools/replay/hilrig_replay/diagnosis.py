@@ -165,7 +165,13 @@ def beating(evidence: Evidence) -> Finding | None:
     typical = float(np.median(drift))
     if abs(typical) > 0.15 * step or np.median(np.abs(drift - typical)) > 0.05 * step or abs(typical) < 1e-4 * step:
         return None
-    period_s = step / abs(typical) * evidence.cycle_ns / 1e9
+    # Most of the way it drifts one way, and comes round at least twice.
+    same_way = float(np.mean(np.sign(drift) == np.sign(typical)))
+    rounds = int((np.abs(np.diff(waits)) > step / 2).sum())
+    if same_way < 0.75 or rounds < 2:
+        return None
+    between_ns = float(np.median(np.diff(samples["write_arrived_ns"])))
+    period_s = step / abs(typical) * between_ns / 1e9
     return Finding(
         "beating",
         f"the controller's cycle ({evidence.cycle_ns / MS:.2f} ms) beats with the step ({step / MS:g} ms): the wait "

@@ -126,7 +126,9 @@ class Matcher:
         """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`; the samples found with it."""
         effective = np.concatenate((self._waiting, states[states["basis_step"] != 0]))
         known = np.concatenate((self._commands, commands))
-        rows, found = _join(effective, known)
+        rows, found = join_commands(effective, known)
+        if len(known):
+            found &= known["basis_step"][rows] == effective["basis_step"]
         missing = effective[~found]
         self._waiting = missing[-self.WINDOW :]
         self._given_up += len(missing) - len(self._waiting)
@@ -147,18 +149,16 @@ def match(states: Rows, commands: Rows) -> NDArray[np.void]:
     return in_order([Matcher().add(states, commands)])
 
 
-def _join(samples: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Row of each sample's command by (session, seq), and where there is one."""
+def join_commands(states: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """The command in force at each state, by (session, seq): its row, and whether it is there; shapes (states,)."""
     if not len(commands):
-        return np.zeros(len(samples), np.intp), np.zeros(len(samples), np.bool_)
+        return np.zeros(len(states), np.intp), np.zeros(len(states), np.bool_)
     # A code has 16 bits, a sequence number far fewer than 48.
     keys = (commands["session"].astype(np.uint64) << np.uint64(48)) | commands["seq"]
-    wanted = (samples["session"].astype(np.uint64) << np.uint64(48)) | samples["command_seq"]
+    wanted = (states["session"].astype(np.uint64) << np.uint64(48)) | states["command_seq"]
     order = np.argsort(keys, kind="stable")
-    at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    rows = order[at]
-    found = (keys[rows] == wanted) & (commands["basis_step"][rows] == samples["basis_step"])
-    return rows, found
+    rows = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
+    return rows, keys[rows] == wanted
 
 
 def _stages(states: Rows, commands: Rows) -> NDArray[np.void]:

@@ -22,6 +22,8 @@ JOINT_SYMBOLS: Final = ("θ1", "θ2", "d3", "θ4")
 JOINT_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
 PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")
 EFFORT_SYMBOLS: Final = ("τ1", "τ2", "τ3", "τ4")
+RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#72b7b2", "#eeca3b")
+"""Of runs that are compared, and of controllers."""
 SEVERITY_COLORS: Final = {"INFO": "#9aa5b1", "WARNING": "#f2b134", "ERROR": "#e45756"}
 
 

@@ -73,12 +73,14 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
             contents=[f"+ {_path(root, 'lanes')}/**" for root in roots],
         ),
     )
+    lateness = plot("Tick lateness, ms", "lateness", legend=False)
     curves = rrb.Vertical(
         plot("Positions: θ in °, d3 in mm", "position"),
         plot("Velocities: θ in °/s, d3 in mm/s", "velocity", legend=False),
         plot("Efforts: τ1 τ2 τ4 in N·m, τ3 in N (thin: commanded)", "effort", legend=False),
         plot("Loop latency, made of its stages, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
-        rrb.Tabs(plot("Tick lateness, ms", "lateness", legend=False), plot("Modbus requests per second", "modbus")),
+        # What controllers ask is on the record alone, not on the bus.
+        lateness if live else rrb.Tabs(lateness, plot("Modbus requests per second", "modbus")),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
     )
     return rrb.Blueprint(

@@ -2,16 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import rerun as rr
 
+from hilrig_replay.palette import RUN_COLORS
 from hilrig_replay.rerun_layout import layout
-from hilrig_replay.rig_view import APPLICATION, Drawn, RigView
+from hilrig_replay.rig_view import Drawn, RigView
 from hilrig_replay.run import Run
-from hilrig_runtime.errors import InputError, OperationError
-
-_RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#e45756", "#b279a2", "#72b7b2")
+from hilrig_replay.streams import to_file
+from hilrig_runtime.errors import InputError
 
 
 def drawn(run: Run) -> Drawn:
@@ -34,19 +33,12 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}")
-    identity = chosen[0].session if len(chosen) == 1 else "+".join(run.session for run in chosen)
-    stream = rr.RecordingStream(APPLICATION, recording_id=identity)
+    name = "+".join(run.session for run in chosen)
     roots = root_names(chosen)
-    try:
-        stream.save(path, default_blueprint=layout(roots))
-    except Exception as error:
-        raise OperationError(f"{path}: can't be written: {error}") from error
+    stream = to_file(path, name, layout(roots))
     with stream:
-        stream.send_recording_name(identity)
         for number, (run, root) in enumerate(zip(chosen, roots, strict=True)):
-            color = None if len(chosen) == 1 else _RUN_COLORS[number % len(_RUN_COLORS)]
+            color = None if len(chosen) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
             write_run(stream, run, root=root, color=color)
     stream.disconnect()
 

@@ -6,7 +6,7 @@ several runs stand beside each other in one viewer.
 """
 
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from hilrig_replay.columns import Names, Rows
-from hilrig_replay.latency import STAGES, Matcher
+from hilrig_replay.latency import STAGES, Matcher, join_commands
 from hilrig_replay.palette import (
     EFFORT_SYMBOLS,
     JOINT_COLORS,
     JOINT_SYMBOLS,
     PALE_JOINT_COLORS,
+    RUN_COLORS,
     SEVERITY_COLORS,
     STAGE_COLORS,
     STAGE_NAMES,
@@ -35,7 +36,6 @@ from hilrig_replay.timebase import Timebase
 from hilrig_sim.model import PartParameters, RigParameters
 from hilrig_sim.urdf import urdf
 
-APPLICATION: Final = "hilrig"
 _RATE_BIN_NS: Final = 100_000_000
 """Modbus requests are counted over so long, ns."""
 _SAFE: Final = "safe zero"
@@ -91,12 +91,19 @@ class RigView:
         self._color = color
         self._matcher = Matcher()
         self._lanes: dict[str, str] = {}
-        self._controller = "controller"
+        self._holder = ""
+        self._holders = {_SAFE: "#e45756", _NOBODY: "#3a424c"}
         self._clients: set[str] = set()
         self._last_tip: NDArray[np.float64] | None = None
         self._placed: set[str] = set()
         self._write_scene()
         self._write_legends()
+
+    def draw(self, drawn: Drawn) -> None:
+        """Draw the rig anew where it has become another one."""
+        before, self._drawn = self._drawn, drawn
+        if (drawn.arm.urdf, drawn.parameters) != (before.arm.urdf, before.parameters):
+            self._write_scene()
 
     # -- what does not change ---------------------------------------------------------------------------------------
 
@@ -158,9 +165,8 @@ class RigView:
         ends = ["state sampled", *(f"+ {STAGE_NAMES[stage]}" for stage in STAGES[:-1]), "+ transport = loop"]
         self._legend("stages", ends, [_BASELINE_COLOR, *(STAGE_COLORS[stage] for stage in STAGES)])
         self._legend("loop", ["loop latency"], ["#e0e4e8"])
-        for lane, colors in self._lane_colors().items():
-            shades = [rgb(color) for color in colors.values()]
-            self._static(f"lanes/{lane}", rr.StateConfiguration(values=list(colors), colors=shades))
+        self._lane_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
+        self._lane_legend("part", {part.name: part.colour for part in self._drawn.parameters.scene.parts})
         self._legend("lateness", ["tick lateness"], ["#e45756"])
 
     def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
@@ -168,13 +174,9 @@ class RigView:
         lines = rr.SeriesLines(names=list(names), colors=shades, widths=[width] * len(names))
         self._static(path, lines)
 
-    def _lane_colors(self) -> dict[str, dict[str, str]]:
-        parts = {part.name: part.colour for part in self._drawn.parameters.scene.parts}
-        return {
-            "magnet": {"on": "#e45756", "off": "#3a424c"},
-            "part": parts,
-            "torque": {_SAFE: "#e45756", _NOBODY: "#3a424c"},
-        }
+    def _lane_legend(self, lane: str, colors: Mapping[str, str]) -> None:
+        shades = [rgb(color) for color in colors.values()]
+        self._static(f"lanes/{lane}", rr.StateConfiguration(values=list(colors), colors=shades))
 
     # -- what changes -----------------------------------------------------------------------------------------------
 
@@ -184,6 +186,7 @@ class RigView:
             self._add_commands(records.commands)
         if len(records.states):
             self._add_states(records.states)
+            self._lane("torque", records.states, self._torque_source(records.states, records.commands))
         if len(records.parts):
             self._add_parts(records.parts)
         samples = self._matcher.add(records.states, records.commands)
@@ -204,7 +207,6 @@ class RigView:
         self._add_pose(times, q)
         self._lane("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._lane("part", states, self._names.texts(states["held_part"]))
-        self._lane("torque", states, _torque_source(states, self._controller))
         self._lane("stops", states, _stops(states["limit_flags"]))
 
     def _add_pose(self, times: list[rr.TimeColumn], q: NDArray[np.float64]) -> None:
@@ -244,7 +246,6 @@ class RigView:
     def _add_commands(self, commands: Rows) -> None:
         times = self._times(commands)
         self._scalars("effort/commanded", times, commands["effort"])
-        self._controller = self._names[int(commands["controller"][-1])] or self._controller
 
     def _add_latency(self, samples: Rows) -> None:
         times = self._times(samples)
@@ -285,6 +286,29 @@ class RigView:
         colors = [rgb(SEVERITY_COLORS.get(severity, "#9aa5b1")) for severity in events["severity"]]
         self._send("events", self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
 
+    def _torque_source(self, states: Rows, commands: Rows) -> NDArray[np.object_]:
+        """Whose torque acts, for each state: the address of who wrote the command in force."""
+        # The command of a state may be in the block before: what was known last holds until a newer one is found.
+        source = np.full(len(states), self._holder, dtype=object)
+        rows, found = join_commands(states, commands)
+        if found.any():
+            at = np.maximum.accumulate(np.where(found, np.arange(len(states)), -1))
+            known = self._names.texts(commands["controller"][rows])
+            known[commands["safe"][rows]] = _SAFE
+            source[at >= 0] = known[at[at >= 0]]
+            self._holder = str(source[-1])
+        source[states["command_seq"] == 0] = _NOBODY
+        source[states["safe"]] = _SAFE
+        self._color_holders(source)
+        return source
+
+    def _color_holders(self, holders: NDArray[np.object_]) -> None:
+        new = set(holders) - {""} - self._holders.keys()
+        if new:
+            for holder in sorted(new):
+                self._holders[holder] = RUN_COLORS[len(self._holders) % len(RUN_COLORS)]
+            self._lane_legend("torque", self._holders)
+
     # -- the recording ----------------------------------------------------------------------------------------------
 
     def _lane(self, name: str, rows: Rows, values: NDArray[np.object_]) -> None:
@@ -319,13 +343,6 @@ class RigView:
 
 def _about_z(angle: float) -> Any:
     return rr.Quaternion(xyzw=[0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))])
-
-
-def _torque_source(states: Rows, controller: str) -> NDArray[np.object_]:
-    source = np.full(len(states), controller, dtype=object)
-    source[states["command_seq"] == 0] = _NOBODY
-    source[states["safe"]] = _SAFE
-    return source
 
 
 def _stops(flags: NDArray[np.uint16]) -> NDArray[np.object_]:

@@ -1,0 +1,64 @@
+"""`hilrig live`: a running rig in the rerun viewer."""
+
+import sys
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import Config
+
+
+def live(
+    rig: Annotated[
+        str | None, typer.Argument(metavar="[RIG]", help="Which rig; without: the lab's first.", show_default=False)
+    ] = None,
+    config: Config = None,
+    save: Annotated[
+        Path | None, typer.Option(metavar="LIVE.RRD", help="Write a rerun file and open nothing.", show_default=False)
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
+) -> None:
+    """Follow a running rig: the same view as of a recording, as it happens; until it is closed, or Ctrl-C."""
+    from hilrig_replay.live import Follower, follow
+    from hilrig_replay.rerun_layout import layout
+    from hilrig_replay.streams import to_file, to_viewer
+    from hilrig_replay.viewer import browser_address, free_port, running_viewer
+    from hilrig_runtime.clock import SYSTEM_CLOCK
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.lifecycle import stop_on_signals
+    from hilrig_runtime.zenoh_bus import ZenohBus
+
+    if save is not None and web:
+        raise InputError("--save writes a file and --web serves a browser: choose one")
+    lab = load_lab(config)
+    name = lab.rig(rig).name if rig is not None else lab.rigs[0].name
+    stopping = threading.Event()
+    stop_on_signals(stopping)
+
+    def say(line: str) -> None:
+        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+    blueprint = layout(live=True)
+    with ExitStack() as closing:
+        if save is not None:
+            stream = to_file(save, f"live-{name}", blueprint)
+
+            def over() -> bool:
+                return False
+        else:
+            grpc_port, web_port = free_port(), free_port() if web else None
+            viewer = closing.enter_context(running_viewer(grpc_port=grpc_port, web_port=web_port))
+            if web_port is not None:
+                say(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it")
+            stream = to_viewer(grpc_port, f"live-{name}", blueprint)
+
+            def over() -> bool:
+                return viewer.poll() is not None
+
+        closing.callback(stream.disconnect)
+        bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
+        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say), over, stopping)
