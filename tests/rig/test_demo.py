@@ -1,0 +1,104 @@
+"""`hilrig demo`: what a newcomer runs first, from the command to every file that it leaves."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from hilrig_replay.latency import STAGES, measure
+from hilrig_replay.run import open_run
+from labs import hilrig
+
+pytestmark = pytest.mark.rig
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("demo")
+    done = hilrig("demo", "--duration", "14", "--out", out / "out", "--json", cwd=out)
+    assert done.returncode == 0, done.stderr
+    return out / "out", json.loads(done.stdout)
+
+
+def test_it_says_where_everything_is(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, said = demo
+    for key in ("recording", "rrd", "plot"):
+        assert Path(said[key]).stat().st_size > 10_000
+
+
+def test_its_latency_is_what_the_latency_command_says(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, said = demo
+    again = hilrig("latency", said["recording"], "--json")
+    latency = json.loads(again.stdout)
+    assert latency == said["latency"]
+    assert {"samples", "loop_ms", "stages_ms", "step_ms", "lost", "fit", "reasons"} <= set(latency)
+    assert set(latency["lost"]) == {"transport", "recorder"}
+    assert set(latency["stages_ms"]) == set(STAGES)
+    statistics = {"p50", "p95", "p99", "p999", "max", "mean", "std"}
+    assert all(statistics <= set(figures) for figures in (latency["loop_ms"], *latency["stages_ms"].values()))
+    assert again.returncode == (0 if latency["fit"] else 1)
+
+
+def test_the_stages_of_each_sample_add_up_exactly_and_none_is_negative(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, said = demo
+    samples = measure(open_run(said["recording"])).table
+    assert len(samples) == said["latency"]["samples"] > 300
+    assert np.array_equal(sum(samples[stage] for stage in STAGES), samples["loop"])
+    for stage in STAGES:
+        assert samples[stage].min() >= 0, stage
+
+
+def test_nothing_is_lost(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, said = demo
+    assert said["latency"]["lost"] == {"transport": 0, "recorder": 0}
+
+
+def test_the_recording_is_verified_and_every_part_stands_in_the_tray(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, said = demo
+    assert said["verify"]["exact"]
+    assert said["task"]["placed"] == len(said["task"]["parts"]) == 4
+    assert said["task"]["largest_error_mm"] < 2.0
+
+
+def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_decoder(
+    demo: tuple[Path, dict[str, Any]],
+) -> None:
+    _, said = demo
+    with Path(said["recording"]).open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {channel.topic for channel in summary.channels.values()} >= {"/state", "/command", "/event"}
+        names = {record.name for record in reader.iter_metadata()}
+        assert names >= {"hilrig.session", "hilrig.config", "hilrig.summary"}
+        attachments = {attachment.name for attachment in reader.iter_attachments()}
+        assert {"lab.toml", "rig1.urdf"} <= attachments
+        steps = [decoded.step for _, _, _, decoded in reader.iter_decoded_messages(topics=["/state"])]
+    assert steps == list(range(steps[0], steps[0] + len(steps)))
+
+
+def test_a_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A controller that only reads: its session is recorded by hand, so there is a file without a sample.
+    from hilrig_cli import demo as module
+
+    controller = tmp_path / "reads_only.py"
+    controller.write_text(
+        "import sys, time\n"
+        "from pymodbus.client import ModbusTcpClient\n"
+        "port = int(sys.argv[sys.argv.index('--port') + 1])\n"
+        "with ModbusTcpClient('127.0.0.1', port=port) as client:\n"
+        "    client.write_coil(0, True)\n"
+        "    time.sleep(1)\n"
+        "print('{}')\n"
+    )
+    monkeypatch.setattr(module, "controller_path", lambda: controller)
+    from typer.testing import CliRunner
+
+    from hilrig_cli.main import app
+
+    done = CliRunner().invoke(app, ["demo", "--duration", "1", "--out", str(tmp_path / "out"), "--json"])
+    assert done.exit_code == 1, done.output
