@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from hilrig_sim.model import ArmParameters, RigParameters, SceneParameters, TrayParameters
 
-POINT_INERTIA: Final = 1e-9
+POINT_INERTIA: Final = 1e-12
 """Stands for the zero inertia of a point mass, kg·m²."""
 POINT_MASS: Final = 1e-9
 """Stands for the mass of the empty magnet, kg."""
@@ -159,15 +159,20 @@ def _joint(
     SubElement(joint, "axis", xyz=_numbers(axis))
     # URDF wants a largest effort and speed; the model has none but what the effort register carries.
     SubElement(
-        joint, "limit", lower=repr(arm.lower[index]), upper=repr(arm.upper[index]), effort="32.767", velocity="100"
+        joint,
+        "limit",
+        lower=repr(float(arm.lower[index])),
+        upper=repr(float(arm.upper[index])),
+        effort="32.767",
+        velocity="100",
     )
-    SubElement(joint, "dynamics", damping=repr(arm.friction[index]), friction="0")
+    SubElement(joint, "dynamics", damping=repr(float(arm.friction[index])), friction="0")
 
 
 def _point_mass(link: Element, mass: float, at: tuple[float, float, float]) -> None:
     inertial = SubElement(link, "inertial")
     SubElement(inertial, "origin", xyz=_numbers(at), rpy="0 0 0")
-    SubElement(inertial, "mass", value=repr(mass))
+    SubElement(inertial, "mass", value=repr(float(mass)))
     tiny = repr(POINT_INERTIA)
     SubElement(inertial, "inertia", ixx=tiny, iyy=tiny, izz=tiny, ixy="0", ixz="0", iyz="0")
 

@@ -169,7 +169,7 @@ def _fixed(table: Tableau, title: str, step_ms: float, count: int) -> Solution:
     position, velocity, effort = np.zeros((4, 1)), np.zeros((4, 1)), np.zeros((4, 1))
     effort[2] = -ARM.masses[2] * GRAVITY
     positions, velocities = np.zeros((2, count + 1)), np.zeros((2, count + 1))
-    time_s = np.arange(count + 1) * (step_ms / 1e3)
+    time_s = np.asarray(np.arange(count + 1) * (step_ms / 1e3), dtype=np.float64)
     # A method that diverges runs out of numbers.
     with np.errstate(all="ignore"):
         for k in range(count):
@@ -193,7 +193,7 @@ def _reference() -> Solution:
         dynamics.rates(views, drive)
         return np.concatenate([y[2:], rates[:2, 0]])
 
-    time_s: Floats = np.linspace(0.0, DURATION_S, 1001, dtype=np.float64)
+    time_s = np.asarray(np.linspace(0.0, DURATION_S, 1001), dtype=np.float64)
     y = reference_solution(derivative, np.zeros(4), time_s, breaks=BREAKS_S)
     return Solution("dop853", "Dormand–Prince, variable step", time_s, y[:2], y[2:])
 
@@ -219,7 +219,7 @@ def draw(figures: Figures, folder: Path) -> list[Path]:
                 axes.plot(solution.time_s, values[joint], color=color, label=f"joint {joint + 1}", linewidth=width)
             axes.set_ylabel(unit)
             if solution.diverged_s is None:
-                axes.set_ylim(-0.1 * reach, reach)
+                axes.set_ylim(-0.25 * reach, reach)
             axes.grid(alpha=0.3)
         angles.legend(loc="upper left")
         angles.set_xlim(0, DURATION_S)
