@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
+from google.protobuf.message import Message
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event
 
 WORLD: Final = "world"
-_TOPICS: Final = ("/tf", "/scene", "/points", "/log")
 _STILL_PERIOD: Final = 500
 """What does not move is said again every so many states, for players that start in the middle."""
 _VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
@@ -91,7 +91,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
 def export_foxglove(run: Run, path: Path) -> Path:
     """Copy a recording, message by message, and add what Foxglove's 3D panel and rerun's MCAP loader draw.
 
-    `/tf` (foxglove.FrameTransforms, one a state), `/scene` (foxglove.SceneUpdate: the arm's solids), `/points`
+    `/tf` (foxglove.FrameTransforms, one a state), `/scene` (foxglove.SceneUpdate: the arm's solids), `/points/<link>`
     (foxglove.PointCloud: the same as points, for viewers that draw no solids) and `/log` (foxglove.Log: the events).
 
     Raises:
@@ -154,9 +154,15 @@ class _Drawing:
         self._writer = writer
         self._arm = arm
         self._solids = solids
-        self._ids = {topic: last_channel + number for number, topic in enumerate(_TOPICS, start=1)}
-        self._schema_ids = {topic: last_schema + number for number, topic in enumerate(_TOPICS, start=1)}
-        self._sequences = dict.fromkeys(_TOPICS, 0)
+        self._types: dict[str, type[Message]] = {
+            "/tf": foxglove.FrameTransforms,
+            "/scene": foxglove.SceneUpdate,
+            "/log": foxglove.Log,
+            **{f"/points/{solid.link}": foxglove.PointCloud for solid in solids},
+        }
+        self._last_schema = last_schema
+        self._ids = {topic: last_channel + number for number, topic in enumerate(self._types, start=1)}
+        self._sequences = dict.fromkeys(self._types, 0)
         self._still = fixed_joints(run.urdf)
         self._scene = _scene(solids)
         self._clouds = list(_clouds(solids))
@@ -167,11 +173,22 @@ class _Drawing:
 
     def declare(self) -> None:
         """Write the schemas and channels."""
-        for topic, message in zip(_TOPICS, foxglove.EXPORTED, strict=True):
-            schema_id = self._schema_ids[topic]
+        schema_ids: dict[str, int] = {}
+        for topic, message in self._types.items():
             name = message.DESCRIPTOR.full_name
-            self._writer.add_schema(Schema(schema_id, file_descriptor_set(message), "protobuf", name))
-            self._writer.add_channel(Channel(self._ids[topic], topic, "protobuf", {}, schema_id))
+            if name not in schema_ids:
+                schema_ids[name] = self._last_schema + len(schema_ids) + 1
+                schema = Schema(schema_ids[name], file_descriptor_set(message), "protobuf", name)
+                self._writer.add_schema(schema)
+            self._writer.add_channel(
+                Channel(
+                    id=self._ids[topic],
+                    topic=topic,
+                    message_encoding="protobuf",
+                    metadata={},
+                    schema_id=schema_ids[name],
+                )
+            )
 
     def state(self, log_ns: int) -> None:
         """Draw the next state."""
@@ -191,7 +208,7 @@ class _Drawing:
             self._put("/scene", log_ns, stamp, self._scene)
             for cloud in self._clouds:
                 _stamp(cloud.timestamp, stamp)
-                self._put("/points", log_ns, stamp, cloud)
+                self._put(f"/points/{cloud.frame_id}", log_ns, stamp, cloud)
         self._put("/tf", log_ns, stamp, message)
 
     def event(self, log_ns: int, event: Event) -> None:

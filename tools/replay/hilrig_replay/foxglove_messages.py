@@ -7,7 +7,6 @@ Described here field by field, with the names and numbers that Foxglove document
 from typing import Any, Final
 
 from google.protobuf import descriptor_pb2, descriptor_pool, duration_pb2, message_factory, timestamp_pb2
-from google.protobuf.message import Message
 
 _FIELD: Final = descriptor_pb2.FieldDescriptorProto
 _SCALARS: Final = {
@@ -131,4 +130,3 @@ Log: Final[type[Any]] = _CLASS["Log"]
 LOG_LEVELS: Final = {"INFO": 2, "WARNING": 3, "ERROR": 4}
 FLOAT32: Final = 7
 UINT8: Final = 1
-EXPORTED: Final[tuple[type[Message], ...]] = (FrameTransforms, SceneUpdate, PointCloud, Log)
