@@ -12,10 +12,10 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from hilrig_modbus_edge import traffic
 from hilrig_modbus_edge.device import Device, DeviceSettings
 from hilrig_modbus_edge.server import Limits, RigServer, bind
 from hilrig_modbus_edge.tls import TlsPolicy
+from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.service import Service
@@ -179,15 +179,13 @@ class Edge:
         if traffic_due:
             self._traffic_due_ns = now_ns + TRAFFIC_PERIOD_NS
         for server in self._servers:
-            if server.notes and (traffic_due or len(server.notes) >= traffic.MOST):
+            if server.traffic.count and (traffic_due or server.traffic.count >= MOST):
                 self._send_traffic(server, now_ns)
         self.service.beat(now_ns)
 
     def _send_traffic(self, server: RigServer, now_ns: int) -> None:
-        notes, server.notes = server.notes, []
-        rig = server.device.rig
-        message = traffic.batch(rig, notes, now_ns, self.service.clock.wall_ns())
-        self._wires[rig].traffic.send(message)
+        message = server.traffic.take(now_ns, self.service.clock.wall_ns())
+        self._wires[server.device.rig].traffic.send(message)
 
     def _close(self) -> None:
         now_ns = self.service.clock.monotonic_ns()
@@ -196,7 +194,7 @@ class Edge:
         for server in self._servers:
             server.device.shut("the edge stops")
             server.close("the edge stops")
-            if server.notes:
+            if server.traffic.count:
                 self._send_traffic(server, now_ns)
         self.state_sessions()
         self.service.log.flush(now_ns)

@@ -22,7 +22,7 @@ from hilrig_modbus_edge.pdu import answer, exception
 from hilrig_modbus_edge.registers import UNIT_IDS
 from hilrig_modbus_edge.throttle import Throttle
 from hilrig_modbus_edge.tls import TlsGate, TlsPolicy
-from hilrig_modbus_edge.traffic import Note
+from hilrig_modbus_edge.traffic import TrafficRecord
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters
@@ -57,8 +57,7 @@ class RigServer:
         self.device = device
         self.limits = limits
         self.counters = counters
-        self.notes: list[Note] = []
-        """Requests since they were last taken."""
+        self.traffic = TrafficRecord(device.rig)
         self.connections: set[Connection] = set()
         self.gates: set[TlsGate] = set()
         """Connections whose TLS handshake is going on."""
@@ -119,6 +118,14 @@ class RigServer:
         times = self._throttle.count((host, reason), self.monotonic_ns())
         if times:
             self.device.connection_refused(f"{host}:{port}", reason, times)
+
+    def count_malformed(self, client: Client, why: str) -> None:
+        """Count a connection that is closed for what it sent, and say so, once in a while."""
+        self.counters.malformed += 1
+        times = self._throttle.count((client.host.address, "malformed"), self.monotonic_ns())
+        if times:
+            more = f" ({times} times)" if times > 1 else ""
+            logger.warning("rig %s: %s sent no Modbus: %s%s", self.device.rig, client.address, why, more)
 
     def close_idle(self, now_ns: int) -> None:
         """Close the connections that have asked for nothing for too long; ns, monotonic clock."""
@@ -264,13 +271,12 @@ class Connection(asyncio.BufferedProtocol):
         reply = answer(self._device, client, pdu, arrived_ns) if unit in UNIT_IDS else exception(pdu[0], _TARGET_SILENT)
         code = reply[1] if reply[0] & 0x80 else 0
         server = self._server
-        server.notes.append((pdu, arrived_ns, self._monotonic_ns(), code, client.address))
+        server.traffic.note(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
         server.counters.requests += 1
         return HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
 
     def _close_malformed(self, why: str) -> None:
-        self._server.counters.malformed += 1
-        logger.warning("rig %s: %s sent no Modbus: %s", self._device.rig, self.client.address, why)
+        self._server.count_malformed(self.client, why)
         self._reason = f"it sent no Modbus: {why}"
         # Not aborted: the answers to what was good before go out.
         self._transport.close()

@@ -1,6 +1,7 @@
-"""What controllers asked of a rig, and when: a note a request, taken apart and encoded in batches.
+"""What controllers asked of a rig, and when: each request noted as it is answered, sent in batches.
 
-The request path pays for one tuple. Requests are kept as the bytes that came.
+A note costs about a microsecond, and it is paid at the request: encoding a whole batch at once would hold up whoever
+asks at that moment.
 """
 
 from typing import Final
@@ -8,31 +9,46 @@ from typing import Final
 from hilrig_schemas import ModbusTraffic
 
 MOST: Final = 256
-"""Notes after which a batch is due though its time has not come: no batch takes long to encode."""
+"""Requests after which a batch is due though its time has not come: memory stays bounded under a flood."""
 _SINGLE: Final = frozenset({0x05, 0x06, 0x16})
 """Functions whose third word is a value, not a count."""
-_ADDRESSED: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
+_COUNTED: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x0F, 0x10, 0x17})
 
 
-Note = tuple[bytes, int, int, int, str]
-"""One request: its PDU, when it arrived and was answered (ns, monotonic clock), the exception code of the answer or 0,
-and the controller's address. A plain tuple, for one is made with each request."""
+class TrafficRecord:
+    """The requests of one rig since they were last taken."""
 
+    def __init__(self, rig: str) -> None:
+        self._rig = rig
+        self._begin()
 
-def batch(rig: str, notes: list[Note], closed_ns: int, wall_ns: int) -> ModbusTraffic:
-    """The message of some requests; `closed_ns` of the edge's monotonic clock, `wall_ns` the same instant."""
-    message = ModbusTraffic(rig=rig, closed_ns=closed_ns, wall_ns=wall_ns)
-    add = message.requests.add
-    for pdu, arrived_ns, answered_ns, exception, controller in notes:
-        function = pdu[0]
-        addressed = function in _ADDRESSED and len(pdu) >= 5
-        add(
-            function=function,
-            address=int.from_bytes(pdu[1:3], "big") if addressed else 0,
-            count=(1 if function in _SINGLE else int.from_bytes(pdu[3:5], "big")) if addressed else 0,
-            arrived_ns=arrived_ns,
-            answered_ns=answered_ns,
-            exception=exception,
-            controller=controller,
-        )
-    return message
+    def _begin(self) -> None:
+        self.count = 0
+        self._message = ModbusTraffic(rig=self._rig)
+        self._add = self._message.requests.add
+
+    def note(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
+        """Note one request: PDU, when it came and was answered (monotonic clock), exception code or 0, who asked."""
+        request = self._add()
+        function = request.function = pdu[0]
+        if len(pdu) >= 5:
+            if function in _COUNTED:
+                request.address = (pdu[1] << 8) | pdu[2]
+                request.count = (pdu[3] << 8) | pdu[4]
+            elif function in _SINGLE:
+                request.address = (pdu[1] << 8) | pdu[2]
+                request.count = 1
+        request.arrived_ns = arrived_ns
+        request.answered_ns = answered_ns
+        if exception:
+            request.exception = exception
+        request.controller = controller
+        self.count += 1
+
+    def take(self, closed_ns: int, wall_ns: int) -> ModbusTraffic:
+        """What was noted, closed at `closed_ns` of the monotonic and `wall_ns` of the wall clock; begin anew."""
+        message = self._message
+        message.closed_ns = closed_ns
+        message.wall_ns = wall_ns
+        self._begin()
+        return message

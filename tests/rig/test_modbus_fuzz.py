@@ -1,0 +1,197 @@
+"""Random and mutated frames over many connections: every request gets its answer, nobody else notices.
+
+`HILRIG_FUZZ_FRAMES` sets how many frames; the seed is printed, and `HILRIG_FUZZ_SEED` repeats it.
+"""
+
+import json
+import os
+import random
+import socket
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clients import build_c_client
+from edge_rig import HEADER
+from labs import RunningLab, write_lab
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+FRAMES = int(os.environ.get("HILRIG_FUZZ_FRAMES", "200000"))
+SEED = int(os.environ.get("HILRIG_FUZZ_SEED", random.SystemRandom().randrange(2**32)))
+
+READER = """
+import json, select, socket, sys, time
+client = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+times, late = [], []
+print("ready", flush=True)
+while True:
+    begin = time.perf_counter()
+    if select.select([0], [], [], 0.002)[0]:
+        break
+    asked = time.perf_counter()
+    late.append(asked - begin - 0.002)
+    client.sendall(bytes.fromhex("000100000006010300000008"))
+    answer = client.recv(300)
+    if len(answer) != 25:
+        sys.exit(f"wrong answer: {answer.hex()}")
+    times.append(time.perf_counter() - asked)
+p99_ms = lambda values: sorted(values)[int(0.99 * len(values))] * 1e3
+print(json.dumps({"reads": len(times), "p99_ms": p99_ms(times), "machine_late_p99_ms": p99_ms(late)}))
+"""
+
+
+def random_pdu(chance: random.Random) -> bytes:
+    """A request that may be right, nearly right, or not at all."""
+    function = chance.choice((1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43, chance.randrange(256)))
+    address = chance.choice((0, 1, 3, 4, 7, 8, 35, 36, 99, 100, 101, 102, 0xFFFF, chance.randrange(65536)))
+    count = chance.choice((0, 1, 2, 4, 8, 36, 121, 123, 125, 126, 2000, 0xFFFF, chance.randrange(65536)))
+    if function in (1, 2, 3, 4, 5, 6):
+        return struct.pack(">BHH", function, address, count)
+    if function in (15, 16):
+        data = chance.randbytes(chance.choice((2, 8, 2 * min(count, 123), chance.randrange(247))))
+        return struct.pack(">BHHB", function, address, count, len(data) & 0xFF) + data
+    if function == 23:
+        data = chance.randbytes(chance.choice((2, 8, chance.randrange(243))))
+        return struct.pack(">BHHHHB", 23, address, count, chance.choice((0, 4)), len(data) // 2, len(data)) + data
+    if function == 43:
+        return bytes((43, chance.choice((13, 14)), chance.randrange(6), chance.randrange(256)))
+    return bytes((function,)) + chance.randbytes(chance.randrange(253))
+
+
+def mutated(chance: random.Random, frame: bytes) -> bytes:
+    """A frame with some bytes changed, left out, or added."""
+    data = bytearray(frame)
+    for _ in range(chance.randrange(1, 4)):
+        where = chance.randrange(len(data))
+        match chance.randrange(4):
+            case 0:
+                data[where] ^= 1 << chance.randrange(8)
+            case 1:
+                data[where] = chance.randrange(256)
+            case 2 if len(data) > 1:
+                del data[where]
+            case _:
+                data[where:where] = chance.randbytes(chance.randrange(1, 5))
+    return bytes(data)
+
+
+def random_stream(chance: random.Random, frames: int) -> bytes:
+    """What one connection sends; most of it has a good header, for behind a bad one nothing is read."""
+    parts = []
+    for _ in range(frames):
+        pdu = random_pdu(chance)[:253]
+        unit = chance.choice((0, 1, 1, 1, 255, chance.randrange(256)))
+        frame = HEADER.pack(chance.randrange(65536), 0, len(pdu) + 1, unit) + pdu
+        kind = chance.random()
+        if kind < 0.35 and len(frame) > 9:
+            # Mutated behind the header, which keeps its length.
+            body = mutated(chance, frame[7:])[:253]
+            frame = HEADER.pack(chance.randrange(65536), 0, len(body) + 1, unit) + body if body else frame
+        elif kind < 0.352:
+            frame = mutated(chance, frame)
+        elif kind < 0.353:
+            frame = chance.randbytes(chance.randrange(1, 300))
+        parts.append(frame)
+    stream = b"".join(parts)
+    return stream[: chance.randrange(len(stream))] if chance.random() < 0.1 else stream
+
+
+def requests_in(stream: bytes) -> list[tuple[int, int, int]]:
+    """Transaction, unit and function of what is a request, up to where the stream is no Modbus any more."""
+    found = []
+    while len(stream) >= 8:
+        transaction, protocol, length, unit = HEADER.unpack(stream[:7])
+        if protocol != 0 or not 2 <= length <= 254 or len(stream) < 6 + length:
+            break
+        found.append((transaction, unit, stream[7]))
+        stream = stream[6 + length :]
+    return found
+
+
+def talk(port: int, stream: bytes) -> bytes:
+    """Send it all, and read until the edge closes."""
+    answers = b""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        try:
+            client.sendall(stream)
+            client.shutdown(socket.SHUT_WR)
+            while part := client.recv(65536):
+                answers += part
+        except OSError:
+            # It closed on what is no Modbus while more was on its way.
+            pass
+    return answers
+
+
+def resident_mib(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@pytest.mark.timeout(600)
+def test_random_frames_hurt_nobody(tmp_path: Path) -> None:
+    print(f"HILRIG_FUZZ_SEED={SEED}")
+    chance = random.Random(SEED)
+    controller = build_c_client()
+    # Made beforehand: what is measured is the edge under them, not a machine that is busy making them.
+    streams: list[tuple[int, bytes]] = []
+    while sum(frames for frames, _ in streams) < FRAMES:
+        frames = chance.randrange(1, 400)
+        streams.append((frames, random_stream(chance, frames)))
+    with RunningLab(write_lab(tmp_path, rigs=2)) as lab:
+        fuzzed, other = (lab.lab.ports[name] for name in ("rig1", "rig2"))
+        edge = lab.service_pid("edge")
+        reader = subprocess.Popen(
+            [sys.executable, "-c", READER, str(fuzzed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "ready\n"
+        looping = subprocess.Popen(
+            [controller, "127.0.0.1", str(other), "600", "20"], stdout=subprocess.PIPE, stdin=subprocess.PIPE
+        )
+        sent = 0
+        before_mib = None
+        try:
+            for frames, stream in streams:
+                answers = talk(fuzzed, stream)
+                asked, answered = requests_in(stream), requests_in(answers)
+                assert len(answered) <= len(asked)
+                for (transaction, unit, function), (t, u, f) in zip(asked, answered, strict=False):
+                    assert (t, u, f & 0x7F) == (transaction, unit, function & 0x7F)
+                if not has_garbage(stream, asked):
+                    assert len(answered) == len(asked), f"{len(asked)} requests, {len(answered)} answers"
+                sent += frames
+                if before_mib is None and sent > FRAMES / 4:
+                    before_mib = resident_mib(edge)
+            assert reader.poll() is None
+            out, _ = reader.communicate("\n", timeout=10)
+            healthy = json.loads(out)
+            assert looping.poll() is None, "the other rig's controller was disturbed"
+        finally:
+            reader.kill()
+            looping.kill()
+            reader.wait()
+            looping.wait()
+        assert lab.service_pid("edge") == edge
+        assert before_mib is not None
+        grown_mib = resident_mib(edge) - before_mib
+        print(f"{sent} frames, {len(streams)} connections, neighbour {healthy}, memory {grown_mib:+.1f} MiB")
+        # A read waits for two processes to wake up: what a busy machine is late with that is not the edge's.
+        assert healthy["p99_ms"] < 5 + 2 * healthy["machine_late_p99_ms"]
+        assert grown_mib < 16
+        assert "Traceback" not in lab.output()
+        assert "ERROR" not in lab.output()
+        eventually(lambda: lab.stop() == 0)
+
+
+def has_garbage(stream: bytes, asked: list[tuple[int, int, int]]) -> bool:
+    """Whether something stands behind the requests: it may reset the connection, and answers get lost with it."""
+    used = 0
+    for _ in asked:
+        used += 6 + struct.unpack_from(">H", stream, used + 4)[0]
+    return used < len(stream)
