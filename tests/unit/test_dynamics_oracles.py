@@ -40,15 +40,17 @@ def random_state(rng: np.random.Generator, arm: ArmParameters) -> tuple[Floats, 
 class MuJoCo:
     """Forward dynamics and tool pose by MuJoCo."""
 
-    def __init__(self, arm: ArmParameters, payload: float = 0.0) -> None:
+    def __init__(self, arm: ArmParameters) -> None:
         self._arm = arm
         self.model = mujoco.MjModel.from_xml_string(urdf(RigParameters(arm=arm)))
         self.model.opt.gravity[:] = (0, 0, -9.81)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
         self.model.dof_armature[3] = arm.j4
         self._tool = self.model.body("tool").id
-        self.model.body_mass[self._tool] = POINT_MASS + payload
         self.data = mujoco.MjData(self.model)
+
+    def hold(self, payload: float) -> None:
+        self.model.body_mass[self._tool] = POINT_MASS + payload
 
     def acceleration(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
         self.data.qpos[:], self.data.qvel[:], self.data.qfrc_applied[:] = position, velocity, effort
@@ -65,13 +67,15 @@ class MuJoCo:
 class Pinocchio:
     """The same by Pinocchio."""
 
-    def __init__(self, arm: ArmParameters, payload: float = 0.0) -> None:
+    def __init__(self, arm: ArmParameters) -> None:
         self._arm = arm
         self.model: Any = pinocchio.buildModelFromXML(urdf(RigParameters(arm=arm)))
         self.model.armature = np.array([0.0, 0.0, 0.0, arm.j4])
-        tool = self.model.inertias[4]
-        self.model.inertias[4] = pinocchio.Inertia(tool.mass + payload, tool.lever, tool.inertia)
         self.data = self.model.createData()
+
+    def hold(self, payload: float) -> None:
+        empty = self.model.inertias[4]
+        self.model.inertias[4] = pinocchio.Inertia(POINT_MASS + payload, empty.lever, empty.inertia)
 
     def acceleration(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
         pinocchio.forwardKinematics(self.model, self.data, position)
@@ -99,10 +103,14 @@ class Pinocchio:
 def test_reduced_form_and_recursion_accelerate_as_the_engine_does(engine: type[MuJoCo] | type[Pinocchio]) -> None:
     rng = np.random.default_rng(20211209)
     worst_reduced = worst_general = 0.0
-    for _ in range(CASES):
-        arm, payload = random_arm(rng), rng.uniform(0, 2)
+    for case in range(CASES):
+        if case % 10 == 0:
+            arm = random_arm(rng)
+            peer = engine(arm)
+        payload = rng.uniform(0, 2)
+        peer.hold(payload)
         position, velocity, effort = random_state(rng, arm)
-        expected = engine(arm, payload).acceleration(position, velocity, effort)
+        expected = peer.acceleration(position, velocity, effort)
         scale = np.linalg.norm(expected)
         reduced = forward_dynamics(arm, position, velocity, effort, payload)
         links, wrench = newton_euler.scara_links(arm, payload), newton_euler.scara_wrench(arm)
@@ -127,9 +135,10 @@ def test_reduced_form_is_the_recursion_with_point_masses() -> None:
 
 def test_recursion_with_any_masses_and_inertias_is_pinocchios() -> None:
     rng = np.random.default_rng(5)
-    for _ in range(CASES):
-        arm = random_arm(rng)
-        model = Pinocchio(arm).model
+    for case in range(CASES):
+        if case % 10 == 0:
+            arm = random_arm(rng)
+            model = Pinocchio(arm).model
         links = []
         for index, link in enumerate(newton_euler.scara_links(arm)):
             root = rng.normal(size=(3, 3))
@@ -148,7 +157,7 @@ def test_recursion_with_any_masses_and_inertias_is_pinocchios() -> None:
 @pytest.mark.parametrize("engine", [MuJoCo, Pinocchio])
 def test_tool_is_where_the_engine_has_it(engine: type[MuJoCo] | type[Pinocchio]) -> None:
     rng = np.random.default_rng(7)
-    for _ in range(100):
+    for _ in range(20):
         arm = random_arm(rng)
         position, _, _ = random_state(rng, arm)
         x, y, z, yaw = kinematics.forward(arm, position)
@@ -160,7 +169,7 @@ def test_tool_is_where_the_engine_has_it(engine: type[MuJoCo] | type[Pinocchio])
 
 def test_jacobian_is_pinocchios() -> None:
     rng = np.random.default_rng(11)
-    for _ in range(100):
+    for _ in range(20):
         arm = random_arm(rng)
         position, _, _ = random_state(rng, arm)
         np.testing.assert_allclose(kinematics.jacobian(arm, position), Pinocchio(arm).jacobian(position), atol=1e-12)

@@ -100,22 +100,22 @@ def inverse_dynamics(
         offset = link.origin + (link.axis * value if link.prismatic else 0.0)
         into = turn.T
         # (7), (12): the new origin, as a point of the parent.
-        moved = np.cross(omega_dot, offset) + np.cross(omega, np.cross(omega, offset)) + origin_acceleration
+        moved = _cross(omega_dot, offset) + _cross(omega, _cross(omega, offset)) + origin_acceleration
         origin_acceleration = into @ moved
         omega, omega_dot = into @ omega, into @ omega_dot
         if link.prismatic:
             # (11), (12).
-            origin_acceleration = origin_acceleration + 2 * np.cross(omega, link.axis * rate) + link.axis * second
+            origin_acceleration = origin_acceleration + 2 * _cross(omega, link.axis * rate) + link.axis * second
         else:
             # (5), (6).
-            omega_dot = omega_dot + np.cross(omega, link.axis * rate) + link.axis * second
+            omega_dot = omega_dot + _cross(omega, link.axis * rate) + link.axis * second
             omega = omega + link.axis * rate
         # (8)–(10).
         centre_acceleration = (
-            np.cross(omega_dot, link.centre) + np.cross(omega, np.cross(omega, link.centre)) + origin_acceleration
+            _cross(omega_dot, link.centre) + _cross(omega, _cross(omega, link.centre)) + origin_acceleration
         )
         force = link.mass * centre_acceleration
-        moment = link.inertia @ omega_dot + np.cross(omega, link.inertia @ omega)
+        moment = link.inertia @ omega_dot + _cross(omega, link.inertia @ omega)
         world_from_link = world_from_link @ turn
         passed.append((turn, offset, force, moment))
     # The tool pushes back on the environment.
@@ -127,13 +127,13 @@ def inverse_dynamics(
         turn, offset, force, moment = passed[index]
         # (13), (14): about this link's origin, in its axes.
         here_force = carried_force + force
-        here_moment = moment + carried_moment + np.cross(link.centre, force)
+        here_moment = moment + carried_moment + _cross(link.centre, force)
         # (15), (16), with the drive and friction of the joint itself.
         along = here_force if link.prismatic else here_moment
         efforts[index] = along @ link.axis + link.drive_inertia * qdd[index] + link.friction * qd[index]
         # To the parent's origin and axes.
         carried_force = turn @ here_force
-        carried_moment = turn @ here_moment + np.cross(offset, carried_force)
+        carried_moment = turn @ here_moment + _cross(offset, carried_force)
     return efforts
 
 
@@ -164,3 +164,9 @@ def _rotation(axis: Floats, angle: float) -> Floats:
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """a × b, (3,); of three numbers each, several times as fast as the general one."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
