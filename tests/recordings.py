@@ -4,10 +4,12 @@ The simulation ticks on its own clock and the edge stamps with another one, year
 controller does, and when, is scripted; so a test knows every stage of every loop without asking the code under test.
 """
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
+from types import MappingProxyType
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -24,6 +26,8 @@ START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
 EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
 MS = 1_000_000
+SHOWN = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""From rad and m to the registers' degrees and mm."""
 CONTROLLER = "192.0.2.7:40001"
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
@@ -48,6 +52,10 @@ class Script:
     """Step at whose start the simulation stands still, and for how long."""
     edge_stalls: Mapping[float, float] = field(default_factory=dict)
     """Time, s, at which the edge stands still, and for how long."""
+    law: str = "wave"
+    """What the torques are: a `wave`, or `feedback` on the positions read."""
+    behind: int = 0
+    """With feedback: how many polls ago the positions were read that it uses."""
     delayed_ack_ms: float = 0.0
     """What the request that follows a write at once waits for a delayed acknowledgement."""
     lost_transport: int = 0
@@ -138,8 +146,8 @@ class _Write:
     command: TorqueCommand
     arrives_ns: int
     """At the simulation."""
-    read: tuple[int, int]
-    """Arrived and answered, of the read before it."""
+    asked_ns: int
+    """Arrival of the read before it at the edge, on the edge's clock."""
 
 
 def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int, int, int]]:
@@ -180,20 +188,22 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
     begin_ns, seq = round(30 * MS), 0
     seen: tuple[int, int] | None = None
+    seen_before: deque[np.ndarray] = deque(maxlen=2 + script.behind)
     while begin_ns < script.seconds * 1e9 - 100 * MS:
         if script.order == "read-compute-write":
-            read_ns = edge_free(max(begin_ns + network_ns, free_ns))
+            asked_ns = max(begin_ns + network_ns, free_ns)
+            read_ns = edge_free(asked_ns)
             seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
             # A loop that reads right after it wrote waits for the acknowledgement of its write.
             write_ns = read_ns + 2 * network_ns + delay_ns + random.randrange(50_000)
         else:
             write_ns = begin_ns + network_ns
-        write_ns = edge_free(write_ns)
-        sent_ns = write_ns + random.randrange(20_000, 60_000) + round(script.injected_command_ms * MS)
+        sent_ns = edge_free(write_ns) + random.randrange(20_000, 60_000) + round(script.injected_command_ms * MS)
         if seen is not None and seen[0] >= 0:
             seq += 1
             index, served_ns = seen
-            effort = 3 * np.sin(0.9 * seq / 50 + np.arange(4))
+            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * SHOWN, 2))
+            effort = _effort(script, seen_before, write_ns / 1e9, seq)
             command = TorqueCommand(
                 seq=seq,
                 effort=effort,
@@ -208,28 +218,40 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
                 command_injected_ns=round(script.injected_command_ms * MS),
                 wall_ns=sent_ns + START_WALL_NS,
             )
-            yield _Write(command, sent_ns + random.randrange(150_000, 250_000), (served_ns, write_ns))
+            yield _Write(command, sent_ns + random.randrange(150_000, 250_000), stamp(asked_ns))
         free_ns = write_ns + 20_000 + round(script.delayed_ack_ms * MS)
         done_ns = write_ns + network_ns
         if script.order == "write-read":
-            read_ns = done_ns + network_ns
+            asked_ns = done_ns + network_ns
+            read_ns = edge_free(asked_ns)
             seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
             done_ns = read_ns + network_ns + delay_ns
         begin_ns = max(done_ns, begin_ns + round(script.poll_ms * MS))
+
+
+def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int) -> np.ndarray:
+    """Torques by a law: a wave that knows nothing of the arm, or feedback on what was read some polls ago."""
+    if script.law == "wave" or len(seen) < 2 + script.behind:
+        return 3 * np.sin(0.9 * seq / 50 + np.arange(4))
+    newest, older = seen[-1 - script.behind], seen[-2 - script.behind]
+    wanted = position(seconds) * SHOWN
+    return np.array([0.5, 0.4, 0.3, 0.2]) * (wanted - newest) - 0.6 * (newest - older)
 
 
 def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
     batch = ModbusTraffic(rig=rig)
     for write in writes:
         command = write.command
-        for function, address, at_ns in ((3, 4, command.state_served_ns), (16, 0, command.write_arrived_ns)):
+        read = (3, 4, write.asked_ns, command.state_served_ns + 15_000)
+        wrote = (16, 0, command.write_arrived_ns, command.write_arrived_ns + 15_000)
+        for function, address, arrived_ns, answered_ns in (read, wrote):
             batch.requests.append(
                 ModbusRequest(
                     function=function,
                     address=address,
                     count=4,
-                    arrived_ns=at_ns,
-                    answered_ns=at_ns + 15_000,
+                    arrived_ns=arrived_ns,
+                    answered_ns=answered_ns,
                     controller=CONTROLLER,
                 )
             )
@@ -251,8 +273,14 @@ def write(
     session: str = "20260101T000000Z-rig1-abcd",
     rig: str = "rig1",
     finish: bool = True,
+    missing: Mapping[str, Collection[int]] = MappingProxyType({}),
+    arrival_lag_ns: int = 0,
 ) -> Path:
-    """Write messages as the recorder does; without `finish` the file has no end, as after a kill."""
+    """Write messages as the recorder does.
+
+    Without `finish` the file has no end, as after a kill. `missing` leaves out messages by topic and sequence; the
+    second half of the messages reaches the recorder `arrival_lag_ns` late.
+    """
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=64 * 1024, compression=compression)
         writer.start()
@@ -281,11 +309,14 @@ def write(
         writer.add_metadata("hilrig.config", configuration)
         writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
         sequences = dict.fromkeys(RECORDED, 0)
-        for one in made:
+        for number, one in enumerate(made):
             sequences[one.topic] += 1
+            if sequences[one.topic] in missing.get(one.topic, ()):
+                continue
+            late_ns = 3 * MS + (arrival_lag_ns if number > len(made) // 2 else 0)
             writer.add_message(
                 channels[one.topic],
-                log_time=one.publish_wall_ns + 3 * MS,
+                log_time=one.publish_wall_ns + late_ns,
                 publish_time=one.publish_wall_ns,
                 sequence=sequences[one.topic],
                 data=one.message.SerializeToString(),

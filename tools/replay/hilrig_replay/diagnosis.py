@@ -15,6 +15,9 @@ from hilrig_replay.columns import Rows
 from hilrig_replay.run import Run
 
 MS: Final = 1e6
+EDGE_STALL_NS: Final = 5_000_000
+"""An answer that takes longer is not its own work any more."""
+SAME_STALL_NS: Final = 500_000_000
 WINDOW_S: Final = 10.0
 WINDOWS: Final = 6
 """What needs the content of messages looks at so many windows of a run, evenly spread, whatever its length."""
@@ -62,6 +65,10 @@ class Evidence:
         return self._windows
 
 
+_SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""From rad and m to the registers' degrees and mm."""
+
+Floats = NDArray[np.float64]
 Rule = Callable[[Evidence], Finding | None]
 
 
@@ -87,21 +94,29 @@ def simulation_stall(evidence: Evidence) -> Finding | None:
 
 
 def edge_stall(evidence: Evidence) -> Finding | None:
-    """Writes that waited in the edge before they left as commands."""
-    waits = evidence.samples["edge"]
-    if not len(waits):
+    """Requests that waited in the edge for their answer, or writes before they left as commands."""
+    waits = [(evidence.samples["edge"], evidence.run.time_ns(evidence.samples))]
+    waits += [
+        (requests["answered_ns"] - requests["arrived_ns"], evidence.run.time_ns(requests))
+        for _, _, requests in evidence.windows()
+    ]
+    waited_ns = np.concatenate([wait for wait, _ in waits])
+    if not len(waited_ns):
         return None
-    limit = max(5 * MS, 20 * float(np.median(waits)))
-    late = np.flatnonzero(waits > limit)
+    late = np.flatnonzero(waited_ns > max(EDGE_STALL_NS, 20 * float(np.median(waited_ns))))
     if not late.size:
         return None
-    worst = int(late[np.argmax(waits[late])])
-    at_s = float(evidence.run.time_s(evidence.samples[worst : worst + 1])[0])
+    at_ns = np.concatenate([at for _, at in waits])[late]
+    worst = int(np.argmax(waited_ns[late]))
+    longest_ms = float(waited_ns[late][worst] / MS)
+    # Whatever waited for the same stall waited at the same time.
+    stalls = 1 + int((np.diff(np.sort(at_ns)) > SAME_STALL_NS).sum())
+    at_s = float(at_ns[worst] / 1e9)
     return Finding(
         "edge_stall",
-        f"the Modbus edge stood still {_times(len(late))}, longest {waits[worst] / MS:.0f} ms at {at_s:.1f} s: "
-        "a write that had arrived waited there",
-        {"stalls": len(late), "longest_ms": float(waits[worst] / MS), "at_s": at_s},
+        f"the Modbus edge stood still {_times(stalls)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: what had arrived "
+        "waited there, for its host was too busy",
+        {"stalls": stalls, "longest_ms": longest_ms, "at_s": at_s},
     )
 
 
@@ -210,32 +225,33 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
 
 def previous_poll(evidence: Evidence) -> Finding | None:
     """Torques that follow the state of the poll before the one just served: a pipeline of one cycle."""
-    just_read: list[float] = []
-    before: list[float] = []
-    for states, commands, _ in evidence.windows():
-        residuals = _residuals(states, commands)
-        just_read.extend(residual for residual, _ in residuals)
-        before.extend(residual for _, residual in residuals)
-    if len(before) < 3:
+    found = [residuals for states, commands, _ in evidence.windows() for residuals in _residuals(states, commands)]
+    if len(found) < 3:
         return None
-    newest, previous = float(np.median(just_read)), float(np.median(before))
-    if previous > 0.05 or newest < 4 * max(previous, 1e-4):
+    newest, previous = np.median(np.array(found), axis=0)
+    ratio = float(np.median([just_read / max(before, 1e-12) for just_read, before in found]))
+    if previous > 0.05 or ratio < 3:
         return None
     cycle = evidence.cycle_ns
     return Finding(
         "previous_poll",
-        f"the torques follow the positions of the poll before (unexplained: {previous:.1%}) and not those just read "
-        f"({newest:.0%}): the controller works a cycle behind, which adds {cycle / MS:.1f} ms to what is measured here",
-        {"unexplained_previous": previous, "unexplained_newest": newest, "added_ms": cycle / MS},
+        f"the torques follow the positions of the poll before, which explain them {ratio:.0f} times better than those "
+        f"just read: the controller works a cycle behind, which adds {cycle / MS:.1f} ms to what is measured here",
+        {
+            "unexplained_previous": float(previous),
+            "unexplained_newest": float(newest),
+            "ratio": ratio,
+            "added_ms": cycle / MS,
+        },
     )
 
 
-def _residuals(states: Rows, commands: Rows, length: int = 80) -> list[tuple[float, float]]:
+def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[float, float]]:
     """What a linear law leaves unexplained of the torques, given the positions just read, and those of a poll before.
 
-    The law has the positions of two polls (so a derivative is in it) and a slow change in time, fitted anew over every
-    `length` commands. Positions are rounded as the registers round them: that noise is in the controller's torques,
-    and tells which poll they came from.
+    The law of a joint has its positions of two polls (so a derivative is in it) and a slow change in time, and is
+    fitted anew over every `length` commands. Positions are rounded as the registers round them: that noise is in the
+    controller's torques, and tells which poll they came from.
     """
     commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
     if len(commands) < length or not len(states):
@@ -246,25 +262,29 @@ def _residuals(states: Rows, commands: Rows, length: int = 80) -> list[tuple[flo
     # Polls that saw the same state say nothing about which one was used.
     fresh = np.concatenate(([True], np.diff(commands["basis_step"].astype(np.int64)) > 0))
     commands, at = commands[fresh], at[fresh]
-    scale = np.degrees(np.array([1.0, 1.0, 0.0, 1.0])) + np.array([0.0, 0.0, 1000.0, 0.0])
-    read = np.round(states["position"][at] * scale, 2)
+    read = np.round(states["position"][at] * _SHOWN, 2)
+    slow = np.vander(np.linspace(-1, 1, length), 4)
     found = []
     for start in range(2, len(commands) - length + 1, length):
         rows = np.arange(start, start + length)
         torques = commands["effort"][rows]
-        slow = np.vander(np.linspace(-1, 1, length), 4)
         spread = ((torques - torques.mean(axis=0)) ** 2).sum()
         if spread < 1e-9:
             continue
-        left = []
-        for lag in (0, 1):
-            law = np.hstack(
-                (read[rows - lag] - read[rows - lag].mean(axis=0), read[rows - lag] - read[rows - lag - 1], slow)
-            )
-            fitted, *_ = np.linalg.lstsq(law, torques, rcond=None)
-            left.append(float(((torques - law @ fitted) ** 2).sum() / spread))
+        left = [
+            sum(_unexplained(read[rows - lag, j], read[rows - lag - 1, j], slow, torques[:, j]) for j in range(4))
+            / spread
+            for lag in (0, 1)
+        ]
         found.append((left[0], left[1]))
     return found
+
+
+def _unexplained(newer: Floats, older: Floats, slow: Floats, torque: Floats) -> float:
+    """Sum of squares that the best law leaves of a joint's torque."""
+    law = np.column_stack((newer - newer.mean(), newer - older, slow))
+    fitted, *_ = np.linalg.lstsq(law, torque, rcond=None)
+    return float(((torque - law @ fitted) ** 2).sum())
 
 
 RULES: Final[tuple[Rule, ...]] = (

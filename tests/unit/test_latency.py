@@ -1,0 +1,172 @@
+"""Loop latency: the stages add up, nothing is negative, and what was scripted is what is found."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from hilrig_replay.latency import STAGES, LatencyReport, Matcher, match, measure
+from hilrig_replay.latency_plot import save_plot
+from hilrig_replay.run import open_run
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import JointState, TorqueCommand
+from recordings import MS, Script, make, record, write
+
+
+def measured(folder: Path, script: Script) -> LatencyReport:
+    return measure(open_run(record(folder / "run.mcap", script)))
+
+
+def by_hand(path: Path) -> dict[tuple[int, int], dict[str, int]]:
+    """Stages out of the raw messages, with nothing but the stock reader and dictionaries."""
+    states, commands = [], {}
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            if channel.topic == "/state":
+                states.append(JointState.FromString(message.data))
+            elif channel.topic == "/command":
+                command = TorqueCommand.FromString(message.data)
+                commands[command.session, command.seq] = command
+    sampled = {(state.incarnation, state.step): state.sampled_ns for state in states}
+    found = {}
+    for state in states:
+        if not state.basis_step:
+            continue
+        command = commands[state.session, state.command_seq]
+        loop = state.sampled_ns - sampled[command.basis_incarnation, command.basis_step]
+        stages = {
+            "register_wait": command.state_served_ns - command.state_arrived_ns - command.state_injected_ns,
+            "controller": command.write_arrived_ns - command.state_served_ns,
+            "edge": command.sent_ns - command.write_arrived_ns - command.command_injected_ns,
+            "injected": command.state_injected_ns + command.command_injected_ns,
+            "tick_wait": state.sampled_ns - state.command_arrived_ns,
+        }
+        found[state.incarnation, state.step] = {"loop": loop, **stages, "transport": loop - sum(stages.values())}
+    return found
+
+
+@pytest.mark.parametrize("delay_ms", [0, 10, 30, 60])
+@pytest.mark.parametrize("poll_ms", [5, 20, 33, 100])
+def test_what_was_scripted_is_found(tmp_path: Path, delay_ms: float, poll_ms: float) -> None:
+    script = Script(seconds=8.0, poll_ms=poll_ms, delay_ms=delay_ms)
+    report = measured(tmp_path, script)
+    assert report.loop_ms is not None
+    assert report.stages_ms["controller"].p50 == pytest.approx(delay_ms + 2 * script.network_ms, abs=1.0)
+    # A state waits for the poll, and a command for the tick: at most two steps beyond what the controller takes.
+    assert delay_ms <= report.loop_ms.p50 <= delay_ms + 2 * script.step_ms + 1
+    assert (
+        report.loop_ms.p50 % script.step_ms == pytest.approx(0, abs=0.2) or report.loop_ms.p50 % script.step_ms > 19.8
+    )
+
+
+def test_an_independent_computation_agrees_to_the_nanosecond(tmp_path: Path) -> None:
+    script = Script(seconds=6.0, poll_ms=7.0, injected_state_ms=4.0, injected_command_ms=3.0)
+    path = record(tmp_path / "run.mcap", script)
+    expected = by_hand(path)
+    table = measure(open_run(path)).table
+    assert len(table) == len(expected) > 200
+    for row in table:
+        assert {name: int(row[name]) for name in ("loop", *STAGES)} == expected[
+            int(row["incarnation"]), int(row["step"])
+        ]
+
+
+def test_stages_add_up_exactly_and_none_is_negative(tmp_path: Path) -> None:
+    table = measured(tmp_path, Script(seconds=6.0, injected_command_ms=12.5)).table
+    assert (sum(table[stage] for stage in STAGES) == table["loop"]).all()
+    for stage in STAGES:
+        assert (table[stage] >= 0).all(), stage
+
+
+def test_blocks_of_any_size_give_the_same_samples(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0, poll_ms=3.0)))
+    whole = match(run.states, run.commands)
+    for rows in (7, 100, 1000):
+        matcher = Matcher()
+        pieces = [matcher.add(block.states, block.commands) for block in run.blocks(rows=rows)]
+        found = np.concatenate(pieces)
+        assert np.array_equal(found[np.argsort(found["step"])], whole), rows
+        assert matcher.unmatched == 0
+
+
+def test_the_report_has_what_scripts_rely_on(tmp_path: Path) -> None:
+    plain = json.loads(json.dumps(measured(tmp_path, Script(seconds=12.0)).as_dict()))
+    keys = {"p50", "p95", "p99", "p999", "max", "mean", "std"}
+    assert plain["samples"] > 500
+    assert set(plain["loop_ms"]) == keys
+    assert list(plain["stages_ms"]) == list(STAGES)
+    assert all(set(statistics) == keys for statistics in plain["stages_ms"].values())
+    assert plain["step_ms"] == 20.0
+    assert plain["lost"] == {"transport": 0, "recorder": 0}
+    assert plain["fit"] is True
+    assert plain["reasons"] == []
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (Script(seconds=12.0, lost_transport=3), "3 messages lost on the way to the recorder"),
+        (Script(seconds=12.0, lost_recorder=1), "1 message lost in the recorder"),
+        (Script(seconds=12.0, clock_steps=2), "the wall clock was set 2 times"),
+        (Script(seconds=12.0, stalls={200: 130.0}), "1 overrun of the simulation, 6 steps missed"),
+        (Script(seconds=2.0), "500 are needed for a 99th percentile"),
+    ],
+)
+def test_what_makes_a_recording_unfit_is_said(tmp_path: Path, script: Script, words: str) -> None:
+    report = measured(tmp_path, script)
+    assert not report.fit
+    assert any(words in reason for reason in report.reasons), report.reasons
+
+
+def test_a_gap_in_the_senders_numbers_is_a_loss_even_if_nobody_counted_it(tmp_path: Path) -> None:
+    script = Script(seconds=12.0)
+    made = make(script)
+    report = measure(open_run(write(tmp_path / "run.mcap", made, script=script, missing={"state": {77, 78}})))
+    assert report.lost.transport == 2
+    assert any("2 messages lost" in reason for reason in report.reasons)
+
+
+def test_a_sample_without_its_command_is_counted(tmp_path: Path) -> None:
+    script = Script(seconds=12.0)
+    run = open_run(write(tmp_path / "run.mcap", make(script), script=script))
+    used = int(run.states["command_seq"][300])
+    report = measure(open_run(write(tmp_path / "less.mcap", make(script), script=script, missing={"command": {used}})))
+    assert any("the commands of 1 sample are not in the recording" in reason for reason in report.reasons)
+
+
+def test_contradicting_stamps_are_said_and_not_hidden(tmp_path: Path) -> None:
+    script = Script(seconds=12.0)
+    made = make(script)
+    state = next(one.message for one in made if isinstance(one.message, JointState) and one.message.step == 200)
+    state.command_arrived_ns += 40 * MS
+    report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
+    assert any("came out negative: the stamps contradict each other" in reason for reason in report.reasons)
+
+
+def test_a_recorder_that_fell_behind_is_said(tmp_path: Path) -> None:
+    script = Script(seconds=12.0)
+    run = open_run(write(tmp_path / "run.mcap", make(script), script=script, arrival_lag_ns=2_500_000_000))
+    assert any("the recorder was behind by up to 2.5 s" in reason for reason in measure(run).reasons)
+
+
+def test_a_recording_without_commands_is_no_measurement(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False)))
+    with pytest.raises(InputError, match="a recording without commands: no controller wrote"):
+        measure(run)
+
+
+@pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])
+def test_the_plot_is_a_file_of_its_ending(tmp_path: Path, ending: str) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=3.0)))
+    picture = tmp_path / f"latency{ending}"
+    save_plot(measure(run), run, picture)
+    begins = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
+    assert picture.read_bytes().startswith(begins[ending])
+
+
+def test_a_plot_of_no_known_ending_is_refused(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=2.0)))
+    with pytest.raises(InputError, match=r"a picture ends in \.png, \.svg, \.pdf"):
+        save_plot(measure(run), run, tmp_path / "latency.bmp")
