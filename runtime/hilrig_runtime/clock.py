@@ -4,8 +4,6 @@ No figure of this project subtracts stamps of two clocks (docs/timing.md). Whate
 that a test can own it.
 """
 
-import ctypes
-import sys
 import time
 from typing import Final, Protocol
 
@@ -71,12 +69,3 @@ class ManualClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Move on to the deadline."""
         self.advance(max(0, deadline_ns - self._monotonic_ns))
-
-
-_PR_SET_TIMERSLACK: Final = 29
-
-
-def sharpen_timers() -> None:
-    """Ask the kernel not to round this thread's sleeps up by its default of 50 µs; only Linux does that."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)

@@ -4,7 +4,6 @@ The first signal sets the wish to stop and the loop ends itself; a second one fo
 `hilrig up` also ends when its parent is gone, which it learns from the end of its standard input.
 """
 
-import gc
 import logging
 import os
 import signal
@@ -15,15 +14,17 @@ from types import FrameType
 from typing import Final
 
 from hilrig_runtime.bus import Bus
-from hilrig_runtime.clock import sharpen_timers
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.realtime import prefer_latency
 from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
 ROUTER_RETRY_S: Final = 0.5
+CLOSES_THE_LOOP: Final = ("sim", "edge")
+"""Services whose punctuality is the product; the others may wait for their turn."""
 
 logger = logging.getLogger(__name__)
 
@@ -43,9 +44,9 @@ def run_service(
         HilrigError: the service can't start or can't go on; what it opened is closed.
     """
     logging.basicConfig(level=logging.INFO, format=f"{name}: %(levelname)s: %(message)s", stream=sys.stderr)
-    # A callback thread shares the interpreter with the loop: hand over ten times as often as by default.
-    sys.setswitchinterval(0.0005)
-    sharpen_timers()
+    if name in CLOSES_THE_LOOP:
+        # Before the bus is opened: its threads inherit it.
+        prefer_latency()
     stopping = threading.Event()
     stop_on_signals(stopping)
     if stop_with_parent:
@@ -55,8 +56,6 @@ def run_service(
     if bus is None:
         return
     with Service(name, lab, bus, instance=instance, stopping=stopping) as service:
-        gc.collect()
-        gc.freeze()
         logger.debug("running as %s", service.source)
         run(service)
 

@@ -18,6 +18,7 @@ from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.rate import Tick
+from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Service
 from hilrig_schemas import Event, LeaseRequest, topics
 
@@ -111,6 +112,7 @@ class Edge:
             await self._first_states()
             for server, listening, policy in sockets:
                 await server.listen(listening, policy)
+            freeze_garbage()
             service.ready()
             await self._tick()
         finally:

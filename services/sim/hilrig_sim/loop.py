@@ -5,7 +5,6 @@ state x_k is published with the effort that acts from now on, and only then is x
 start of its step.
 """
 
-import gc
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from hilrig_runtime.rate import Rate, Tick
+from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Service
 from hilrig_schemas import JointState, RigConfig, topics
 from hilrig_sim.commands import CommandFollower, StepTimes
@@ -45,8 +45,7 @@ def run(service: Service) -> None:
             served.enter_context(service.bus.serve(topics.CONFIG.key(lab.name, rig.name), answer))
         service.counters.rigs = len(parameters)
         rate = Rate(step_ns, service.clock)
-        gc.collect()
-        gc.freeze()
+        freeze_garbage()
         service.ready()
         stopping = service.stopping
         while not stopping.is_set():

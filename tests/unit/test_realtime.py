@@ -1,0 +1,57 @@
+"""What a process asks for its timing: granted where the system can, harmless where it can't."""
+
+import multiprocessing
+import os
+import struct
+import sys
+from multiprocessing.connection import Connection
+
+import pytest
+
+from hilrig_runtime import realtime
+
+
+def _granted(connection: Connection) -> None:
+    import ctypes
+    import platform
+    import threading
+
+    realtime.prefer_latency()
+    slices = []
+
+    def look() -> None:
+        attributes = ctypes.create_string_buffer(realtime._SCHED_ATTR.size)
+        number = realtime._SCHED_SETATTR[platform.machine()] + 1
+        ctypes.CDLL(None).syscall(number, 0, attributes, len(attributes), 0)
+        slices.append(struct.unpack_from("=IIQiIQ", attributes.raw)[5])
+
+    look()
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    slack = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)
+    connection.send((slices, slack, sys.getswitchinterval()))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has timer slack and slices")
+def test_the_thread_and_those_that_it_starts_get_short_slices_and_sharp_timers() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_granted, args=(theirs,))
+    process.start()
+    assert ours.poll(20)
+    slices, slack, interval = ours.recv()
+    process.join(10)
+    assert slack == 1
+    assert interval == pytest.approx(0.0005)
+    release = tuple(int(part) for part in os.uname().release.split(".")[:2])
+    if release >= (6, 12):
+        assert slices == [realtime.SLICE_NS, realtime.SLICE_NS]
+
+
+def test_an_unknown_machine_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "abacus")
+    interval = sys.getswitchinterval()
+    try:
+        realtime.prefer_latency()
+    finally:
+        sys.setswitchinterval(interval)
