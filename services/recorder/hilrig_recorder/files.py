@@ -132,7 +132,7 @@ class Files:
             "recorder": str(recorder),
             "log_time": str(self._clock.wall_ns()),
         }
-        self._note(file, "hilrig.loss", note)
+        self._note(file, numbered("hilrig.loss", file.notes), note)
 
     def source(self, recording: Recording, source: str, incarnation: int) -> None:
         """See `Shelf.source`."""
@@ -140,7 +140,8 @@ class Files:
         if file is None or (source, incarnation) in file.sources:
             return
         file.sources.add((source, incarnation))
-        self._note(file, "hilrig.source", {"source": source, "incarnation": str(incarnation)})
+        values = {"source": source, "incarnation": str(incarnation)}
+        self._note(file, numbered("hilrig.source", len(file.sources)), values)
         self._ask_config(recording.rig)
 
     def refuse(self, what: str) -> None:
@@ -271,7 +272,7 @@ class Files:
             "software_version": config.software_version,
             "machine": config.machine,
         }
-        self._note(file, "hilrig.config", values)
+        self._note(file, numbered("hilrig.config", len(file.configurations)), values)
         wall_ns = self._clock.wall_ns()
         lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were in force.\n"
         attachments = (
@@ -391,6 +392,11 @@ class Files:
             self._tell(Event(severity=Event.ERROR, text=text))
         elif was_full and not self._full:
             self.forget_trouble("")
+
+
+def numbered(name: str, number: int) -> str:
+    """Name of the first, second, … metadata record of a kind: names are unique in a file."""
+    return name if number == 1 else f"{name}.{number}"
 
 
 def file_name(session: str, number: int) -> str:

@@ -251,7 +251,7 @@ class _Copy:
     def _copy_metadata(self, writer: RunWriter, item: Metadata) -> None:
         self._recovery.metadata += 1
         self._has_summary |= item.name == "hilrig.summary"
-        if item.name == "hilrig.loss":
+        if item.name.startswith("hilrig.loss"):
             for name in self._notes:
                 self._notes[name] += int(item.metadata.get(name.removeprefix("lost_"), "0"))
         writer.add_metadata(item.name, item.metadata)
