@@ -1,0 +1,158 @@
+"""Recordings for other tools: what is in them is what was recorded, and the arm stands where the states say."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import recordings
+from hilrig_replay.export import TABLES, export_foxglove, export_tables, table
+from hilrig_replay.run import open_run
+from hilrig_replay.scene import rotate
+from hilrig_replay.shapes import Solid, solids_of
+from hilrig_runtime.errors import InputError
+from hilrig_sim.kinematics import forward
+from hilrig_sim.model import ArmParameters
+from labs import hilrig
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recordings.record(tmp_path_factory.mktemp("export") / "run.mcap", recordings.Script(seconds=2))
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_tables_hold_every_row_with_a_column_a_number(recording: Path, tmp_path: Path, kind: str) -> None:
+    run = open_run(recording)
+    paths = export_tables(run, tmp_path / "tables", kind)
+    assert [path.name for path in paths] == [f"{name}.{kind}" for name in TABLES]
+    read = pyarrow.csv.read_csv if kind == "csv" else pyarrow.parquet.read_table
+    states = read(paths[0])
+    assert states.num_rows == len(run.states) == 100
+    assert states["step"].to_pylist() == run.states["step"].tolist()
+    np.testing.assert_array_equal(states["position_d3"].to_numpy(), run.states["position"][:, 2])
+    np.testing.assert_array_equal(states["time_s"].to_numpy(), run.time_s(run.states))
+    assert set(states["session"].to_pylist()) == {run.session}
+    events = read(paths[2])
+    assert events["kind"].to_pylist()[0] == "SESSION_START"
+    assert read(paths[1]).num_rows == len(run.commands)
+    assert read(paths[3]).num_rows == len(run.traffic)
+
+
+def test_a_table_has_no_column_that_is_a_code(recording: Path) -> None:
+    states = table(open_run(recording), "state")
+    assert {str(states.schema.field(name).type) for name in ("session", "held_part")} == {"string"}
+
+
+def test_every_recorded_message_is_in_the_export_as_it_was(recording: Path, tmp_path: Path) -> None:
+    out = export_foxglove(open_run(recording), tmp_path / "fox.mcap")
+    topics = ["/state", "/command", "/event", "/traffic"]
+
+    def messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
+        with path.open("rb") as stream:
+            return [
+                (channel.topic, message.sequence, message.log_time, message.publish_time, message.data)
+                for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(topics=topics)
+            ]
+
+    assert messages(out) == messages(recording)
+    with recording.open("rb") as before, out.open("rb") as after:
+        one, two = make_reader(before), make_reader(after)
+        assert [item.name for item in one.iter_attachments()] == [item.name for item in two.iter_attachments()]
+        assert [item.metadata for item in one.iter_metadata()] == [item.metadata for item in two.iter_metadata()]
+
+
+def test_the_frames_lead_to_where_the_kinematics_has_the_tool(recording: Path, tmp_path: Path) -> None:
+    run = open_run(recording)
+    out = export_foxglove(run, tmp_path / "fox.mcap")
+    poses = {}
+    with out.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        frames = [message for _, _, _, message in reader.iter_decoded_messages(topics=["/tf"])]
+    assert len(frames) == len(run.states)
+    arm = ArmParameters()
+    for state, message in zip(run.states, frames, strict=True):
+        for transform in message.transforms:
+            t, r = transform.translation, transform.rotation
+            poses[transform.child_frame_id] = (
+                transform.parent_frame_id,
+                np.array([t.x, t.y, t.z]),
+                np.array([r.x, r.y, r.z, r.w]),
+            )
+        point, frame = np.zeros(3), "tool"
+        while frame != "world":
+            frame, translation, rotation = poses[frame]
+            point = rotate(rotation, point) + translation
+        expected = forward(arm, state["position"].reshape(4, 1))[:3, 0]
+        np.testing.assert_allclose(point, expected, atol=1e-9)
+
+
+def test_shapes_and_points_of_every_link_are_there_in_its_frame(recording: Path, tmp_path: Path) -> None:
+    run = open_run(recording)
+    out = export_foxglove(run, tmp_path / "fox.mcap")
+    links = {solid.link for solid in solids_of(run.urdf)}
+    with out.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = list(reader.iter_decoded_messages())
+        statistics = reader.get_summary().statistics
+    scene = next(message for _, channel, _, message in found if channel.topic == "/scene")
+    assert {entity.frame_id for entity in scene.entities} == links
+    clouds = {channel.topic: message for _, channel, _, message in found if channel.topic.startswith("/points/")}
+    assert set(clouds) == {f"/points/{link}" for link in links}
+    for cloud in clouds.values():
+        assert len(cloud.data) % cloud.point_stride == 0
+        assert len(cloud.data) > 100 * cloud.point_stride
+    logs = [message.message for _, channel, _, message in found if channel.topic == "/log"]
+    assert len(logs) == len(run.events)
+    assert statistics.message_count == len(found)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("box", (0.3, 0.2, 0.1)), ("cylinder", (0.2, 0.2, 0.3)), ("sphere", (0.2, 0.2, 0.2))]
+)
+def test_points_lie_on_the_surface(kind: str, size: tuple[float, float, float]) -> None:
+    at, unturned = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    points = Solid("link", kind, size, at, unturned, (1, 1, 1, 1)).points() - at
+    half = np.array(size) / 2
+    np.testing.assert_allclose(np.abs(points).max(axis=0), half, atol=2e-3)
+    if kind == "sphere":
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), half[0], atol=2e-3)
+    if kind == "box":
+        assert np.isclose(np.abs(points), half).any(axis=1).all()
+
+
+def test_a_box_turned_about_z_by_a_quarter_swaps_its_sides() -> None:
+    quarter = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    points = Solid("link", "box", (0.4, 0.2, 0.1), np.zeros(3), quarter, (1, 1, 1, 1)).points()
+    np.testing.assert_allclose(np.abs(points).max(axis=0), [0.1, 0.2, 0.05], atol=1e-12)
+
+
+def test_a_recording_without_a_urdf_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = recordings.record(tmp_path / "run.mcap", recordings.Script(seconds=1))
+    run = open_run(path)
+    monkeypatch.setattr(type(run), "urdf", "")
+    with pytest.raises(InputError, match="no URDF"):
+        export_foxglove(run, tmp_path / "fox.mcap")
+
+
+def test_the_command_prints_what_it_wrote_and_refuses_to_write_over(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fox.mcap"
+    answer = hilrig("export", recording, "--foxglove", out, "--csv", tmp_path / "csv")
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stdout.split() == [str(out), *(str(tmp_path / "csv" / f"{name}.csv") for name in TABLES)]
+    again = hilrig("export", recording, "--foxglove", out)
+    assert again.returncode == 2
+    assert "exists" in again.stderr
+    nothing = hilrig("export", recording)
+    assert nothing.returncode == 2
+    assert "nothing to write" in nothing.stderr
+
+
+def test_the_answer_of_runs_is_json_of_which_every_path_exists(recording: Path) -> None:
+    answer = json.loads(hilrig("runs", recording.parent, "--json").stdout)
+    assert [Path(run["path"]).exists() for run in answer["runs"]] == [True]
