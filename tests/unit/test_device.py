@@ -110,8 +110,9 @@ def test_the_standing_command_is_repeated_with_its_number(bench: Bench) -> None:
 
 def test_the_echo_word_comes_back_in_the_next_command(bench: Bench) -> None:
     client = bench.connect()
+    bench.write(client, 0, 1)
     bench.write(client, registers.ECHO, 4711)
-    assert not bench.commands
+    assert len(bench.commands) == 1
     bench.write(client, 0, 1)
     assert bench.commands[-1].echo == 4711
 
@@ -333,6 +334,12 @@ def test_a_session_begins_with_the_lease_and_ends_after_its_grace(bench: Bench) 
     assert bench.session_changes == 2
     last = bench.commands[-1]
     assert (last.session, last.seq, last.basis_step, last.safe) == ("", 2, 0, True)
+
+
+def test_a_session_that_begins_with_a_write_that_moves_nothing_is_told_too(bench: Bench) -> None:
+    bench.write(bench.connect(), registers.ECHO, 1)
+    [command] = bench.commands
+    assert (command.session, command.safe, command.controller) == (bench.device.session.id, True, "")
 
 
 def test_the_same_host_goes_on_with_its_session_and_another_begins_its_own(bench: Bench) -> None:

@@ -114,6 +114,7 @@ class Device:
         self._torque = bytearray(8)
         self._echo = 0
         self._last_writer = ""
+        self._session_told = ""
         self._repeat_due_ns = clock.monotonic_ns()
         self._command = TorqueCommand(rig=rig, effort=(0.0, 0.0, 0.0, 0.0), safe=True)
 
@@ -235,6 +236,7 @@ class Device:
             self._echo = int.from_bytes(words[:2], "big")
         self.watchdog.timeout_ns = timeout_ns
         self._rewatch()
+        self._tell_session()
 
     def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int) -> None:
         """Switch the magnet, or reset the rig.
@@ -251,6 +253,7 @@ class Device:
             self._torque[:] = bytes(8)
             self._command.resets += 1
         else:
+            self._tell_session()
             return
         self._write_command(client, arrived_ns)
 
@@ -458,6 +461,11 @@ class Device:
         command.write_arrived_ns = 0
         self._send()
 
+    def _tell_session(self) -> None:
+        """A write that moved nothing may have begun a session: the simulation learns of it from a command."""
+        if self._command.session != self._session_told:
+            self._send_own_command()
+
     def _clear_basis(self) -> None:
         command = self._command
         command.basis_incarnation = command.basis_step = 0
@@ -469,6 +477,7 @@ class Device:
         command.wall_ns = self._clock.wall_ns()
         command.sent_ns = now_ns
         self._repeat_due_ns = now_ns + self.settings.repeat_ns
+        self._session_told = command.session
         self._outlet.send_command(command)
 
     def _look(self) -> StateImage:
