@@ -46,7 +46,7 @@ class Verification:
     gaps: int
     """Places where states are missing."""
     exact: bool
-    """Every compared state is the recorded one to the last bit."""
+    """Position and velocity of every compared state are the recorded ones to the last bit."""
     tolerance: float
     """Deviation that was allowed; rad, m, rad/s, m/s."""
     largest_deviation: tuple[float, float, float, float]

@@ -1,0 +1,127 @@
+"""A recording is verified bit for bit, and what was changed in it is found at its step."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilrig_replay.verify import OTHER_MACHINE_TOLERANCE, verify
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import JointState
+from hilrig_sim.machine import machine_name
+from recordings import Made, record, write
+from virtual_rig import VirtualRig, work
+
+
+@pytest.fixture(scope="module")
+def run() -> list[Made]:
+    """The example's work, then a reset, a collision with the stops and the fall of the quill."""
+    with VirtualRig() as rig:
+        work(rig, 14.0, state_delay_ms=10, command_delay_ms=10)
+        rig.command((0, 0, -5, 0), resets=0)
+        rig.tick(20)
+        rig.command((20, -8, 3, 1), magnet=True, resets=1)
+        rig.tick(100)
+        rig.command((-20, 8, -9, -1), resets=1)
+        rig.tick(100)
+        return rig.recorded()
+
+
+def states(made: list[Made]) -> list[JointState]:
+    return [one.message for one in made if isinstance(one.message, JointState)]
+
+
+def copied(made: list[Made]) -> list[Made]:
+    copies = []
+    for one in made:
+        message = type(one.message)()
+        message.CopyFrom(one.message)
+        copies.append(Made(one.topic, one.publish_wall_ns, message))
+    return copies
+
+
+def test_a_run_with_picks_drops_stops_and_a_reset_is_verified_bit_for_bit(run: list[Made], tmp_path: Path) -> None:
+    kinds = {one.message.kind for one in run if not isinstance(one.message, JointState)}
+    assert len(kinds) >= 4
+    found = verify(write(tmp_path / "run.mcap", run), tolerance=0.0)
+    assert found.same
+    assert found.exact
+    assert found.gaps == 0
+    assert found.largest_deviation == (0.0, 0.0, 0.0, 0.0)
+    # A reset is a beginning, and the last state has no successor.
+    assert found.steps == len(states(run)) - 2
+    assert "bit for bit" in found.sentence()
+
+
+@pytest.mark.parametrize("row", [40, 333, 700])
+def test_one_changed_effort_is_found_at_its_step(run: list[Made], tmp_path: Path, row: int) -> None:
+    changed = copied(run)
+    state = states(changed)[row]
+    state.effort[1] += 0.001
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert not found.same
+    assert not found.exact
+    assert found.first_diverging_step == state.step
+    assert found.largest_deviation[1] > 1e-8
+    assert f"step {state.step} does not lead" in found.sentence()
+    assert not verify(tmp_path / "run.mcap", tolerance=OTHER_MACHINE_TOLERANCE).same
+
+
+def test_a_changed_position_is_found_before_and_after(run: list[Made], tmp_path: Path) -> None:
+    changed = copied(run)
+    state = states(changed)[500]
+    state.position[0] = np.nextafter(state.position[0], 10)
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert found.first_diverging_step == state.step - 1
+    assert verify(tmp_path / "run.mcap", tolerance=1e-9).same
+
+
+def test_a_part_that_was_moved_by_hand_is_found(run: list[Made], tmp_path: Path) -> None:
+    changed = copied(run)
+    state = next(state for state in states(changed)[300:] if state.parts)
+    state.parts[0].x += 0.001
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert not found.same
+    assert found.largest_part_deviation == pytest.approx(0.001)
+
+
+def test_missing_states_are_gaps_not_divergence(run: list[Made], tmp_path: Path) -> None:
+    path = write(tmp_path / "run.mcap", run, missing={"state": {20, 21, 400}})
+    found = verify(path, tolerance=0.0)
+    assert found.same
+    assert found.exact
+    assert found.gaps == 2
+    assert 0 < found.skipped < 120
+    assert "2 gaps" in found.sentence()
+
+
+def test_without_a_tolerance_it_depends_on_the_machine(run: list[Made], tmp_path: Path) -> None:
+    found = verify(write(tmp_path / "run.mcap", run))
+    assert found.machine != machine_name()
+    assert found.tolerance == OTHER_MACHINE_TOLERANCE
+
+
+def test_a_run_that_the_model_never_made_is_refused_as_false(tmp_path: Path) -> None:
+    found = verify(record(tmp_path / "run.mcap"))
+    assert not found.same
+    assert found.first_diverging_step == 1
+
+
+def test_a_recording_without_parameters_says_so(run: list[Made], tmp_path: Path) -> None:
+    path = write(tmp_path / "run.mcap", run, metadata={"hilrig.config": {"step_ns": "20000000"}})
+    with pytest.raises(InputError, match="does not say with which parameters"):
+        verify(path)
+
+
+def test_an_hour_would_take_less_than_half_a_minute(tmp_path: Path) -> None:
+    with VirtualRig() as rig:
+        for second in range(60):
+            rig.command(np.sin(second + np.arange(4.0)) * (1, 1, 3, 0.05) - (0, 0, 4.9, 0))
+            rig.tick(50)
+    path = write(tmp_path / "run.mcap", rig.recorded())
+    begin_s = time.process_time()
+    found = verify(path, tolerance=0.0)
+    took_s = time.process_time() - begin_s
+    assert found.exact
+    assert 3600 / 60 * took_s < 30
