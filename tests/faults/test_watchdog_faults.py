@@ -1,0 +1,163 @@
+"""A controller dies in every way that a controller can: the torque is zero within the time-out plus one step.
+
+Judged by the recording of the whole rig. Stamps of the edge and of the simulation are compared here, for on one host
+both are of the same clock.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from hilrig_schemas import Event, JointState, TorqueCommand
+from labs import HILRIG, RunningLab, hilrig, write_lab
+from namespaces import Network, require_namespaces
+from waiting import eventually
+
+TIMEOUT_MS, STEP_MS = 400, 20
+LATE_MS = 15
+"""What a busy machine may be late with waking two processes up, one after the other."""
+
+ASK = ("lease", "--json", "--config")
+
+CONTROLLER = """
+import socket, sys, time
+rig = socket.create_connection((sys.argv[1], int(sys.argv[2])))
+rig.settimeout(60)
+turn = 0
+while True:
+    turn += 1
+    rig.sendall(bytes.fromhex("000100000006010300040004"))
+    rig.recv(300)
+    if sys.argv[3] == "writes" or turn < 25:
+        rig.sendall(bytes.fromhex("00020000000f0110000000040801f401f401f40064"))
+        rig.recv(300)
+    if turn == 25:
+        print("running", flush=True)
+    time.sleep(0.02)
+"""
+
+
+def controller(port: int, mode: str = "writes", host: str = "127.0.0.1") -> list[str]:
+    return [sys.executable, "-c", CONTROLLER, host, str(port), mode]
+
+
+def messages(path: Path, topic: str, kind: type) -> list:  # type: ignore[type-arg]
+    with path.open("rb") as file:
+        return [kind.FromString(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
+
+
+def judge(recording: Path, why: str) -> None:
+    """The torque of the last write was gone in time, and the event says why."""
+    commands = messages(recording, "/command", TorqueCommand)
+    states = messages(recording, "/state", JointState)
+    events = messages(recording, "/event", Event)
+    last_write = [command for command in commands if command.controller][-1]
+    acting = [state for state in states if any(state.effort)]
+    assert acting, "the controller never moved the arm"
+    first_zero = next(state for state in states if state.step > acting[-1].step)
+    assert first_zero.sampled_ns > last_write.write_arrived_ns
+    took_ms = (first_zero.sampled_ns - last_write.write_arrived_ns) / 1e6
+    assert TIMEOUT_MS <= took_ms <= TIMEOUT_MS + STEP_MS + LATE_MS
+    [trip] = [event for event in events if event.kind == Event.WATCHDOG_TRIP]
+    assert why in trip.text
+    assert trip.watchdog_data.timeout_ns == TIMEOUT_MS * 1_000_000
+    assert TIMEOUT_MS <= trip.watchdog_data.silent_ns / 1e6 < TIMEOUT_MS + LATE_MS
+
+
+FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
+    "rig1": ("writes", signal.SIGKILL, "is gone"),
+    "rig2": ("writes", signal.SIGSTOP, "is silent"),
+    "rig3": ("reads on", None, "reads but does not write"),
+}
+"""What the controller of each rig does, what is done to it, and what the event must say."""
+
+
+@pytest.mark.rig
+def test_torque_is_gone_when_the_controller_is(tmp_path: Path) -> None:
+    config = write_lab(tmp_path, rigs=3, extra=f"edge.watchdog_ms = {TIMEOUT_MS}")
+    with RunningLab(config) as lab:
+        processes = {
+            rig: subprocess.Popen(controller(lab.lab.ports[rig], mode), stdout=subprocess.PIPE, text=True)
+            for rig, (mode, _, _) in FAULTS.items()
+        }
+        try:
+            for process in processes.values():
+                assert process.stdout is not None
+                assert process.stdout.readline() == "running\n"
+            for rig, (_, fault, _) in FAULTS.items():
+                if fault is not None:
+                    processes[rig].send_signal(fault)
+            eventually(lambda: all(tripped(status) for status in json.loads(hilrig(*ASK, config).stdout)))
+        finally:
+            for process in processes.values():
+                process.kill()
+                process.wait()
+        assert lab.stop() == 0
+        for rig, (_, _, why) in FAULTS.items():
+            [recording] = [path for path in lab.recordings if path.parent.name == rig]
+            judge(recording, why)
+
+
+def tripped(status: dict[str, object]) -> bool:
+    return bool(status["watchdog_tripped"])
+
+
+@pytest.mark.rig
+def test_torque_is_gone_when_the_edge_is(tmp_path: Path) -> None:
+    """With the edge killed nobody repeats the command: the simulation's own time-out does it."""
+    extra = "sim.command_timeout_ms = 300\nedge.repeat_ms = 100"
+    config = write_lab(tmp_path, extra=extra)
+    with RunningLab(config) as lab:
+        process = subprocess.Popen(controller(lab.port), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "running\n"
+            os.kill(lab.service_pid("edge"), signal.SIGKILL)
+            # `up` starts it again; nobody holds the rig then.
+            eventually(lambda: hilrig("lease", "rig1", "--config", config).returncode == 0)
+        finally:
+            process.kill()
+            process.wait()
+        assert lab.stop() == 0
+        [recording] = lab.recordings[:1]
+        commands = [c for c in messages(recording, "/command", TorqueCommand) if c.controller]
+        states = messages(recording, "/state", JointState)
+        acting = [state for state in states if any(state.effort)]
+        zero = next(state for state in states if state.step > acting[-1].step)
+        # The last word may be a repetition, which is not recorded.
+        assert 0 < (zero.sampled_ns - commands[-1].sent_ns) / 1e6 <= 300 + 100 + STEP_MS + LATE_MS
+
+
+@pytest.mark.hosts
+def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
+    require_namespaces()
+    lab = write_lab(tmp_path, extra=f"edge.watchdog_ms = {TIMEOUT_MS}\nedge.host = '0.0.0.0'")
+    with Network(["rig", "pc"]) as network:
+        log = (tmp_path / "up.log").open("w")
+        up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
+        eventually(lambda: "running" in (tmp_path / "up.log").read_text(), timeout_s=30)
+        from hilrig_runtime.config import load_lab
+
+        port = load_lab(lab).ports["rig1"]
+        command = controller(port, host=network.address("rig"))
+        process = network.popen("pc", command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+        network.set_link("pc", up=False)
+
+        def status() -> dict[str, object]:
+            asked = network.run("rig", [*HILRIG, "lease", "rig1", "--json", "--config", str(lab)], capture_output=True)
+            return json.loads(asked.stdout)  # type: ignore[no-any-return]
+
+        eventually(lambda: tripped(status()))
+        up.send_signal(signal.SIGTERM)
+        assert up.wait(10) == 0
+        log.close()
+    [recording] = (tmp_path / "recordings").rglob("*.mcap")
+    judge(recording, "is silent")
