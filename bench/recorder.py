@@ -214,8 +214,8 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
         for process in (sender, recorder):
             process.wait(15)
         sender.stdout.close()
-    idle = [health for health in healths if not health.received_hz and not health.recordings]
     busy = [health for health in healths if health.recordings]
+    idle = healths[: healths.index(busy[0])]
     recorded, lost_transport, lost_recorder = contents(paths)
     return Found(
         sent=said["sent"],
@@ -225,7 +225,7 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
         size=sum(path.stat().st_size for path in paths),
         wall_s=said["wall_s"],
         # Importing is not recording: what it took before the first session is not counted.
-        cpu_s=(healths[-1].cpu_ns - (idle[0].cpu_ns if idle else 0)) * 1e-9,
+        cpu_s=(healths[-1].cpu_ns - (idle[-1].cpu_ns if idle else 0)) * 1e-9,
         memory_early=busy[len(busy) // 5].resident_bytes,
         memory_late=busy[-1].resident_bytes,
     )

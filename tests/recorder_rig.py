@@ -1,6 +1,7 @@
 """A recorder as a process of its own, and services that send to it over the real bus and remember what they sent."""
 
 import os
+import pickle
 import random
 import signal
 import subprocess
@@ -231,3 +232,17 @@ def files_of(lab: LabConfig, rig: str, pattern: str = "*.mcap") -> list[Path]:
 def times(name: str, default: int) -> int:
     """How often something is tried: more often when the environment says so."""
     return int(os.environ.get(name, default))
+
+
+def main() -> None:
+    """Senders as a program: `begin RIG` and `end RIG` on standard input; at its end what was sent goes into a file."""
+    lab, out = load_lab(Path(sys.argv[1])), Path(sys.argv[2])
+    with sending(lab, [rig.name for rig in lab.rigs]) as senders:
+        for line in sys.stdin:
+            word, rig = line.split()
+            (senders.begin if word == "begin" else senders.end)(rig)
+    out.write_bytes(pickle.dumps(senders.sent))
+
+
+if __name__ == "__main__":
+    main()

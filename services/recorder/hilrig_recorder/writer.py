@@ -10,11 +10,10 @@ import os
 import struct
 import sys
 import zlib
-from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import FileIO
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -48,6 +47,8 @@ _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<BQQQQQI")
 _CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
+_ENTRY: Final = struct.Struct("<QQQIIB")
+_COUNT: Final = struct.Struct("<HI")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _COMPRESSION: Final = b"zstd"
 
@@ -55,6 +56,40 @@ _COMPRESSION: Final = b"zstd"
 def part_path(path: Path) -> Path:
     """What a recording is called while it is written."""
     return path.with_name(path.name + PART_SUFFIX)
+
+
+class _Chunk(NamedTuple):
+    """What is kept of a chunk that is written; times are wall clock, ns."""
+
+    start: int
+    first_ns: int
+    last_ns: int
+    data_size: int
+    raw_size: int
+    counts: tuple[tuple[int, int], ...]
+    """Channel and number of its messages; their indexes follow the chunk in this order."""
+
+    def index_record(self) -> bytes:
+        """The record that leads a reader to it."""
+        chunk_size = _CHUNK.size + self.data_size
+        offset = self.start + chunk_size
+        channel_offsets = b""
+        for channel_id, count in self.counts:
+            channel_offsets += _CHANNEL_OFFSET.pack(channel_id, offset)
+            offset += _INDEX_HEAD.size + 16 * count
+        head = _CHUNK_INDEX_HEAD.pack(
+            Opcode.CHUNK_INDEX.value,
+            _CHUNK_INDEX_HEAD.size + len(channel_offsets) + _CHUNK_INDEX_TAIL.size - 9,
+            self.first_ns,
+            self.last_ns,
+            self.start,
+            chunk_size,
+            len(channel_offsets),
+        )
+        tail = _CHUNK_INDEX_TAIL.pack(
+            offset - self.start - chunk_size, len(_COMPRESSION), _COMPRESSION, self.data_size, self.raw_size
+        )
+        return head + channel_offsets + tail
 
 
 class RunWriter:
@@ -93,11 +128,8 @@ class RunWriter:
         self._first_ns = 0
         self._last_ns = 0
         self._indexes: dict[int, list[int]] = {}
-        # A day of chunks is a megabyte or two: the index of each as its final bytes, and counts to take it back.
-        self._chunk_indexes = bytearray()
-        self._chunk_index_starts = array("Q")
-        self._chunk_counts = array("I")
-        self._chunk_count_starts = array("Q")
+        # What the index at the end needs of each chunk, packed: a day of them is four megabytes.
+        self._chunks = bytearray()
         self._totals: dict[int, int] = {}
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
@@ -172,59 +204,37 @@ class RunWriter:
         count = len(self._records)
         self._records.clear()
         self._pending_bytes = 0
-        start = self.size
-        chunk_bytes = _CHUNK.size + len(data)
-        pieces = [
-            _CHUNK.pack(
-                Opcode.CHUNK.value,
-                chunk_bytes - 9,
-                self._first_ns,
-                self._last_ns,
-                len(raw),
-                zlib.crc32(raw),
-                len(_COMPRESSION),
-                _COMPRESSION,
-                len(data),
-            ),
-            data,
-        ]
-        offset = start + chunk_bytes
-        channel_offsets = b""
-        counts = array("I")
+        head = _CHUNK.pack(
+            Opcode.CHUNK.value,
+            _CHUNK.size + len(data) - 9,
+            self._first_ns,
+            self._last_ns,
+            len(raw),
+            zlib.crc32(raw),
+            len(_COMPRESSION),
+            _COMPRESSION,
+            len(data),
+        )
+        pieces = [head, data]
+        counts: list[tuple[int, int]] = []
         for channel_id, index in self._indexes.items():
             if not index:
                 continue
-            counts.append(channel_id)
-            counts.append(len(index) // 2)
-            channel_offsets += _CHANNEL_OFFSET.pack(channel_id, offset)
+            counts.append((channel_id, len(index) // 2))
             entries = struct.pack(f"<{len(index)}Q", *index)
             pieces.append(_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX.value, 6 + len(entries), channel_id, len(entries)))
             pieces.append(entries)
-            offset += _INDEX_HEAD.size + len(entries)
             index.clear()
+        start = self.size
         try:
             self._append(b"".join(pieces))
         except OSError:
             self.given_up += count
             raise
-        self._chunk_index_starts.append(len(self._chunk_indexes))
-        self._chunk_indexes += _CHUNK_INDEX_HEAD.pack(
-            Opcode.CHUNK_INDEX.value,
-            _CHUNK_INDEX_HEAD.size + len(channel_offsets) + _CHUNK_INDEX_TAIL.size - 9,
-            self._first_ns,
-            self._last_ns,
-            start,
-            chunk_bytes,
-            len(channel_offsets),
-        )
-        self._chunk_indexes += channel_offsets
-        self._chunk_indexes += _CHUNK_INDEX_TAIL.pack(
-            offset - start - chunk_bytes, len(_COMPRESSION), _COMPRESSION, len(data), len(raw)
-        )
-        self._chunk_count_starts.append(len(self._chunk_counts))
-        self._chunk_counts += counts
-        for channel_id, part in zip(counts[::2], counts[1::2], strict=True):
+        for channel_id, part in counts:
+            self._chunks += _COUNT.pack(channel_id, part)
             self._totals[channel_id] += part
+        self._chunks += _ENTRY.pack(start, self._first_ns, self._last_ns, len(data), len(raw), len(counts))
         self.message_count += count
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -260,7 +270,7 @@ class RunWriter:
                 self._end(last_words())
                 return
             except OSError:
-                if not self._chunk_index_starts:
+                if not self._chunks:
                     raise
                 self._take_back_chunk()
 
@@ -279,11 +289,12 @@ class RunWriter:
         start = self.size + len(encoded(DataEnd(0)))
         summary = bytearray()
         offsets = bytearray()
+        chunks = list(self._chunk_entries())
         groups: list[tuple[Opcode, bytes]] = [
             (Opcode.SCHEMA, encoded(*self._schemas)),
             (Opcode.CHANNEL, encoded(*self._channels)),
-            (Opcode.STATISTICS, encoded(self._statistics())),
-            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.STATISTICS, encoded(self._statistics(chunks))),
+            (Opcode.CHUNK_INDEX, b"".join(chunk.index_record() for chunk in reversed(chunks))),
             (Opcode.ATTACHMENT_INDEX, encoded(*self._attachment_indexes)),
             (Opcode.METADATA_INDEX, encoded(*self._metadata_indexes)),
         ]
@@ -297,36 +308,40 @@ class RunWriter:
         crc = zlib.crc32(footer_head, zlib.crc32(summary))
         return bytes(summary) + encoded(Footer(start, offset_start, crc)) + MCAP0_MAGIC
 
-    def _statistics(self) -> Statistics:
-        times = [struct.unpack_from("<QQ", self._chunk_indexes, start + 9) for start in self._chunk_index_starts]
+    def _statistics(self, chunks: list[_Chunk]) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
             channel_message_counts={channel_id: count for channel_id, count in self._totals.items() if count},
-            chunk_count=len(times),
+            chunk_count=len(chunks),
             message_count=self.message_count,
-            message_start_time=min((first for first, _ in times), default=0),
-            message_end_time=max((last for _, last in times), default=0),
+            message_start_time=min((chunk.first_ns for chunk in chunks), default=0),
+            message_end_time=max((chunk.last_ns for chunk in chunks), default=0),
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self._schemas),
         )
 
+    def _chunk_entries(self) -> Iterator[_Chunk]:
+        """The chunks that are written, newest first."""
+        end = len(self._chunks)
+        while end:
+            entry = _ENTRY.unpack_from(self._chunks, end - _ENTRY.size)
+            start, first_ns, last_ns, data_size, raw_size, channels = entry
+            end -= _ENTRY.size + channels * _COUNT.size
+            counts = tuple(_COUNT.iter_unpack(self._chunks[end : end + channels * _COUNT.size]))
+            yield _Chunk(start, first_ns, last_ns, data_size, raw_size, counts)
+
     def _take_back_chunk(self) -> None:
         """Give up the newest chunk, and whatever was written behind it."""
-        index_start = self._chunk_index_starts.pop()
-        (offset,) = struct.unpack_from("<Q", self._chunk_indexes, index_start + 25)
-        del self._chunk_indexes[index_start:]
-        counts_start = self._chunk_count_starts.pop()
-        counts = self._chunk_counts[counts_start:]
-        del self._chunk_counts[counts_start:]
-        for channel_id, part in zip(counts[::2], counts[1::2], strict=True):
-            self._totals[channel_id] -= part
-        count = sum(counts[1::2])
-        self._metadata_indexes = [index for index in self._metadata_indexes if index.offset < offset]
-        self._attachment_indexes = [index for index in self._attachment_indexes if index.offset < offset]
-        self.message_count -= count
-        self.given_up += count
-        self._cut(offset)
+        chunk = next(self._chunk_entries())
+        del self._chunks[len(self._chunks) - _ENTRY.size - len(chunk.counts) * _COUNT.size :]
+        self._metadata_indexes = [index for index in self._metadata_indexes if index.offset < chunk.start]
+        self._attachment_indexes = [index for index in self._attachment_indexes if index.offset < chunk.start]
+        for channel_id, count in chunk.counts:
+            self._totals[channel_id] -= count
+            self.message_count -= count
+            self.given_up += count
+        self._cut(chunk.start)
 
     # -- the disk ---------------------------------------------------------------------------------------------------
 

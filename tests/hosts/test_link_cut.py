@@ -1,0 +1,73 @@
+"""The recorder on another host than the rig, and the cable between them pulled out: nothing is lost."""
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from namespaces import Network, require_namespaces
+from recorder_rig import Key, files_of, make_lab, metadata, recorded
+from waiting import eventually
+
+TESTS = Path(__file__).parents[1]
+HILRIG = str(Path(sys.executable).with_name("hilrig"))
+
+
+def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], Path]:
+    """Record a session during which the recorder's cable is out for a while: what was sent, and the file."""
+    require_namespaces()
+    config, lab = make_lab(folder, extra='bus.topology = "router"\nbus.router = "tcp/rig:7447"')
+    sent_file = folder / "sent.pickle"
+    with Network(["rig", "store"]) as network, (folder / "log").open("w") as log:
+        router = [sys.executable, str(TESTS / "zenoh_router.py"), "--listen", "tcp/0.0.0.0:7447"]
+        network.popen("rig", [*router, "--no-multicast-scouting"], stdin=subprocess.PIPE)
+        recorder = network.popen("store", [HILRIG, "recorder", "-c", str(config)], stderr=log, cwd=folder)
+        command = [sys.executable, str(TESTS / "recorder_rig.py"), str(config), str(sent_file)]
+        sender = network.popen("rig", command, stdin=subprocess.PIPE, text=True)
+        assert sender.stdin is not None
+
+        def say(line: str) -> None:
+            print(line, file=sender.stdin, flush=True)
+
+        say("begin rig1")
+        [part] = eventually(lambda: files_of(lab, "rig1", "*.part"), timeout_s=30)
+        eventually(lambda: part.stat().st_size > 20_000, timeout_s=20)
+        network.set_link("store", False)
+        time.sleep(cut_s)
+        during = part.stat().st_size
+        network.set_link("store", True)
+        eventually(lambda: part.stat().st_size > during + 10_000, timeout_s=60)
+        say("end rig1")
+        [path] = eventually(lambda: files_of(lab, "rig1"), timeout_s=30)
+        sender.stdin.close()
+        assert sender.wait(20) == 0
+        assert recorder.poll() is None
+    return pickle.loads(sent_file.read_bytes())["rig1"], path
+
+
+@pytest.mark.hosts
+@pytest.mark.rig
+def test_a_cable_pulled_for_five_seconds_loses_nothing(tmp_path: Path) -> None:
+    sent, path = record_with_a_cut(tmp_path, 5.0)
+    found = recorded([path])
+    assert len(found) == len(set(found))
+    missing = set(sent) - set(found)
+    assert not missing, f"{len(missing)} of {len(sent)} are missing"
+    summary = metadata(path)["hilrig.summary"]
+    assert (summary["lost_transport"], summary["lost_recorder"], summary["clock_steps"]) == ("0", "0", "0")
+
+
+@pytest.mark.hosts
+@pytest.mark.rig
+@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes most of a minute: set HILRIG_LONG=1")
+def test_of_a_longer_cut_the_file_says_exactly_what_is_missing(tmp_path: Path) -> None:
+    sent, path = record_with_a_cut(tmp_path, 20.0)
+    missing = set(sent) - set(recorded([path]))
+    summary = metadata(path)["hilrig.summary"]
+    assert len(missing) > 0
+    assert int(summary["lost_transport"]) == len(missing)
+    assert summary["lost_recorder"] == "0"
