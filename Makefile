@@ -8,9 +8,20 @@ BIN := .venv/bin
 help: ## what there is
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1|/' | awk -F'|' '{printf "  make %-8s %s\n", $$1, $$2}'
 
-.venv/ready: pyproject.toml constraints.txt
+PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+
+# Debian keeps ensurepip in a package of its own.
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo 'hilrig needs Python 3.11 or newer: make PYTHON=python3.11' >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { apt-get update -qq && apt-get install --yes -qq python3-venv; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+
+.venv/ready: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP_INSTALL) '.[all]'
+	@touch $@
+
+.venv/dev: .venv/ready
+	$(PIP_INSTALL) '.[dev]'
 	@touch $@
 
 system: ## the system parts that tests and benchmarks use (apt, as root)
@@ -19,22 +30,22 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-test: .venv/ready system check ## everything that CI runs
+test: .venv/dev system check ## everything that CI runs
 	$(BIN)/pytest
 
-check: .venv/ready ## format, lint, types, floors
+check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
 
-gen: .venv/ready ## generated code and tables, from their sources
+gen: .venv/dev ## generated code and tables, from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
 	$(BIN)/python docs/make_configuration.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python tests/conformance.py > docs/modbus-conformance.md
 
-bench: .venv/ready system ## every benchmark; writes the tables of docs/performance.md
+bench: .venv/dev system ## every benchmark; writes the tables of docs/performance.md
 	$(BIN)/python bench/run_all.py
 
 clean: ## everything that was built or installed here
