@@ -8,6 +8,7 @@ start of its step.
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -48,10 +49,12 @@ def run(service: Service) -> None:
         freeze_garbage()
         service.ready()
         stopping = service.stopping
-        while not stopping.is_set():
-            tick = rate.wait()
-            simulation.tick(tick)
-            service.beat(service.clock.monotonic_ns())
+        # What can't be computed is dealt with where it shows, not warned of.
+        with np.errstate(all="ignore"):
+            while not stopping.is_set():
+                tick = rate.wait()
+                simulation.tick(tick)
+                service.beat(service.clock.monotonic_ns())
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +127,18 @@ class Simulation:
         events = plant.step(self._effort, self._magnet)
         if events:
             self._reporter.tell_of_plant(events, step + 1, sampled_ns, [rig.follower.session for rig in rigs])
+        if not isfinite(plant.velocity.sum()):
+            self._catch(step + 1)
         self._counters.count_tick(tick, self._step_ns)
         if tick.missed_steps or tick.lateness_ns > self._step_ns:
             self._reporter.tell_of_overrun(tick, step, sampled_ns)
+
+    def _catch(self, step: int) -> None:
+        """Bring rigs back whose motion the step could not follow: better at the start than nowhere for ever."""
+        for rig in self._rigs:
+            if not np.isfinite(self._plant.velocity[:, rig.index]).all():
+                self._plant.reset(rig.index)
+                self._reporter.tell_of_escape(rig.index, rig.follower.session, step)
 
     def _warm_up(self) -> None:
         """Take the first steps, which are slow, before time counts."""

@@ -16,6 +16,8 @@ GRAVITY: Final = 9.81
 """m/s², as in the paper (20)."""
 LARGEST_REGISTER_FORCE: Final = 32.767
 """What the paper's force register can ask for, N."""
+LARGEST_EFFORT: Final = 32.768
+"""What the drives give at most, N·m or N: all that a register can ask for, either way."""
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]

@@ -26,8 +26,6 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 TOOL_CONTACT_FLAG: Final = 1 << 8
-LARGEST_EFFORT: Final = 1e6
-"""Efforts beyond it, N·m or N, are no numbers of this arm: they are cut off so that the state stays finite."""
 
 
 _TRUE: Final = b"\x01"

@@ -55,6 +55,14 @@ class Reporter:
             event.rig, event.session, event.step = self._rigs[rig], follower.session, step
             self._emit(event)
 
+    def tell_of_escape(self, rig: int, session: str, step: int) -> None:
+        """A rig whose motion was too fast for the step, and which is back at its start pose from `step` on."""
+        text = "the motion was too fast for the step: back at the start pose"
+        event = Event(
+            kind=Event.RESET, severity=Event.ERROR, text=text, rig=self._rigs[rig], session=session, step=step
+        )
+        self._emit(event)
+
     def tell_of_overrun(self, tick: Tick, step: int, now_ns: int) -> None:
         """A tick that came more than a step late, or gave up deadlines."""
         self._missed += tick.missed_steps

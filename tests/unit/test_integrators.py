@@ -1,0 +1,107 @@
+"""The integration methods: their limits of stability, their orders, and whole trajectories against scipy's DOP853."""
+
+import numpy as np
+import pytest
+
+from hilrig_runtime.errors import InputError
+from hilrig_sim.dynamics import ReducedDynamics, forward_dynamics
+from hilrig_sim.integrators import EULER, RK4, RKF45, TABLEAUS, Tableau, reference_solution
+from hilrig_sim.model import ArmParameters, RigParameters, StepParameters
+from hilrig_sim.stability import check_stable, fastest_mode, largest_safe_step
+from hilrig_sim.stepping import FixedStep
+
+PAPER = ArmParameters(masses=(1.0, 0.5, 0.5))
+"""Of m2 and m3 only the sum counts in the plane: 1 kg as in experiment (44)."""
+EFFORT = np.array([1.2, -0.7, -4.5, 0.05])
+
+
+def stepped(table: Tableau, step_s: float, seconds: float, arm: ArmParameters = PAPER) -> tuple[np.ndarray, np.ndarray]:
+    """q(t) and the last embedded error, from rest."""
+    position, velocity, error = (np.zeros((4, 1)) for _ in range(3))
+    stepper = FixedStep(ReducedDynamics([arm]), table, step_s)
+    for _ in range(round(seconds / step_s)):
+        stepper.advance(position, velocity, EFFORT[:, np.newaxis], error)
+    return position[:, 0], error[:, 0]
+
+
+def exact(seconds: float, arm: ArmParameters = PAPER) -> np.ndarray:
+    """q(t) by DOP853."""
+
+    def derivative(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[4:], forward_dynamics(arm, y[:4], y[4:], EFFORT)])
+
+    return reference_solution(derivative, np.zeros(8), np.array([0.0, seconds]))[:4, -1]
+
+
+def test_limits_of_stability_are_those_of_the_literature() -> None:
+    assert EULER.negative_real_limit() == pytest.approx(2.0)
+    assert RK4.negative_real_limit() == pytest.approx(2.785, abs=1e-3)
+    assert RKF45.negative_real_limit() == pytest.approx(3.678, abs=1e-3)
+    assert RKF45.negative_real_limit(RKF45.embedded) == pytest.approx(3.020, abs=1e-3)
+
+
+def test_the_papers_arm_has_its_fastest_mode_at_129_5() -> None:
+    assert fastest_mode(PAPER, theta2=0.0) == pytest.approx(129.5, abs=0.05)
+    assert fastest_mode(PAPER) == pytest.approx(129.5, abs=0.05)
+    assert fastest_mode(PAPER, payload=0.5) < fastest_mode(PAPER)
+
+
+@pytest.mark.parametrize("table", TABLEAUS.values(), ids=lambda table: table.name)
+def test_weights_are_consistent(table: Tableau) -> None:
+    assert sum(table.b) == pytest.approx(1.0)
+    assert sum(table.error_weights) == pytest.approx(0.0, abs=1e-15)
+    assert [len(row) for row in table.a] == list(range(table.stages))
+
+
+@pytest.mark.parametrize(("table", "order"), [(EULER, 1), (RK4, 4), (RKF45, 5)], ids=["euler", "rk4", "rkf45"])
+def test_each_method_has_its_order(table: Tableau, order: int) -> None:
+    # An arm with little friction, so that the steps are limited by accuracy and not by stability.
+    arm = ArmParameters(friction=(0.3, 0.3, 1.0, 0.005))
+    reference = exact(0.8, arm)
+    errors = [np.abs(stepped(table, step_s, 0.8, arm)[0] - reference).max() for step_s in (0.02, 0.01)]
+    assert np.log2(errors[0] / errors[1]) > order - 0.5
+
+
+def test_ten_seconds_agree_with_dop853() -> None:
+    position, _ = stepped(RKF45, 0.001, 10.0)
+    np.testing.assert_allclose(position, exact(10.0), rtol=0, atol=1e-8)
+    at_20_ms, _ = stepped(RKF45, 0.020, 10.0)
+    np.testing.assert_allclose(at_20_ms, exact(10.0), rtol=0, atol=2e-4)
+
+
+def test_embedded_error_tells_how_far_off_the_step_is() -> None:
+    _, coarse = stepped(RKF45, 0.02, 0.02)
+    _, fine = stepped(RKF45, 0.01, 0.01)
+    assert np.all(np.abs(coarse[:2]) > 8 * np.abs(fine[:2]))
+    true = np.abs(stepped(RKF45, 0.02, 0.02)[0] - exact(0.02))
+    assert np.all(np.abs(coarse[:2]) < 100 * true[:2] + 1e-6)
+    assert np.all(np.abs(coarse[:2]) > 0.1 * true[:2])
+
+
+@pytest.mark.parametrize(("table", "limit_s"), [(EULER, 0.01544), (RK4, 0.02150), (RKF45, 0.02839)])
+def test_a_mode_grows_just_beyond_the_limit_and_not_below(table: Tableau, limit_s: float) -> None:
+    def speed_after(step_s: float) -> float:
+        stepper = FixedStep(ReducedDynamics([PAPER]), table, step_s)
+        position, velocity = np.zeros((4, 1)), np.zeros((4, 1))
+        velocity[:2, 0] = 1e-9, -3e-9
+        effort = np.array([[0.0], [0.0], [-0.5 * 9.81], [0.0]])
+        for _ in range(300):
+            stepper.advance(position, velocity, effort)
+        return float(np.abs(velocity[:2]).max())
+
+    assert speed_after(0.98 * limit_s) < 1e-9
+    assert speed_after(1.02 * limit_s) > 1e-8
+
+
+def test_an_unstable_step_is_refused_with_what_would_be_right() -> None:
+    unstable = RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000))
+    with pytest.raises(InputError, match=r"the largest safe step is 22\.7 ms \(20% margin\); give sim.substeps = 2"):
+        check_stable(unstable)
+    check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000, substeps=2)))
+    check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=20_000_000)))
+    with pytest.raises(InputError, match="unstable with euler"):
+        check_stable(RigParameters(arm=PAPER, sim=StepParameters(integrator="euler")))
+
+
+def test_what_has_no_friction_has_no_limit() -> None:
+    assert largest_safe_step(ArmParameters(friction=(0.0, 0.0, 0.0, 0.0)), "rkf45") == float("inf")

@@ -1,0 +1,141 @@
+"""Forward and inverse kinematics: every solution is one, none is missed, and where there is none it says why."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilrig_runtime.errors import InputError
+from hilrig_sim import kinematics
+from hilrig_sim.kinematics import UnreachableError
+from hilrig_sim.model import ArmParameters
+
+ARM = ArmParameters()
+
+
+def inside(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False)
+
+
+joints = st.tuples(*(inside(low, high) for low, high in zip(ARM.lower, ARM.upper, strict=True)))
+
+
+def same_pose(one: np.ndarray, other: np.ndarray, tolerance: float = 1e-9) -> bool:
+    turned = math.remainder(one[3] - other[3], 2 * math.pi)
+    return bool(np.all(np.abs(one[:3] - other[:3]) <= tolerance) and abs(turned) <= tolerance)
+
+
+@given(joints)
+def test_every_solution_reaches_the_pose_and_is_within_the_limits(q: tuple[float, ...]) -> None:
+    pose = kinematics.forward(ARM, q)
+    for solution in kinematics.inverse(ARM, pose):
+        assert np.all(solution >= ARM.lower)
+        assert np.all(solution <= ARM.upper)
+        assert same_pose(kinematics.forward(ARM, solution), pose)
+
+
+@given(joints.filter(lambda q: abs(math.sin(q[1])) > 1e-3))
+def test_the_joints_that_made_a_pose_are_among_its_solutions(q: tuple[float, ...]) -> None:
+    solutions = kinematics.inverse(ARM, kinematics.forward(ARM, q))
+    assert np.abs(solutions - np.array(q)).max(axis=1).min() < 1e-6
+
+
+@given(joints.filter(lambda q: abs(math.sin(q[1])) > 1e-3))
+def test_both_elbows_and_every_turn_of_joint_4_are_found(q: tuple[float, ...]) -> None:
+    pose = kinematics.forward(ARM, q)
+    solutions = kinematics.inverse(ARM, pose)
+    for theta2 in (q[1], -q[1]):
+        bend = math.atan2(ARM.l3 * math.sin(theta2), ARM.l2 + ARM.l3 * math.cos(theta2))
+        theta1 = math.remainder(math.atan2(pose[1], pose[0]) - bend, 2 * math.pi)
+        theta4 = math.remainder(pose[3] - theta1 - theta2, 2 * math.pi)
+        turns = [theta4 + k * 2 * math.pi for k in (-1, 0, 1)]
+        margin = 1e-6
+        if abs(theta1) < ARM.upper[0] - margin:
+            for turn in turns:
+                if abs(turn) < ARM.upper[3] - margin:
+                    expected = (theta1, theta2, q[2], turn)
+                    assert np.abs(solutions - expected).max(axis=1).min() < 1e-6
+
+
+def test_no_solution_is_given_twice() -> None:
+    straight = kinematics.inverse(ARM, (ARM.l2 + ARM.l3, 0.0, 0.1, 0.0))
+    assert len({tuple(np.round(solution, 9)) for solution in straight}) == len(straight)
+
+
+@pytest.mark.parametrize(
+    ("pose", "why"),
+    [
+        ((0.61, 0.0, 0.1, 0.0), "too far: 610.0 mm from joint 1, 600.0 mm is the most"),
+        ((0.05, 0.0, 0.1, 0.0), "in reach, but theta2 would be"),
+        ((0.4, 0.0, 0.2, 0.0), "too high: z goes from -61.0 to 139.0 mm"),
+        ((0.4, 0.0, -0.1, 0.0), "too low"),
+        ((-0.55, 0.0, 0.1, 0.0), "theta1 would be"),
+        ((float("nan"), 0.0, 0.1, 0.0), "must be finite"),
+    ],
+)
+def test_an_unreachable_pose_says_why(pose: tuple[float, ...], why: str) -> None:
+    with pytest.raises(UnreachableError, match=why):
+        kinematics.inverse(ARM, pose)
+    assert issubclass(UnreachableError, InputError)
+
+
+def test_a_pose_nearer_than_the_difference_of_the_links_is_too_near() -> None:
+    arm = ArmParameters(l2=0.4, l3=0.2)
+    with pytest.raises(UnreachableError, match=r"too near: 100\.0 mm from joint 1, 200\.0 mm is the least"):
+        kinematics.inverse(arm, (0.1, 0.0, 0.1, 0.0))
+
+
+def test_a_limit_of_joint_4_can_be_what_is_in_the_way() -> None:
+    arm = ArmParameters(lower=(*ARM.lower[:3], -0.1), upper=(*ARM.upper[:3], 0.1))
+    with pytest.raises(UnreachableError, match="theta4 would be"):
+        kinematics.inverse(arm, (0.4, 0.0, 0.1, math.pi))
+
+
+@given(joints)
+def test_jacobian_is_the_derivative_of_the_pose(q: tuple[float, ...]) -> None:
+    step = 1e-6
+    columns = []
+    for axis in np.eye(4):
+        ahead, behind = (kinematics.forward(ARM, np.array(q) + sign * step * axis) for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * step))
+    np.testing.assert_allclose(kinematics.jacobian(ARM, q), np.array(columns).T, atol=1e-8)
+
+
+@given(joints)
+def test_the_determinant_vanishes_where_the_arm_is_straight_or_folded(q: tuple[float, ...]) -> None:
+    determinant = abs(np.linalg.det(kinematics.jacobian(ARM, q)))
+    assert determinant == pytest.approx(float(kinematics.manipulability(ARM, q)), abs=1e-12)
+    assert kinematics.is_singular(ARM, (q[0], 0.0, q[2], q[3]))
+    assert not kinematics.is_singular(ARM, (q[0], 1.0, q[2], q[3]))
+
+
+def test_many_poses_at_once_are_the_same_as_one_by_one() -> None:
+    rng = np.random.default_rng(1)
+    many = rng.uniform(np.array(ARM.lower)[:, None], np.array(ARM.upper)[:, None], (4, 50))
+    poses, jacobians = kinematics.forward(ARM, many), kinematics.jacobian(ARM, many)
+    for index in range(50):
+        np.testing.assert_array_equal(poses[:, index], kinematics.forward(ARM, many[:, index]))
+        np.testing.assert_array_equal(jacobians[:, :, index], kinematics.jacobian(ARM, many[:, index]))
+
+
+def test_reach_is_a_ring_less_what_the_stops_cut_off() -> None:
+    reach = kinematics.reach(ARM)
+    assert reach.outer == pytest.approx(0.6)
+    assert reach.inner == pytest.approx(2 * 0.3 * math.cos(math.radians(153 / 2)))
+    assert (reach.bottom, reach.top) == pytest.approx((0.139 - 0.2, 0.139))
+    ring = math.pi * (reach.outer**2 - reach.inner**2)
+    assert 0.75 * ring < reach.area < ring
+    assert kinematics.in_reach(ARM, 0.3, 0.2)
+    assert not kinematics.in_reach(ARM, -0.55, 0.0)
+
+
+@given(st.floats(-0.65, 0.65), st.floats(-0.65, 0.65))
+def test_what_is_in_reach_has_a_solution_and_nothing_else(x: float, y: float) -> None:
+    try:
+        found = len(kinematics.inverse(ARM, (x, y, 0.1, 0.0))) > 0
+    except UnreachableError:
+        found = False
+    on_an_edge = abs(math.hypot(x, y) - 0.6) < 1e-6
+    assert on_an_edge or found == bool(kinematics.in_reach(ARM, x, y))

@@ -1,0 +1,223 @@
+"""Parts, tray, table and magnet: what is picked, carried, dropped, and what comes to rest on what."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilrig_sim import kinematics
+from hilrig_sim.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
+from hilrig_sim.plant import TOOL_CONTACT_FLAG, Happening, Plant, PlantEvent
+from hilrig_sim.world import GROUND_BELOW_TABLE, NONE
+
+ARM = ArmParameters()
+TABLE = -0.06
+ON, OFF = np.array([True]), np.array([False])
+
+
+def part(
+    name: str, x: float, y: float, *, below: float = TABLE, mass: float = 0.2, iron: bool = True
+) -> PartParameters:
+    size = (0.04, 0.04, 0.03)
+    return PartParameters(name, "cylinder", size, mass, iron, "#808080", (x, y, below + 0.015), 0.0)
+
+
+TRAY = TrayParameters("tray", (0.1, 0.1, 0.008), (0.3, -0.2, TABLE), 0.3, "#404040", ((0.3, -0.2, TABLE + 0.008),))
+
+
+def plant_over(x: float, y: float, z: float, *parts: PartParameters, arm: ArmParameters = ARM) -> Plant:
+    """A rig whose tool stands at (x, y, z), over a scene of parts and the tray."""
+    plant = Plant([RigParameters(arm=arm, scene=SceneParameters(parts=parts, trays=(TRAY,)))])
+    go_to(plant, x, y, z)
+    return plant
+
+
+def go_to(plant: Plant, x: float, y: float, z: float) -> None:
+    plant.place(0, kinematics.inverse(ARM, (x, y, z, 0.0))[0], np.zeros(4), None)
+
+
+def hold(plant: Plant) -> np.ndarray:
+    """Efforts that carry the quill and what is on it."""
+    return np.array([[0.0], [0.0], [-(ARM.masses[2] + plant.world.payload()[0]) * GRAVITY], [0.0]])
+
+
+def steps(plant: Plant, count: int, effort: np.ndarray, magnet: np.ndarray) -> list[PlantEvent]:
+    return [event for _ in range(count) for event in tuple(plant.step(effort, magnet))]
+
+
+def test_the_magnet_takes_a_part_within_its_reach_and_its_mass_is_carried() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.034, part("a", 0.308, 0.1))
+    (event,) = steps(plant, 1, hold(plant), ON)
+    assert (event.happening, event.part) == (Happening.PART_PICKED, 0)
+    assert plant.world.held[0] == 0
+    assert plant.dynamics.payload[0] == 0.2
+    later = steps(plant, 50, hold(plant), ON)
+    assert Happening.PART_DROPPED not in {event.happening for event in later}
+    assert abs(plant.velocity[2, 0]) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("x", "z", "iron"),
+    [(0.3 + 0.0151, TABLE + 0.03, True), (0.3, TABLE + 0.03 + 0.0052, True), (0.3, TABLE + 0.03, False)],
+    ids=["too far aside", "too high", "not magnetic"],
+)
+def test_the_magnet_takes_nothing_else(x: float, z: float, iron: bool) -> None:
+    plant = plant_over(0.3, 0.1, z, part("a", x, 0.1, iron=iron))
+    assert steps(plant, 1, hold(plant), ON) == []
+    assert plant.world.held[0] == NONE
+
+
+def test_of_two_parts_in_reach_it_takes_the_nearer() -> None:
+    thin = [replace(part(name, x, 0.1), size=(0.01, 0.01, 0.03)) for name, x in (("a", 0.312), ("b", 0.292))]
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, *thin)
+    steps(plant, 1, hold(plant), ON)
+    assert plant.world.held[0] == 1
+
+
+def test_a_held_part_stays_where_it_sits_on_the_magnet_and_turns_with_it() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.308, 0.1))
+    steps(plant, 1, hold(plant), ON)
+    effort = hold(plant)
+    effort[:, 0] += (2.0, -1.0, -2.0, 0.05)
+    for _ in range(40):
+        plant.step(effort, ON)
+        x, y, z, yaw = plant.tool(np.array([0]))[:, 0]
+        world = plant.world
+        assert world.x[0, 0] == pytest.approx(x + 0.008 * np.cos(yaw), abs=1e-12)
+        assert world.y[0, 0] == pytest.approx(y + 0.008 * np.sin(yaw), abs=1e-12)
+        assert world.z[0, 0] == pytest.approx(z - 0.015, abs=1e-12)
+    assert abs(yaw) > 0.1
+
+
+def test_to_take_a_part_along_costs_energy_and_keeps_momentum() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1, mass=1.0))
+    plant.velocity[:, 0] = 0.8, -0.5, 0.0, 0.0
+    before = plant.dynamics.kinetic_energy(plant.position[1], plant.velocity)[0]
+    alpha, a12, a22 = (element[0] for element in plant.dynamics.mass_matrix_12(plant.position[1]))
+    momentum = np.array([[alpha, a12], [a12, a22]]) @ plant.velocity[:2, 0]
+    plant._switched[:] = True
+    plant._switch_magnets(ON)
+    alpha, a12, a22 = (element[0] for element in plant.dynamics.mass_matrix_12(plant.position[1]))
+    np.testing.assert_allclose(np.array([[alpha, a12], [a12, a22]]) @ plant.velocity[:2, 0], momentum, atol=1e-12)
+    after = plant.dynamics.kinetic_energy(plant.position[1], plant.velocity)[0]
+    assert after < 0.95 * before
+
+
+def test_a_dropped_part_falls_freely_and_comes_to_rest_on_the_table() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1))
+    steps(plant, 1, hold(plant), ON)
+    go_up(plant, 0.15)
+    height = plant.world.z[0, 0]
+    dropped = steps(plant, 1, hold(plant), OFF)
+    assert [event.happening for event in dropped] == [Happening.PART_DROPPED]
+    assert plant.dynamics.payload[0] == 0.0
+    assert plant.world.z[0, 0] == pytest.approx(height - 0.5 * GRAVITY * 0.02**2)
+    heights = []
+    for _ in range(30):
+        plant.step(hold(plant), OFF)
+        heights.append(plant.world.z[0, 0])
+    assert heights == sorted(heights, reverse=True)
+    assert heights[-1] == pytest.approx(TABLE + 0.015, abs=1e-12)
+    assert plant.world.at_rest(0)
+    assert not plant.world.moving[0]
+
+
+def go_up(plant: Plant, height: float) -> None:
+    """Move tool and part up at once, as a test may."""
+    plant.position[2, 0] -= height
+    plant._begin_anew()
+    rigs = np.array([0])
+    plant.world.carry(rigs, plant.tool(rigs))
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "rests_on"),
+    [(0.3, -0.2, TABLE + 0.008), (0.42, 0.15, TABLE + 0.03), (0.42, 0.185, TABLE + 0.03), (0.2, 0.25, TABLE)],
+    ids=["tray", "part", "edge of a part", "table"],
+)
+def test_a_dropped_part_rests_on_what_is_below_it(x: float, y: float, rests_on: float) -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1), part("b", 0.42, 0.15))
+    steps(plant, 1, hold(plant), ON)
+    plant.position[:, 0] = kinematics.inverse(ARM, (x, y, 0.1, 0.0))[0]
+    go_up(plant, 0.0)
+    steps(plant, 40, hold(plant), OFF)
+    assert plant.world.z[0, 0] == pytest.approx(rests_on + 0.015, abs=1e-9)
+    assert plant.world.at_rest(0)
+
+
+def test_what_stood_on_a_part_that_is_taken_away_falls() -> None:
+    lower, upper = part("lower", 0.30, 0.1), part("upper", 0.33, 0.1, below=TABLE + 0.03, iron=False)
+    # The tool stands where only the lower one is, for the upper one leaves its middle free.
+    plant = plant_over(0.30, 0.1, TABLE + 0.03, replace(lower, size=(0.05, 0.05, 0.03)), upper)
+    assert plant.world.at_rest(0)
+    steps(plant, 1, hold(plant), ON)
+    assert plant.world.held[0] == 0
+    go_up(plant, 0.1)
+    steps(plant, 20, hold(plant), ON)
+    assert plant.world.z[1, 0] == pytest.approx(TABLE + 0.015, abs=1e-9)
+
+
+def test_a_part_dropped_beyond_the_table_lies_on_the_floor() -> None:
+    scene = SceneParameters(parts=(part("a", 0.3, 0.1),), table_size=(0.7, 0.7))
+    plant = Plant([RigParameters(scene=scene)])
+    go_to(plant, 0.3, 0.1, TABLE + 0.03)
+    steps(plant, 1, hold(plant), ON)
+    plant.position[:, 0] = kinematics.inverse(ARM, (0.1, 0.5, 0.1, 0.0))[0]
+    go_up(plant, 0.0)
+    steps(plant, 60, hold(plant), OFF)
+    assert plant.world.z[0, 0] == pytest.approx(TABLE - GROUND_BELOW_TABLE + 0.015, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "stops_at"),
+    [(0.3, -0.2, TABLE + 0.008), (0.42, 0.15, TABLE + 0.03), (0.2, 0.25, TABLE)],
+    ids=["tray", "part", "table"],
+)
+def test_the_tool_stops_on_what_is_below_it(x: float, y: float, stops_at: float) -> None:
+    plant = plant_over(x, y, 0.1, part("b", 0.42, 0.15))
+    events = steps(plant, 60, np.zeros((4, 1)), OFF)
+    (hit,) = [event for event in events if event.happening is Happening.LIMIT_HIT]
+    assert (hit.joint, hit.upper) == (0, True)
+    assert hit.speed > 0.3
+    assert plant.tool(np.array([0]))[2, 0] == pytest.approx(stops_at, abs=1e-12)
+    assert plant.limit_flags[0] == TOOL_CONTACT_FLAG
+    assert plant.velocity[2, 0] == 0.0
+
+
+def test_a_held_part_stops_the_tool_its_height_earlier() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1), part("b", 0.42, 0.15))
+    steps(plant, 1, hold(plant), ON)
+    plant.position[:, 0] = kinematics.inverse(ARM, (0.45, 0.15, 0.08, 0.0))[0]
+    go_up(plant, 0.0)
+    steps(plant, 60, np.zeros((4, 1)), ON)
+    assert plant.tool(np.array([0]))[2, 0] == pytest.approx(TABLE + 0.06, abs=1e-12)
+    assert plant.world.z[0, 0] == pytest.approx(TABLE + 0.045, abs=1e-12)
+
+
+def test_nothing_is_ever_below_the_table() -> None:
+    rng = np.random.default_rng(8)
+    parts = [part("a", 0.3, 0.1), part("b", 0.42, 0.15), part("c", 0.2, 0.3)]
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, *parts)
+    for step in range(1500):
+        if step % 30 == 0:
+            effort, magnet = rng.uniform((-4, -4, -14, -0.1), (4, 4, 6, 0.1))[:, np.newaxis], rng.random(1) < 0.7
+        plant.step(effort, magnet)
+        assert plant.tool(np.array([0]))[2, 0] >= TABLE - 1e-12
+        assert np.all(plant.world.z[:, 0] - 0.015 >= TABLE - 1e-12)
+
+
+def test_a_reset_puts_arm_and_parts_back() -> None:
+    plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1))
+    steps(plant, 10, hold(plant) + 1.0, ON)
+    plant.reset(0)
+    assert plant.world.held[0] == NONE
+    assert plant.dynamics.payload[0] == 0.0
+    np.testing.assert_array_equal(plant.position[:, 0], ARM.start)
+    np.testing.assert_allclose((plant.world.x[0, 0], plant.world.y[0, 0]), (0.3, 0.1))
+    assert plant.world.moving[0]
+
+
+def test_a_rig_without_parts_or_trays_has_a_table_all_the_same() -> None:
+    plant = Plant([RigParameters()])
+    steps(plant, 60, np.zeros((4, 1)), ON)
+    assert plant.tool(np.array([0]))[2, 0] == pytest.approx(TABLE, abs=1e-12)
