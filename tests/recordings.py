@@ -273,13 +273,14 @@ def write(
     session: str = "20260101T000000Z-rig1-abcd",
     rig: str = "rig1",
     finish: bool = True,
+    configured: bool = True,
     missing: Mapping[str, Collection[int]] = MappingProxyType({}),
     arrival_lag_ns: int = 0,
 ) -> Path:
     """Write messages as the recorder does.
 
-    Without `finish` the file has no end, as after a kill. `missing` leaves out messages by topic and sequence; the
-    second half of the messages reaches the recorder `arrival_lag_ns` late.
+    Without `finish` the file has no end, as after a kill; without `configured` the rig did not say what it is.
+    `missing` leaves out messages by topic and sequence; the second half reaches the recorder `arrival_lag_ns` late.
     """
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=64 * 1024, compression=compression)
@@ -306,8 +307,9 @@ def write(
             "step_ns": str(round(script.step_ms * MS)),
             "parameters_json": PARAMETERS.to_json(),
         }
-        writer.add_metadata("hilrig.config", configuration)
-        writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
+        if configured:
+            writer.add_metadata("hilrig.config", configuration)
+            writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
         sequences = dict.fromkeys(RECORDED, 0)
         for number, one in enumerate(made):
             sequences[one.topic] += 1

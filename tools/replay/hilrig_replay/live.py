@@ -93,7 +93,8 @@ class Follower:
             except DecodeError:
                 self._say(f"a message of {self._rig}/{topic} can't be decoded: another version of hilrig sends it")
         records = self._decoder.take()
-        if count:
+        # The edge goes on repeating its command when the simulation is gone: states are the sign of life.
+        if len(records.states):
             self._heard_ns = now_ns
             if self._silent:
                 self._silent = False

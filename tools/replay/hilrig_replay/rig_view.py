@@ -5,6 +5,7 @@ blocks come out of a file (`replay`) or off the bus (`live`). Everything of a ri
 several runs stand beside each other in one viewer.
 """
 
+import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -257,7 +258,7 @@ class RigView:
         kinds = np.isin(traffic["function"], _READS)
         for code in np.unique(traffic["controller"]):
             controller = self._names[int(code)]
-            safe = controller.replace("/", "_") or "unknown"
+            safe = re.sub(r"[^\w.-]", "_", controller) or "unknown"
             if safe not in self._clients:
                 self._clients.add(safe)
                 for kind, color in _KIND_COLORS.items():

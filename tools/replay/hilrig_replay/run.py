@@ -22,6 +22,7 @@ from hilrig_runtime.errors import InputError
 
 ALL: Final = frozenset({"state", "command", "event", "traffic"})
 BLOCK_ROWS: Final = 20_000
+_USUAL_STEP_NS: Final = 20_000_000
 _SLACK_NS: Final = 2_000_000_000
 """A message arrives at the recorder at most so long after it was sent, as a rule; a range is read that much wider."""
 
@@ -93,9 +94,13 @@ class Run:
         if said:
             return said
         states = next(iter(self.blocks(frozenset({"state"}), rows=1000))).states
-        steps = np.diff(states["step"].astype(np.int64))
-        durations = np.diff(states["sampled_ns"])[steps == 1]
-        return int(np.median(durations)) if durations.size else 20_000_000
+        mine = states[states["incarnation"] == states["incarnation"][0]]
+        steps = int(mine["step"][-1]) - int(mine["step"][0])
+        if not steps:
+            return _USUAL_STEP_NS
+        # Each tick is late by some microseconds; a step is a round number.
+        duration_ns = int(mine["sampled_ns"][-1]) - int(mine["sampled_ns"][0])
+        return max(round(duration_ns / steps / 100_000) * 100_000, 1)
 
     @property
     def parameters_json(self) -> str:

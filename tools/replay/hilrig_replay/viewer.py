@@ -8,7 +8,10 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from pathlib import Path
 from typing import Final
+
+import rerun_cli
 
 from hilrig_runtime.errors import OperationError
 
@@ -20,8 +23,22 @@ _POLL_S: Final = 0.05
 
 
 def environment() -> dict[str, str]:
-    """The environment of a viewer: its usage statistics stay off, as they are on build machines."""
-    return {**os.environ, "CI": "true"}
+    """The environment of a viewer: its usage statistics stay off, as they are on build machines, and its log quiet."""
+    return {"RUST_LOG": "error", **os.environ, "CI": "true"}
+
+
+def executable() -> Path:
+    """The viewer's own program: the Python module of that name would stand between us and it, and not pass signals on.
+
+    Raises:
+        OperationError: it is not installed.
+    """
+    folder = Path(rerun_cli.__file__).parent
+    names = {"win32": ["rerun.exe"], "darwin": ["Rerun.app/Contents/MacOS/Rerun", "rerun"]}.get(sys.platform, ["rerun"])
+    for name in names:
+        if (folder / name).exists():
+            return folder / name
+    raise OperationError(f"the rerun viewer is not installed in {folder}")
 
 
 def open_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) -> "subprocess.Popen[bytes]":
@@ -35,7 +52,7 @@ def open_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) ->
     Raises:
         OperationError: it can't be started.
     """
-    command = [sys.executable, "-m", "rerun", *arguments, "--bind", LOOPBACK, "--port", str(grpc_port)]
+    command = [str(executable()), *arguments, "--bind", LOOPBACK, "--port", str(grpc_port)]
     if web_port is None:
         command += ["--memory-limit", MEMORY_LIMIT, "--hide-welcome-screen"]
     else:

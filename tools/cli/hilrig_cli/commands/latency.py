@@ -1,6 +1,7 @@
 """`hilrig latency`: where the time goes between a state and the torque that answers it."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,21 +40,31 @@ def latency(
         if len(paths) > 1:
             raise InputError(f"--plot draws one run, and {len(paths)} were given")
         check_plot_path(plot)
-    reports = []
+    reports, unreadable = [], []
     for path in paths:
-        run = open_run(path)
-        report = measure(run)
+        try:
+            run = open_run(path)
+            report = measure(run)
+        except InputError as error:
+            # Among many runs a bad one is a line of its own.
+            if len(paths) == 1:
+                raise
+            unreadable.append({"path": str(path), "reason": str(error)})
+            continue
         if plot is not None:
             save_plot(report, run, plot)
         # Of many runs only the figures are kept.
         reports.append(replace(report, table=report.table[:0].copy()))
     if as_json:
-        print(json.dumps(reports[0].as_dict() if len(reports) == 1 else {"runs": [each.as_dict() for each in reports]}))
-    elif len(reports) == 1:
+        many = {"runs": [each.as_dict() for each in reports], "unreadable": unreadable}
+        print(json.dumps(reports[0].as_dict() if len(paths) == 1 else many))
+    elif len(paths) == 1:
         print_report(reports[0])
     else:
         print_overview(reports)
-    if not all(each.fit for each in reports):
+        for bad in unreadable:
+            print(bad["reason"], file=sys.stderr)
+    if unreadable or not all(each.fit for each in reports):
         raise typer.Exit(1)
 
 
@@ -66,7 +77,7 @@ def print_report(report: "LatencyReport") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_replay.latency_plot import STAGE_NAMES
+    from hilrig_replay.palette import STAGE_NAMES
 
     console = Console()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"

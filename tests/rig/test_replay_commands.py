@@ -1,0 +1,88 @@
+"""`hilrig latency` and `hilrig replay` as a user starts them: what they print, what they write, how they end."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from labs import hilrig
+from recordings import Script, make, record, write
+from rrd_files import RrdFile
+
+pytestmark = pytest.mark.rig
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("runs") / "run.mcap", Script(seconds=12.0))
+
+
+def test_latency_prints_a_table_for_people(run: Path) -> None:
+    result = hilrig("latency", run)
+    assert result.returncode == 0, result.stderr
+    for words in ("loop", "register wait", "tick wait", "p99.9", "fit for latency claims"):
+        assert words in result.stdout
+
+
+def test_latency_as_json_is_alone_on_standard_output(run: Path, tmp_path: Path) -> None:
+    result = hilrig("latency", run, "--json", "--plot", tmp_path / "latency.png")
+    report = json.loads(result.stdout)
+    assert report["fit"] is True
+    assert report["loop_ms"]["p50"] == pytest.approx(20, abs=0.1)
+    assert (tmp_path / "latency.png").stat().st_size > 20_000
+
+
+def test_a_recording_that_is_not_fit_ends_with_1(tmp_path: Path) -> None:
+    result = hilrig("latency", record(tmp_path / "run.mcap", Script(seconds=3.0)))
+    assert result.returncode == 1
+    assert "not fit for latency claims" in result.stdout
+
+
+def test_a_folder_is_all_of_its_runs_and_a_bad_one_does_not_hide_the_others(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "good.mcap").write_bytes(run.read_bytes())
+    (tmp_path / "torn.mcap").write_bytes(run.read_bytes()[:5000])
+    result = hilrig("latency", tmp_path, "--json")
+    assert result.returncode == 1
+    answer = json.loads(result.stdout)
+    assert [each["fit"] for each in answer["runs"]] == [True]
+    assert len(answer["unreadable"]) == 1
+    assert "torn" in answer["unreadable"][0]["reason"]
+
+
+@pytest.mark.parametrize("command", [["latency"], ["replay", "--save", "out.rrd"]])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "no MCAP file")],
+)
+def test_a_bad_file_is_one_clear_line(command: list[str], content: bytes | None, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    result = hilrig(*command, path, cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert f"{path}: " in result.stderr
+    assert words in result.stderr
+
+
+def test_a_run_without_a_controller_has_a_picture_but_no_latency(tmp_path: Path) -> None:
+    script = Script(seconds=1.0, controllers=False)
+    path = write(tmp_path / "run.mcap", make(script), script=script)
+    result = hilrig("latency", path)
+    assert result.returncode == 2
+    assert "a recording without commands" in result.stderr
+    assert hilrig("replay", path, "--save", tmp_path / "run.rrd").returncode == 0
+
+
+def test_replay_writes_a_file_that_rerun_reads(run: Path, tmp_path: Path) -> None:
+    result = hilrig("replay", run, "--save", tmp_path / "run.rrd")
+    assert result.returncode == 0, result.stderr
+    assert RrdFile(tmp_path / "run.rrd").rows("/position") == 600
+
+
+def test_two_ways_of_showing_at_once_are_refused(run: Path, tmp_path: Path) -> None:
+    result = hilrig("replay", run, "--save", tmp_path / "run.rrd", "--web")
+    assert result.returncode == 2
+    assert "choose one" in result.stderr

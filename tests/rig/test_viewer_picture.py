@@ -1,0 +1,95 @@
+"""The viewer itself, on a virtual display: a recording opens as the arm, its table and its curves."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from hilrig_replay.rerun_view import save_rrd
+from hilrig_replay.run import open_run
+from hilrig_replay.viewer import environment, executable, free_port, running_viewer
+from labs import HILRIG
+from recordings import Script, record
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
+"""Vulkan in software, of Debian's mesa-vulkan-drivers."""
+
+
+@pytest.fixture(scope="module")
+def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("viewer")
+    save_rrd(open_run(record(folder / "run.mcap", Script(seconds=6.0))), folder / "run.rrd")
+    return folder / "run.rrd"
+
+
+def share_of(
+    picture: np.ndarray, red: tuple[float, float], green: tuple[float, float], blue: tuple[float, float]
+) -> float:
+    """Share of pixels whose channels, 0 to 1, lie in the ranges."""
+    inside = np.ones(picture.shape[:2], dtype=bool)
+    for channel, (low, high) in enumerate((red, green, blue)):
+        inside &= (picture[..., channel] >= low) & (picture[..., channel] <= high)
+    return float(inside.mean())
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None or not DRIVER.exists(), reason="needs xvfb, mesa-vulkan-drivers")
+def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> None:
+    shot = tmp_path / "shot.png"
+    command = ["xvfb-run", "-a", "-s", "-screen 0 4000x3000x24", str(executable()), str(rrd)]
+    command += ["--screenshot-to", str(shot), "--window-size", "1000x600"]
+    environ = {**environment(), "VK_DRIVER_FILES": str(DRIVER), "XDG_RUNTIME_DIR": str(tmp_path)}
+    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100, env=environ)
+    assert shot.exists(), result.stderr
+    picture = imread(shot)[..., :3]
+    scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
+    # The table is light wood, the first link orange, the background nearly black.
+    assert share_of(scene, (0.75, 1), (0.7, 1), (0.6, 0.9)) > 0.1
+    assert share_of(scene, (0.6, 1), (0.35, 0.75), (0, 0.45)) > 0.004
+    assert share_of(scene, (0, 0.15), (0, 0.15), (0, 0.18)) > 0.1
+    curves = picture[:, int(0.6 * picture.shape[1]) :]
+    assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10
+
+
+def test_the_browsers_viewer_is_served_on_this_machine_alone(rrd: Path) -> None:
+    grpc_port, web_port = free_port(), free_port()
+    with running_viewer(str(rrd), grpc_port=grpc_port, web_port=web_port) as viewer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{web_port}/", timeout=10) as page:
+            assert b"<canvas" in page.read()
+        for port in (grpc_port, web_port):
+            with socket.socket() as other:
+                # Nothing listens on another address of this machine, so it is still free.
+                other.bind(("127.0.0.2", port))
+        assert viewer.poll() is None
+    assert viewer.poll() is not None
+
+
+def test_replay_to_a_browser_ends_with_its_viewer_on_a_signal(rrd: Path) -> None:
+    command = [*HILRIG, "replay", str(rrd.with_name("run.mcap")), "--web"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        assert line.startswith("open http://127.0.0.1:"), line
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        eventually(lambda: not session_of(process.pid), timeout_s=5)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.stderr.close()
+
+
+def session_of(leader: int) -> list[int]:
+    """Processes still alive in a process group."""
+    found = subprocess.run(["pgrep", "-g", str(leader)], check=False, capture_output=True, text=True)
+    return [int(pid) for pid in found.stdout.split()]

@@ -1,0 +1,35 @@
+"""A rerun file read back with rerun's own reader: what is in it, by entity path."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import RrdReader
+
+
+class RrdFile:
+    """The tables of a rerun file."""
+
+    def __init__(self, path: Path) -> None:
+        self.tables: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+        self.timelines: set[str] = set()
+        for chunk in RrdReader(path).stream().to_chunks():
+            self.tables[chunk.entity_path].append(chunk.to_record_batch())
+            self.timelines.update(chunk.timeline_names)
+
+    def column(self, path: str, ending: str) -> np.ndarray:
+        """A column of an entity in the order of `sim_time`, one row a time."""
+        batches = [batch for batch in self.tables[path] if "sim_time" in batch.schema.names]
+        rows, times = [], []
+        for batch in batches:
+            names = [name for name in batch.schema.names if name.endswith(ending)]
+            if names:
+                rows.extend(batch.column(names[0]).to_pylist())
+                times.extend(batch.column("sim_time").cast(pa.int64()).to_pylist())
+        order = np.argsort(times, kind="stable")
+        return np.array([rows[at] for at in order])
+
+    def rows(self, path: str) -> int:
+        """Rows of an entity that are on a timeline."""
+        return sum(batch.num_rows for batch in self.tables[path] if "sim_time" in batch.schema.names)

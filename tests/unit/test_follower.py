@@ -1,0 +1,137 @@
+"""A running rig followed on the bus in memory: drawn as it comes, missed when it goes, welcome when it is back."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rerun as rr
+
+from hilrig_replay.live import SILENCE_NS, Follower
+from hilrig_replay.rerun_layout import layout
+from hilrig_replay.streams import to_file
+from hilrig_runtime.clock import ManualClock
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.memory_bus import MemoryBus
+from hilrig_schemas import JointState, RigConfig
+from hilrig_schemas.topics import CONFIG, RIG_TOPICS, Traffic
+from hilrig_sim.urdf import urdf
+from recordings import PARAMETERS, Made, Script, make
+from rrd_files import RrdFile
+
+KEYS = {topic.name: topic.key("lab", "rig1") for topic in RIG_TOPICS}
+
+
+class Watched:
+    """A follower with everything around it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.bus = MemoryBus()
+        self.clock = ManualClock()
+        self.said: list[str] = []
+        self.stream: rr.RecordingStream = to_file(path, "live-rig1", layout(live=True))
+        self.follower = Follower(self.bus, "lab", "rig1", self.stream, self.clock, self.said.append)
+
+    def serve(self) -> None:
+        config = RigConfig(rig="rig1", step_ns=20_000_000, parameters_json=PARAMETERS.to_json(), urdf=urdf(PARAMETERS))
+        self.bus.serve(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
+
+    def send(self, made: list[Made]) -> None:
+        for one in made:
+            self.bus.publisher(KEYS[one.topic], Traffic.CONTROL).put(one.message.SerializeToString())
+
+    def shown(self) -> RrdFile:
+        self.stream.disconnect()
+        return RrdFile(self.path)
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Iterator[Watched]:
+    watched = Watched(tmp_path / "live.rrd")
+    yield watched
+    watched.follower.close()
+    watched.stream.disconnect()
+
+
+def test_what_is_on_the_bus_is_drawn_batch_by_batch(watched: Watched) -> None:
+    watched.serve()
+    assert watched.follower.find(threading.Event())
+    made = [one for one in make(Script(seconds=3.0)) if one.topic != "traffic"]
+    for start in range(0, len(made), 50):
+        watched.send(made[start : start + 50])
+        watched.follower.step()
+    shown = watched.shown()
+    assert shown.rows("/position") == 150
+    assert shown.rows("/scene/joints/d3") == 150
+    assert shown.rows("/stages") > 130
+    assert shown.rows("/events") == 2
+
+
+def test_where_nothing_runs_it_says_what_to_do(watched: Watched) -> None:
+    with pytest.raises(OperationError, match=r"no simulation of rig 'rig1' in lab 'lab' answers.*hilrig up"):
+        watched.follower.find(threading.Event(), timeout_s=0.0)
+
+
+def test_a_wish_to_stop_ends_the_search(watched: Watched) -> None:
+    stopping = threading.Event()
+    stopping.set()
+    assert not watched.follower.find(stopping)
+
+
+def test_silence_and_return_are_said_once(watched: Watched) -> None:
+    watched.serve()
+    watched.follower.find(threading.Event())
+    made = [one for one in make(Script(seconds=1.0)) if one.topic == "state"]
+    watched.send(made[:10])
+    watched.follower.step()
+    for _ in range(3):
+        watched.clock.advance(SILENCE_NS)
+        watched.follower.step()
+    watched.send(made[10:])
+    watched.follower.step()
+    assert watched.said == ["nothing comes from rig1: waiting for it", "rig1 is back"]
+
+
+def test_a_restarted_simulation_goes_on_in_the_same_picture(watched: Watched) -> None:
+    watched.serve()
+    watched.follower.find(threading.Event())
+    made = [one for one in make(Script(seconds=2.0)) if one.topic == "state"]
+    watched.send(made[:50])
+    watched.follower.step()
+    for number, one in enumerate(made[50:]):
+        assert isinstance(one.message, JointState)
+        one.message.incarnation, one.message.step = 99, number + 1
+        one.message.sampled_ns -= 1_000_000_000_000
+    watched.send(made[50:])
+    watched.follower.step()
+    assert watched.shown().rows("/position") == 100
+
+
+def test_what_comes_before_the_first_state_does_not_disturb(watched: Watched) -> None:
+    watched.serve()
+    watched.follower.find(threading.Event())
+    made = make(Script(seconds=1.0))
+    watched.send([one for one in made if one.topic == "command"][:5])
+    watched.follower.step()
+    watched.send([one for one in made if one.topic == "state"])
+    watched.follower.step()
+    assert watched.shown().rows("/position") == 50
+
+
+def test_a_message_of_another_version_is_said_and_passed_over(watched: Watched) -> None:
+    watched.serve()
+    watched.follower.find(threading.Event())
+    watched.bus.publisher(KEYS["state"], Traffic.CONTROL).put(b"\xff\xff\xff")
+    watched.follower.step()
+    assert len(watched.said) == 1
+    assert "can't be decoded" in watched.said[0]
+
+
+def test_what_waits_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    watched.serve()
+    watched.follower.find(threading.Event())
+    state = next(one for one in make(Script(seconds=0.1)) if one.topic == "state")
+    for _ in range(30_000):
+        watched.send([state])
+    assert watched.follower.step() == 20_000

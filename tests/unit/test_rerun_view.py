@@ -1,0 +1,99 @@
+"""What stands in a rerun file is what stands in the recording; read back with rerun's own reader."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilrig_replay.latency import measure
+from hilrig_replay.rerun_view import root_names, save_rrd
+from hilrig_replay.run import open_run
+from hilrig_replay.scene import tips
+from hilrig_runtime.errors import InputError, OperationError
+from recordings import PARAMETERS, Script, make, record, write
+from rrd_files import RrdFile
+
+
+def test_curves_are_the_states_in_degrees_and_millimetres(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=3.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    shown = RrdFile(tmp_path / "run.rrd")
+    scale = np.array([180 / np.pi, 180 / np.pi, 1000, 180 / np.pi])
+    assert np.allclose(shown.column("/position", "scalars"), run.states["position"] * scale)
+    assert np.allclose(shown.column("/velocity", "scalars"), run.states["velocity"] * scale)
+    assert np.allclose(shown.column("/effort/applied", "scalars"), run.states["effort"])
+    assert np.allclose(shown.column("/effort/commanded", "scalars"), run.commands["effort"])
+    assert {"sim_time", "wall", "step"} <= shown.timelines
+
+
+def test_the_stages_end_at_the_loop_latency(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=3.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    shown = RrdFile(tmp_path / "run.rrd")
+    ends = shown.column("/stages", "scalars")
+    loops = measure(run).table["loop"] / 1e6
+    assert ends.shape == (len(loops), 7)
+    assert np.allclose(ends[:, -1], loops)
+    assert (np.diff(ends, axis=1) >= 0).all()
+
+
+def test_the_trail_ends_where_the_tool_is(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=2.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    strips = RrdFile(tmp_path / "run.rrd").column("/scene/trail", "strips")
+    assert np.allclose(strips[:, 0, 1], tips(PARAMETERS.arm, run.states["position"]), atol=1e-6)
+    assert np.allclose(strips[1:, 0, 0], strips[:-1, 0, 1])
+
+
+def test_arm_parts_events_and_requests_are_there(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    shown = RrdFile(tmp_path / "run.rrd")
+    for joint in ("theta1", "theta2", "d3", "theta4"):
+        assert shown.rows(f"/scene/joints/{joint}") == len(run.states)
+    for part in ("red", "blue", "green", "yellow"):
+        assert shown.rows(f"/scene/parts/{part}") == 4
+    assert shown.column("/events", "text").ravel().tolist() == [
+        f"{kind.replace('_', ' ').lower()}: {text}"
+        for kind, text in zip(run.events["kind"], run.events["text"], strict=True)
+    ]
+    reads = shown.column("/modbus/192.0.2.7_40001/reads", "scalars")
+    assert reads.sum() / 10 == pytest.approx((run.traffic["function"] == 3).sum())
+
+
+def test_lanes_hold_changes_only(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=8.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    shown = RrdFile(tmp_path / "run.rrd")
+    magnet = run.states["magnet"]
+    assert shown.column("/lanes/magnet", "state").ravel().tolist() == [
+        "on" if on else "off" for on in magnet[np.concatenate(([True], np.diff(magnet)))]
+    ]
+    assert shown.column("/lanes/torque", "state").ravel().tolist() == ["nobody", "192.0.2.7:40001"]
+
+
+def test_several_runs_stand_beside_each_other(tmp_path: Path) -> None:
+    script = Script(seconds=1.0)
+    paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    runs = [open_run(write(path, make(script), script=script, session=f"session-{path.stem}")) for path in paths]
+    save_rrd(runs, tmp_path / "both.rrd")
+    shown = RrdFile(tmp_path / "both.rrd")
+    for run in runs:
+        assert shown.rows(f"/{run.session}/position") == 50
+    assert len(set(root_names([runs[0], runs[0]]))) == 2
+
+
+def test_a_recording_that_says_nothing_of_its_rig_is_drawn_as_by_default(tmp_path: Path) -> None:
+    script = Script(seconds=1.0)
+    run = open_run(write(tmp_path / "run.mcap", make(script), script=script, configured=False))
+    assert (run.urdf, run.parameters_json, run.step_ns) == ("", "", 20_000_000)
+    save_rrd(run, tmp_path / "run.rrd")
+    assert RrdFile(tmp_path / "run.rrd").rows("/scene/joints/theta1") == 50
+
+
+def test_where_it_can_not_be_written_is_said(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=0.5)))
+    with pytest.raises(InputError, match="there is no folder"):
+        save_rrd(run, tmp_path / "nowhere" / "run.rrd")
+    with pytest.raises(OperationError, match="can't be written: Is a directory"):
+        save_rrd(run, tmp_path)
