@@ -1,5 +1,6 @@
 """The recorder as a service, on a bus within this process: what other services sent is what the files hold."""
 
+import errno
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,12 +11,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_recorder.service import run
+from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig, RecorderConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.service import Service
-from hilrig_schemas import RigConfig
+from hilrig_schemas import Event, RigConfig
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
 from log_streams import FakeSource
 from waiting import eventually
@@ -151,3 +153,131 @@ def test_a_folder_that_cannot_be_written_is_named_at_the_start(tmp_path: Path) -
         Lab(folder).recorder(),
     ):
         pass
+
+
+def test_a_disk_that_fails_one_rig_s_file_is_told_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(tmp_path)
+    sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
+    failing = threading.Event()
+    append = RunWriter._append
+
+    def fail(writer: RunWriter, data: bytes) -> None:
+        if failing.is_set() and writer.path.parent.name == "rig1":
+            raise OSError(errno.EIO, "Input/output error")
+        append(writer, data)
+
+    monkeypatch.setattr(RunWriter, "_append", fail)
+    told: list[Event] = []
+    lab.bus.subscribe("hil/lab/rig1/event", lambda _, payload: told.append(Event.FromString(payload)))
+    with lab.recorder() as service:
+        for rig in ("rig1", "rig2"):
+            edge.start(rig, f"{SESSION}-{rig}", now())
+        lab.send(edge)
+        eventually(lambda: len(list(tmp_path.rglob("*.part"))) == 2)
+        failing.set()
+        for _ in range(50):
+            for rig in ("rig1", "rig2"):
+                sim.state(rig, now())
+            lab.send(sim)
+        eventually(lambda: any("Input/output error" in event.text for event in told))
+        eventually(lambda: "Input/output error" in service.counters.trouble)
+        edge.end("rig2", f"{SESSION}-rig2", now())
+        lab.send(edge)
+        for rig in ("rig1", "rig2"):
+            sim.state(rig, now())
+        lab.send(sim)
+        [path] = eventually(lab.recordings)
+    assert path.parent.name == "rig2"
+    assert metadata(path)["hilrig.summary"]["lost_recorder"] == "0"
+    assert len(payloads(path)) == 53
+    # What stood in the other file when the disk failed waits to be recovered, and is at the next start.
+    failing.clear()
+    with lab.recorder():
+        eventually(lambda: len(lab.recordings()) == 2)
+
+
+def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(tmp_path, queue_entries=40)
+    sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
+    slow, go_on = threading.Event(), threading.Event()
+    close_chunk = RunWriter.close_chunk
+
+    def crawl(writer: RunWriter) -> None:
+        if slow.is_set():
+            go_on.wait(10)
+        close_chunk(writer)
+
+    monkeypatch.setattr(RunWriter, "close_chunk", crawl)
+    with lab.recorder() as service:
+        edge.start("rig1", SESSION, now())
+        lab.send(edge)
+        eventually(lambda: list(tmp_path.rglob("*.part")))
+        slow.set()
+
+        def more() -> int:
+            sim.state("rig1", now(), SESSION)
+            lab.send(sim)
+            return service.counters.lost_recorder or len(sim.sent) > 300
+
+        # The disk takes nothing for a while: first what comes waits, then it is dropped.
+        eventually(more)
+        go_on.set()
+        eventually(lambda: service.counters.queue_depth == 0 and service.counters.lost_recorder)
+        edge.end("rig1", SESSION, now())
+        lab.send(edge)
+        sim.state("rig1", now())
+        lab.send(sim)
+        [path] = eventually(lab.recordings)
+    missing = len(sim.sent) + len(edge.sent) - len(payloads(path))
+    summary = metadata(path)["hilrig.summary"]
+    assert missing > 0
+    assert int(summary["lost_recorder"]) == missing
+    assert summary["lost_transport"] == "0"
+
+
+def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost_between(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hilrig_recorder.files._MIB", 12 * 1024)
+    lab = Lab(tmp_path, rotate_mib=1, min_free_mib=0)
+    sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
+    with lab.recorder():
+        edge.start("rig1", SESSION, now())
+        lab.send(edge)
+
+        def three_files() -> bool:
+            for _ in range(20):
+                sim.state("rig1", now(), SESSION)
+            lab.send(sim)
+            return len(lab.recordings()) >= 2
+
+        eventually(three_files, timeout_s=20)
+        edge.end("rig1", SESSION, now())
+        lab.send(edge)
+        sim.state("rig1", now())
+        lab.send(sim)
+        eventually(lambda: not list(tmp_path.rglob("*.part")))
+    paths = sorted(lab.recordings(), key=lambda path: (len(path.name), path.name))
+    assert [metadata(path)["hilrig.session"]["part"] for path in paths] == [str(n + 1) for n in range(len(paths))]
+    assert sorted(message for path in paths for message in payloads(path)) == sorted(sent(sim, edge))
+
+
+def test_a_session_that_has_ended_is_not_recorded_again_by_the_next_recorder(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    edge = FakeSource("edge/1")
+    with lab.recorder():
+        edge.start("rig1", SESSION, now())
+        lab.send(edge)
+        edge.command("rig1", now(), SESSION)
+        edge.end("rig1", SESSION, now())
+        lab.send(edge)
+        eventually(lab.recordings)
+    before = [path.read_bytes() for path in lab.recordings()]
+    # The streams' caches give the next recorder the session's beginning and end once more.
+    with lab.recorder() as service:
+        eventually(lambda: service.counters.received >= 3)
+    assert [path.read_bytes() for path in lab.recordings()] == before
