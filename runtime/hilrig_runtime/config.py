@@ -282,9 +282,21 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: no valid TOML: {error}") from error
     except ValidationError as error:
-        raise InputError("\n".join(f"{where}: {_sentence(mistake)}" for mistake in error.errors())) from error
+        raise InputError("\n".join(f"{where}: {_sentence(mistake)}" for mistake in _causes(error))) from error
     lab._source = text
     return lab
+
+
+def _causes(error: ValidationError) -> list[Any]:
+    """The mistakes, without the complaint that a list is too short for lack of an item that is itself mistaken."""
+    mistakes: list[Any] = list(error.errors())
+
+    def follows_from_another(mistake: Any) -> bool:
+        place = mistake["loc"]
+        inner = (other["loc"] for other in mistakes if other is not mistake)
+        return mistake["type"] == "too_short" and any(loc[: len(place)] == place for loc in inner)
+
+    return [mistake for mistake in mistakes if not follows_from_another(mistake)]
 
 
 def _sentence(mistake: Any) -> str:

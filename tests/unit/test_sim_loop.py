@@ -1,0 +1,177 @@
+"""The simulation's tick in virtual time: its order, its stamps, what it sends and what it tells of."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import Event
+from hilrig_sim.configured import rig_parameters
+from hilrig_sim.model import RigParameters
+from hilrig_sim.plant import Plant
+from virtual_rig import VirtualRig
+
+
+@pytest.fixture
+def rig() -> VirtualRig:
+    with VirtualRig() as virtual:
+        yield virtual
+
+
+def test_steps_count_from_one_and_carry_incarnation_and_stamps(rig: VirtualRig) -> None:
+    rig.tick(3)
+    assert [state.step for state in rig.states] == [1, 2, 3]
+    assert {state.incarnation for state in rig.states} == {rig.service.incarnation}
+    steps_ns = np.diff([state.sampled_ns for state in rig.states])
+    assert set(steps_ns.tolist()) == {20_000_000}
+    assert rig.states[-1].wall_ns - rig.states[-1].sampled_ns == rig.clock.wall_ns() - rig.clock.monotonic_ns()
+    assert rig.states[-1].lateness_ns == 0
+
+
+def test_the_state_is_sent_before_the_step_with_the_effort_that_acts_from_then_on(rig: VirtualRig) -> None:
+    rig.tick()
+    rig.command((1.0, 0.5, -5.0, 0.0))
+    applied = rig.tick()
+    assert list(applied.effort) == [1.0, 0.5, -5.0, 0.0]
+    assert list(applied.position[:2]) == [0.0, 0.0]
+    following = rig.tick()
+    plant = Plant([rig.parameters[0]])
+    plant.place(0, applied.position, applied.velocity)
+    plant.step(np.array([applied.effort]).T, np.array([False]))
+    assert list(following.position) == plant.position[:, 0].tolist()
+    assert list(following.velocity) == plant.velocity[:, 0].tolist()
+    assert list(following.integration_error) == plant.error[:, 0].tolist()
+
+
+def test_loop_latency_is_the_time_between_two_samples_and_only_where_a_command_took_effect(rig: VirtualRig) -> None:
+    rig.tick(5)
+    rig.clock.advance(7_000_000)
+    rig.command(basis_step=3)
+    arrived_ns = rig.clock.monotonic_ns()
+    state = rig.tick()
+    assert (state.basis_step, state.command_arrived_ns, state.command_seq) == (3, arrived_ns, 1)
+    assert state.loop_latency_ns == state.sampled_ns - rig.states[2].sampled_ns > 0
+    assert state.sampled_ns >= state.command_arrived_ns
+    after = rig.tick()
+    assert (after.basis_step, after.command_arrived_ns, after.loop_latency_ns, after.command_seq) == (0, 0, 0, 1)
+
+
+def test_a_basis_that_is_not_kept_or_not_ours_gives_no_latency(rig: VirtualRig) -> None:
+    rig.tick(2)
+    for options in ({"basis_step": 99}, {"basis_step": 1, "basis_incarnation": 5}, {"basis_step": 0}):
+        rig.command(**options)
+        state = rig.tick()
+        assert (state.basis_step, state.loop_latency_ns) == (0, 0)
+        assert state.command_arrived_ns > 0
+
+
+def test_when_commands_stop_the_effort_goes_to_zero_and_both_ends_are_told(rig: VirtualRig) -> None:
+    rig.command((1.0, 0.0, 0.0, 0.0))
+    assert not rig.tick().safe
+    rig.tick(31)
+    state = rig.states[-1]
+    assert state.safe
+    assert list(state.effort) == [0.0] * 4
+    rig.command((1.0, 0.0, 0.0, 0.0), repeat=True)
+    assert list(rig.tick().effort) == [1.0, 0.0, 0.0, 0.0]
+    told = [event for event in rig.events if event.kind in (Event.COMMAND_LOST, Event.COMMAND_BACK)]
+    assert [event.kind for event in told] == [Event.COMMAND_LOST, Event.COMMAND_BACK]
+    assert told[0].watchdog_data.timeout_ns == 600_000_000
+    assert told[0].watchdog_data.silent_ns > 600_000_000
+    assert told[0].session == "session"
+
+
+def test_a_reset_starts_from_the_start_pose_at_that_very_step(rig: VirtualRig) -> None:
+    rig.command((3.0, -2.0, -5.5, 0.2))
+    rig.tick(20)
+    rig.command((3.0, -2.0, -5.5, 0.2), resets=1)
+    state = rig.tick()
+    assert list(state.position) == [0.0] * 4
+    assert list(state.velocity) == [0.0] * 4
+    assert len(state.parts) == 4
+    (reset,) = [event for event in rig.events if event.kind == Event.RESET]
+    assert reset.step == state.step
+
+
+def test_parts_are_stated_at_the_start_while_they_move_and_once_a_second(rig: VirtualRig) -> None:
+    rig.tick(120)
+    stated = [state.step for state in rig.states if state.parts]
+    assert stated[0] == 1
+    assert np.diff(stated).tolist() == [50, 50]
+    assert [part.name for part in rig.states[0].parts] == ["red", "blue", "green", "yellow"]
+
+
+def test_the_quill_coming_down_is_told_once(rig: VirtualRig) -> None:
+    rig.tick(100)
+    (hit,) = [event for event in rig.events if event.kind == Event.LIMIT_HIT]
+    assert (hit.limit_data.joint, hit.limit_data.upper) == (0, True)
+    shows = next(state for state in rig.states if state.limit_flags & 256)
+    assert hit.step == shows.step
+    assert "mm/s" in hit.text
+
+
+def test_a_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
+    rig.tick(3)
+    rig.clock.advance(130_000_000)
+    state = rig.tick()
+    assert state.missed_steps == 5
+    assert state.step == 4
+    (overrun,) = [event for event in rig.events if event.kind == Event.OVERRUN]
+    assert overrun.overrun_data.missed_steps == 5
+    rig.tick()
+    assert rig.states[-1].missed_steps == 0
+    assert rig.service.counters.overruns == 1
+
+
+def test_overruns_in_a_burst_are_told_of_together(rig: VirtualRig) -> None:
+    for _ in range(30):
+        rig.clock.advance(50_000_000)
+        rig.tick()
+    told = [event for event in rig.events if event.kind == Event.OVERRUN]
+    assert 2 <= len(told) <= 3
+    # The first tick has no deadline to miss.
+    assert rig.service.counters.overruns == 29
+
+
+def test_what_the_step_cannot_follow_comes_back_at_the_start() -> None:
+    arm = ArmConfig(masses_kg=(0.05, 0.02, 0.02), friction=(0.01, 0.01, 0.1, 0.01))
+    with VirtualRig(LabConfig(rigs=(RigSettings(arm=arm),))) as rig, np.errstate(all="ignore"):
+        for turn in range(300):
+            rig.command([32.0, -32.0, 0.0, 1.0] if turn % 2 else [-32.0, 32.0, 0.0, 1.0])
+            rig.tick()
+            if "RESET" in rig.kinds():
+                break
+        reset = rig.events[rig.kinds().index("RESET")]
+        assert reset.severity == Event.ERROR
+        state = rig.tick()
+    assert state.step == reset.step
+    assert list(state.position) == [0.0] * 4
+
+
+def test_rigs_of_one_lab_obey_their_own_commands_only() -> None:
+    lab = LabConfig(rigs=(RigSettings(name="a"), RigSettings(name="b")))
+    with VirtualRig(lab) as rig:
+        rig.command((2.0, 0.0, -4.9, 0.0), rig="b")
+        rig.tick(20)
+        last = {state.rig: state for state in rig.states}
+    assert last["a"].position[0] == 0.0
+    assert last["b"].position[0] > 0.05
+    assert last["a"].safe
+    assert not last["b"].safe
+
+
+def test_parameters_come_back_from_json_exactly() -> None:
+    parameters = rig_parameters(LabConfig(), RigSettings())
+    assert RigParameters.from_json(parameters.to_json()) == parameters
+    assert json.loads(parameters.to_json())["scene"]["parts"][0]["name"] == "red"
+    for text in ("", "{}", "[]", '{"arm": {}, "sim": {}, "scene": {"parts": [{"name": 1}], "trays": []}}'):
+        with pytest.raises(InputError, match="not understood"):
+            RigParameters.from_json(text)
+
+
+def test_a_step_that_would_be_unstable_is_refused_with_the_rig_named() -> None:
+    lab = LabConfig(sim=SimConfig(step_ms=40))
+    with pytest.raises(InputError, match=r"rig 'rig1': the step of 40 ms would be unstable.*sim\.substeps = 2"):
+        rig_parameters(lab, lab.rigs[0])
