@@ -231,7 +231,7 @@ def lab_of(port: int, rigs: int) -> LabConfig:
     return LabConfig.model_validate(
         {
             "edge": {"first_port": port, "max_connections": 64, "max_connections_per_host": 64},
-            "bus": {"first_port": free_ports(3), "express": True},
+            "bus": {"first_port": free_ports(3)},
             "rigs": [{"name": f"rig{number + 1}"} for number in range(rigs)],
         }
     )

@@ -1,11 +1,15 @@
 """A connected controller as a device sees it: who it is, what it may do, and what it was last shown."""
 
 from dataclasses import dataclass
+from typing import Final
 
 Served = tuple[int, int, int, int, int]
 """A state that a controller was shown, which is what its next write is based on: the incarnation of the simulation that
 sent it, its step, when it came to the edge and when it was read (ns, monotonic clock), and the delay added on purpose
 on its way (ns). A plain tuple, for one is made with each read."""
+
+NO_BASIS: Final[Served] = (0, 0, 0, 0, 0)
+"""Nothing was shown."""
 
 
 @dataclass(slots=True, eq=False)

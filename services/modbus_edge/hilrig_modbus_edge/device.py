@@ -13,7 +13,7 @@ from typing import Final, Protocol
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge import codec, registers
-from hilrig_modbus_edge.client import Client, Host
+from hilrig_modbus_edge.client import NO_BASIS, Client, Host, Served
 from hilrig_modbus_edge.image import StateImage
 from hilrig_modbus_edge.lease import Lease
 from hilrig_modbus_edge.registers import Status, Table
@@ -31,6 +31,15 @@ REFUSAL_PERIOD_NS: Final = 1_000 * MS
 
 
 HOSTS_KEPT: Final = 64
+_OF_A_WRITE: Final = (
+    "controller",
+    "basis_incarnation",
+    "basis_step",
+    "state_arrived_ns",
+    "state_served_ns",
+    "state_injected_ns",
+    "write_arrived_ns",
+)
 
 
 class ModbusError(Exception):
@@ -115,6 +124,9 @@ class Device:
         self._echo = 0
         self._last_writer = ""
         self._session_told = ""
+        # Whose word the command is and what it was based on: most writes change neither.
+        self._commander: Client | None = None
+        self._basis: Served | None = None
         self._repeat_due_ns = clock.monotonic_ns()
         self._command = TorqueCommand(rig=rig, effort=(0.0, 0.0, 0.0, 0.0), safe=True)
 
@@ -433,20 +445,21 @@ class Device:
         command = self._command
         command.effort[:] = codec.effort_of(self._torque)
         command.seq += 1
-        command.controller = client.address
-        command.safe = False
+        if client is not self._commander:
+            self._commander = client
+            command.controller = client.address
+            command.safe = False
         command.echo = self._echo
         basis = client.basis
-        if basis is None:
-            self._clear_basis()
-        else:
+        if basis is not self._basis:
+            self._basis = basis
             (
                 command.basis_incarnation,
                 command.basis_step,
                 command.state_arrived_ns,
                 command.state_served_ns,
                 command.state_injected_ns,
-            ) = basis
+            ) = basis or NO_BASIS
         command.write_arrived_ns = arrived_ns
         self._send()
 
@@ -455,21 +468,16 @@ class Device:
         command = self._command
         command.effort[:] = codec.effort_of(self._torque)
         command.seq += 1
-        command.controller = ""
         command.safe = not any(self._torque)
-        self._clear_basis()
-        command.write_arrived_ns = 0
+        for field in _OF_A_WRITE:
+            command.ClearField(field)
+        self._commander = self._basis = None
         self._send()
 
     def _tell_session(self) -> None:
         """A write that moved nothing may have begun a session: the simulation learns of it from a command."""
         if self._command.session != self._session_told:
             self._send_own_command()
-
-    def _clear_basis(self) -> None:
-        command = self._command
-        command.basis_incarnation = command.basis_step = 0
-        command.state_arrived_ns = command.state_served_ns = command.state_injected_ns = 0
 
     def _send(self) -> None:
         command = self._command
