@@ -1,0 +1,114 @@
+"""The simulation as a process: it ticks on the bus, answers who it is, obeys commands, and ends when it is told to."""
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilrig_runtime.config import LabConfig, load_lab
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas import Event, JointState, RigConfig, TorqueCommand
+from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE
+from hilrig_sim.model import RigParameters
+from labs import HILRIG, hilrig, write_lab
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+
+class SimProcess:
+    """`hilrig sim` as a user starts it, and a client of its bus."""
+
+    def __init__(self, config: Path) -> None:
+        self.lab: LabConfig = load_lab(config)
+        self.states: list[JointState] = []
+        self.events: list[Event] = []
+        self.log = config.parent / "sim.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [*HILRIG, "sim", "--config", str(config)], stdout=log, stderr=log, cwd=config.parent
+            )
+        self.bus = ZenohBus(self.lab.bus, "edge", express=True)
+        key = self.lab.name
+        self.bus.subscribe(STATE.key(key, "*"), lambda _, payload: self.states.append(STATE.decode(payload)))
+        self.bus.subscribe(EVENT.key(key, "*"), lambda _, payload: self.events.append(EVENT.decode(payload)))
+        self._command = self.bus.publisher(COMMAND.key(key, "rig1"), COMMAND.traffic)
+        self._seq = 0
+
+    def command(self, *effort: float) -> None:
+        """Command efforts, answering to the newest state."""
+        self._seq += 1
+        newest = self.states[-1]
+        command = TorqueCommand(
+            rig="rig1",
+            session="s",
+            seq=self._seq,
+            effort=effort,
+            basis_step=newest.step,
+            basis_incarnation=newest.incarnation,
+        )
+        self._command.put(command.SerializeToString())
+
+    def close(self) -> None:
+        self.bus.close()
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def sim(tmp_path: Path) -> Iterator[SimProcess]:
+    running = SimProcess(write_lab(tmp_path))
+    try:
+        eventually(lambda: running.states, timeout_s=20)
+        yield running
+    finally:
+        running.close()
+
+
+def test_it_ticks_at_its_step_and_says_what_it_is(sim: SimProcess) -> None:
+    eventually(lambda: len(sim.states) > 60)
+    states = sim.states[:60]
+    assert [state.step for state in states] == list(range(states[0].step, states[0].step + 60))
+    passed_ns = states[-1].sampled_ns - states[0].sampled_ns
+    missed = sum(state.missed_steps for state in states[1:])
+    assert passed_ns == pytest.approx((59 + missed) * 20e6, abs=20e6)
+    (answer,) = sim.bus.ask(CONFIG.key(sim.lab.name, "rig1"), timeout_s=5.0)
+    config = RigConfig.FromString(answer.payload)
+    assert (config.rig, config.incarnation, config.step_ns) == ("rig1", states[0].incarnation, 20_000_000)
+    assert len(RigParameters.from_json(config.parameters_json).scene.parts) == 4
+    assert config.urdf.startswith("<?xml")
+    assert config.lab_toml == sim.lab.source
+    assert "numpy" in config.machine
+
+
+def test_a_command_moves_the_arm_closes_the_loop_and_is_missed_when_it_stops(sim: SimProcess) -> None:
+    sim.command(2.0, 0.0, -5.0, 0.0)
+    applied = eventually(lambda: next((state for state in sim.states if state.command_seq == 1), None))
+    assert list(applied.effort) == [2.0, 0.0, -5.0, 0.0]
+    assert applied.basis_step < applied.step
+    assert applied.loop_latency_ns > 0
+    assert applied.command_arrived_ns <= applied.sampled_ns
+    eventually(lambda: sim.states[-1].position[0] > 0.02)
+    lost = eventually(lambda: next((event for event in sim.events if event.kind == Event.COMMAND_LOST), None))
+    assert lost.rig == "rig1"
+    eventually(lambda: sim.states[-1].safe)
+    assert list(sim.states[-1].effort) == [0.0] * 4
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_it_ends_with_0_when_it_is_told_to(sim: SimProcess, how: signal.Signals) -> None:
+    os.kill(sim.process.pid, how)
+    assert sim.process.wait(timeout=5) == 0
+    assert "Traceback" not in sim.log.read_text()
+
+
+def test_an_unstable_step_is_refused_in_one_line_before_anything_runs(tmp_path: Path) -> None:
+    done = hilrig("sim", "--config", write_lab(tmp_path, extra="sim.step_ms = 60"))
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if "unstable" in line]
+    assert "give sim.substeps = 3 or a shorter sim.step_ms" in line
+    assert "Traceback" not in done.stderr
