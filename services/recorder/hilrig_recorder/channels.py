@@ -5,7 +5,7 @@ it is known whether it goes into any.
 """
 
 import struct
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
@@ -20,6 +20,7 @@ SCHEMA_VERSION: Final = "hilrig.v1"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _FIXED_LENGTH: Final = _MESSAGE.size - 9
 _OPCODE: Final = int(Opcode.MESSAGE)
+_LOG_TIME_AT: Final = 15
 _pack: Final = _MESSAGE.pack
 
 
@@ -50,6 +51,25 @@ CHANNELS: Final = tuple(
 )
 CHANNEL_OF_TOPIC: Final = {name: number for number, name in enumerate(RECORDED, start=1)}
 """Channel id of a topic's name."""
+
+
+class MessageHead(NamedTuple):
+    """What stands before a message's bytes in its record; times are wall clock, ns."""
+
+    channel_id: int
+    sequence: int
+    log_time: int
+    publish_time: int
+
+
+def message_head(record: bytes) -> MessageHead:
+    """The head of a record that `encode_message` made."""
+    return MessageHead(*_MESSAGE.unpack_from(record)[2:])
+
+
+def log_time_of(record: bytes) -> int:
+    """Its arrival alone, ns."""
+    return int.from_bytes(record[_LOG_TIME_AT : _LOG_TIME_AT + 8], "little")
 
 
 def encode_message(channel_id: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> bytes:

@@ -17,7 +17,7 @@ from typing import Final, Protocol
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message, log_time_of, message_head
 from hilrig_recorder.intake import Arrival
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, is_name, parse_rig_key
@@ -142,8 +142,8 @@ class Shelf(Protocol):
 class _Rig:
     name: str
     recordings: list[Recording] = field(default_factory=list)
-    # log time, channel, sequence, publish time, encoded message
-    preroll: deque[tuple[int, int, int, int, bytes]] = field(default_factory=deque)
+    # Encoded messages and nothing about them: for a large lab these are a hundred thousand objects.
+    preroll: deque[bytes] = field(default_factory=deque)
     # log time, transport, recorder: losses within the pre-roll
     losses: deque[tuple[int, int, int]] = field(default_factory=deque)
     sources: dict[str, "_Source"] = field(default_factory=dict)
@@ -224,7 +224,7 @@ class SessionBook:
             channel_id = stream.channel_id
             record = encode_message(channel_id, sequence, log_time, publish_ns, payload)
             rig = stream.rig
-            rig.preroll.append((log_time, channel_id, sequence, publish_ns, record))
+            rig.preroll.append(record)
             for recording in rig.recordings:
                 if not recording.selective or recording.wants(channel_id, sequence, publish_ns):
                     recording.add(channel_id, log_time, record)
@@ -393,9 +393,10 @@ class SessionBook:
         for _, transport, recorder in rig.losses:
             recording.tally.lost_transport += transport
             recording.tally.lost_recorder += recorder
-        for log_time, channel_id, sequence, publish_ns, record in rig.preroll:
-            if recording.wants(channel_id, sequence, publish_ns):
-                recording.add(channel_id, log_time, record)
+        for record in rig.preroll:
+            head = message_head(record)
+            if recording.wants(head.channel_id, head.sequence, head.publish_time):
+                recording.add(head.channel_id, head.log_time, record)
         self._recordings[session] = recording
         rig.recordings.append(recording)
 
@@ -424,7 +425,7 @@ class SessionBook:
         horizon = wall_ns - self._preroll_ns
         for rig in self._rigs.values():
             # A clock set back would keep what is stamped in its future for ever.
-            while rig.preroll and not horizon <= rig.preroll[0][0] <= wall_ns:
+            while rig.preroll and not horizon <= log_time_of(rig.preroll[0]) <= wall_ns:
                 rig.preroll.popleft()
             while rig.losses and not horizon <= rig.losses[0][0] <= wall_ns:
                 rig.losses.popleft()
