@@ -30,13 +30,14 @@ def latency(
     Exit code 1: the recording (or one of them) is not fit for latency claims; the reasons are printed.
     """
     from hilrig_replay.latency import measure
-    from hilrig_replay.latency_plot import check_plot_path, save_plot
     from hilrig_replay.run import open_run
     from hilrig_replay.selection import recordings
     from hilrig_runtime.errors import InputError
 
     paths = recordings(runs)
     if plot is not None:
+        from hilrig_replay.latency_plot import check_plot_path, save_plot
+
         if len(paths) > 1:
             raise InputError(f"--plot draws one run, and {len(paths)} were given")
         check_plot_path(plot)
