@@ -4,6 +4,7 @@ Python, C and Node.js run as a student runs them; each must move the arm to two 
 sent.
 """
 
+import json
 import re
 import shutil
 import subprocess
@@ -16,20 +17,22 @@ from pathlib import Path
 import pytest
 
 from clients import mbpoll_read, mbpoll_write, require_mbpoll
-from edge_rig import EdgeRig, running_edge
-from labs import RunningLab, write_lab
+from edge_rig import EdgeRig, RawClient, running_edge
+from labs import RunningLab, hilrig, write_lab
 from waiting import eventually
 
 pytestmark = pytest.mark.rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+LONG_LEASE = "edge.lease_timeout_ms = 60000"
+"""A command takes its time to start on a busy machine."""
 SECONDS = "7.8"
 """Nearly both poses' time: the arm stands in the second one when the program ends."""
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
-    with RunningLab(write_lab(tmp_path_factory.mktemp("lab"), rigs=3)) as lab:
+    with RunningLab(write_lab(tmp_path_factory.mktemp("lab"), rigs=3, extra=LONG_LEASE)) as lab:
         yield lab
 
 
@@ -93,6 +96,34 @@ def test_an_example_without_a_rig_says_so(name: str, request: pytest.FixtureRequ
     assert done.returncode == 3
     assert "rig" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_teacher_sees_who_holds_a_rig_and_takes_it_back(lab: RunningLab) -> None:
+    def ask(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return hilrig("lease", *arguments, "--config", lab.config)
+
+    with RawClient("127.0.0.1", lab.lab.ports["rig2"]) as holder:
+        holder.write(0, 0)
+        everyone = json.loads(ask("--json").stdout)
+        assert [status["rig"] for status in everyone] == ["rig1", "rig2", "rig3"]
+        assert everyone[1]["holder"] == holder.address
+        assert everyone[1]["connections"] == 1
+        assert holder.address in ask("rig2").stdout.replace("\n", "")
+        taken = ask("rig2", "--release", "--json")
+        assert (taken.returncode, json.loads(taken.stdout)["released"]) == (0, holder.address)
+        assert ask("rig2", "--release").returncode == 1
+        assert holder.write(0, 0).hex() == "9006"
+
+
+def test_questions_that_cannot_be_answered_say_why(lab: RunningLab, tmp_path: Path) -> None:
+    unknown = hilrig("lease", "rig9", "--config", lab.config)
+    assert unknown.returncode == 2
+    assert "rig1, rig2, rig3" in unknown.stderr
+    assert hilrig("lease", "--release", "--config", lab.config).returncode == 2
+    nobody = hilrig("lease", "--config", write_lab(tmp_path))
+    assert nobody.returncode == 3
+    assert "no edge answers" in nobody.stderr
+    assert "Traceback" not in nobody.stderr
 
 
 def test_two_foreign_clients_at_once_and_the_lease_between_them(in_c: Path) -> None:

@@ -12,6 +12,11 @@ NO_BASIS: Final[Served] = (0, 0, 0, 0, 0)
 """Nothing was shown."""
 
 
+def address_of(host: str, port: int) -> str:
+    """ "host:port"; an IPv6 host stands in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 @dataclass(slots=True, eq=False)
 class Host:
     """The machine that connections come from: one may read and another write."""

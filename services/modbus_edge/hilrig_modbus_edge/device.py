@@ -13,7 +13,7 @@ from typing import Final, Protocol
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge import codec, registers
-from hilrig_modbus_edge.client import NO_BASIS, Client, Host, Served
+from hilrig_modbus_edge.client import NO_BASIS, Client, Host, Served, address_of
 from hilrig_modbus_edge.image import StateImage
 from hilrig_modbus_edge.lease import Lease
 from hilrig_modbus_edge.registers import Status, Table
@@ -136,7 +136,7 @@ class Device:
         """A controller connected."""
         known = self._hosts.setdefault(host, Host(host))
         known.connections += 1
-        client = Client(f"{host}:{port}", known, may_write, last_request_ns=self._monotonic_ns())
+        client = Client(address_of(host, port), known, may_write, last_request_ns=self._monotonic_ns())
         self.clients.add(client)
         return client
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.client import Client
+from hilrig_modbus_edge.client import Client, address_of
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, MAX_LENGTH, MIN_LENGTH, Request, split
 from hilrig_modbus_edge.pdu import answer, exception
@@ -117,7 +117,7 @@ class RigServer:
         self.counters.refused += 1
         times = self._throttle.count((host, reason), self.monotonic_ns())
         if times:
-            self.device.connection_refused(f"{host}:{port}", reason, times)
+            self.device.connection_refused(address_of(host, port), reason, times)
 
     def count_malformed(self, client: Client, why: str) -> None:
         """Count a connection that is closed for what it sent, and say so, once in a while."""

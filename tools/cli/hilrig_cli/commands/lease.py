@@ -80,7 +80,9 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("rig", "held by", "last request", "session", "connections", "watchdog")
+    table = Table()
+    for column in ("rig", "held by", "last request", "session", "connections", "watchdog"):
+        table.add_column(column, no_wrap=column in ("rig", "held by"), overflow="fold")
     for status in statuses:
         off = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
         table.add_row(
