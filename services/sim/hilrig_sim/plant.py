@@ -19,7 +19,7 @@ from hilrig_sim.integrators import TABLEAUS, Tableau
 from hilrig_sim.model import RigParameters
 from hilrig_sim.stepping import FixedStep
 from hilrig_sim.stops import crossing, stop_outward
-from hilrig_sim.world import NONE, TOUCHING, World
+from hilrig_sim.world import ALL, NONE, TOUCHING, World
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,6 +29,7 @@ TOOL_CONTACT_FLAG: Final = 1 << 8
 
 
 _TRUE: Final = b"\x01"
+_FALSE: Final = b"\x00"
 
 
 class Happening(Enum):
@@ -80,7 +81,7 @@ class Plant:
         """q̇: rad/s, rad/s, m/s, rad/s, (4, N)."""
         self.error = np.zeros((4, count))
         """Embedded estimate of the last integration step's error of q, (4, N)."""
-        self.world = World([rig.scene for rig in rigs])
+        self.world = World([rig.scene for rig in rigs], max(arm.l2 + arm.l3 for arm in self._arms))
         self.dynamics = ReducedDynamics(self._arms)
         self._integrator = FixedStep(self.dynamics, self._tableau, self._step)
         self._l1 = np.array([arm.l1 for arm in self._arms])
@@ -122,14 +123,17 @@ class Plant:
         """For each rig: bit j-1 joint j on its lower stop, bit 3+j on its upper one, bit 8 tool on what is below it."""
         return self._flags
 
-    def tool(self, rigs: Ints) -> Floats:
+    def tool(self, rigs: Ints | slice) -> Floats:
         """Poses (x, y, z, yaw) of the tools of some rigs, (4, K); (1)–(4)."""
-        theta1, theta2, d3, theta4 = self.position[:, rigs]
+        theta1, theta2, d3, theta4 = position = self.position[:, rigs]
         l2, l3 = self.dynamics.l2[rigs], self.dynamics.l3[rigs]
+        pose = np.empty_like(position)
         sum12 = theta1 + theta2
-        x = l2 * np.cos(theta1) + l3 * np.cos(sum12)
-        y = l2 * np.sin(theta1) + l3 * np.sin(sum12)
-        return np.stack([x, y, self._l1[rigs] - d3, sum12 + theta4])
+        pose[0] = l2 * np.cos(theta1) + l3 * np.cos(sum12)
+        pose[1] = l2 * np.sin(theta1) + l3 * np.sin(sum12)
+        np.subtract(self._l1[rigs], d3, pose[2])
+        np.add(sum12, theta4, pose[3])
+        return pose
 
     def reset(self, rig: int) -> None:
         """Put a rig and its parts back to the start, at rest."""
@@ -271,7 +275,8 @@ class Plant:
         np.logical_and(self._contact_unknown, self._low, self._contact_unknown)
         if not any_true(self._contact_unknown):
             return
-        rigs = np.flatnonzero(self._contact_unknown)
+        # A view where all are asked for: with few rigs, to pick columns costs more than to compute with them.
+        rigs = np.flatnonzero(self._contact_unknown) if _FALSE in self._contact_unknown.tobytes() else ALL
         self._contact_known[:, rigs] = place[:, rigs]
         tip = self.tool(rigs)
         bottom = self._l1[rigs] - self._start_position[2, rigs] - world.held_height[rigs]

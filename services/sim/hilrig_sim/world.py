@@ -32,11 +32,13 @@ GROUND_BELOW_TABLE: Final = 0.75
 class World:
     """The scenes of N rigs."""
 
-    def __init__(self, scenes: Sequence[SceneParameters]) -> None:
+    def __init__(self, scenes: Sequence[SceneParameters], reach: float) -> None:
+        """Set up the scenes of rigs whose tools stay within `reach` of joint 1, m."""
         count = len(scenes)
         self._scenes = tuple(scenes)
         self.part_names = tuple(tuple(part.name for part in scene.parts) for scene in scenes)
         rows = max(len(scene.parts) for scene in scenes)
+        self._row_numbers = np.arange(rows)[:, np.newaxis]
         self.x = np.full((rows, count), FAR_AWAY)
         self.y = np.full((rows, count), FAR_AWAY)
         self.z = np.zeros((rows, count))
@@ -65,7 +67,7 @@ class World:
                 self._attracted[row, rig] = part.ferromagnetic
         self._reach = np.array([scene.magnet_reach for scene in scenes])
         self._gap = np.array([scene.magnet_gap for scene in scenes])
-        self._surfaces = _Surfaces(scenes)
+        self._surfaces = _Surfaces(scenes, reach)
         self.moving = np.zeros(count, dtype=np.bool_)
         """Where a part moved in the last step, (N,)."""
         self._any_moving = False
@@ -170,9 +172,11 @@ class World:
         """
         return self._support(rigs, x, y, self._held_radius[rigs], bottom, self.held[rigs])
 
-    def footprint_centre(self, rigs: Ints, tip: Floats) -> tuple[Floats, Floats]:
+    def footprint_centre(self, rigs: Rigs, tip: Floats) -> tuple[Floats, Floats]:
         """World x, y, m, (K,) each, of what each of these rigs would set down: the held part's centre or the tip."""
         x, y, _, yaw = tip
+        if not self.holding:
+            return x, y
         c, s = np.cos(yaw), np.sin(yaw)
         grip_x, grip_y, _ = self._grip[:, rigs]
         return x + (c * grip_x - s * grip_y), y + (s * grip_x + c * grip_y)
@@ -235,11 +239,8 @@ class World:
 
     def _refresh_highest(self, rigs: Ints) -> None:
         top = self.z[:, rigs] + self.half_height[:, rigs]
-        top = np.where(self._rows() == self.held[rigs], -np.inf, top)
+        top = np.where(self._row_numbers == self.held[rigs], -np.inf, top)
         self.highest[rigs] = np.maximum(top.max(axis=0, initial=-np.inf), self._surfaces.highest[rigs])
-
-    def _rows(self) -> Ints:
-        return np.arange(self.x.shape[0])[:, np.newaxis]
 
     def _bottom(self, row: int, rig: int) -> float:
         return float(self.z[row, rig] - self.half_height[row, rig])
@@ -262,18 +263,24 @@ class World:
         top = self.z[:, rigs] + self.half_height[:, rigs]
         under = (dx * dx + dy * dy < together * together) & (top <= bottom + TOUCHING)
         # A held part hangs on the magnet: nothing stands on it.
-        under &= (self._rows() != ignored) & (self._rows() != self.held[rigs])
+        under &= self._row_numbers != ignored
+        if self.holding:
+            under &= self._row_numbers != self.held[rigs]
         return np.asarray(np.maximum(height, np.where(under, top, -np.inf).max(axis=0)))
 
 
 class _Surfaces:
     """What never moves: the floor, each rig's table and trays."""
 
-    def __init__(self, scenes: Sequence[SceneParameters]) -> None:
+    def __init__(self, scenes: Sequence[SceneParameters], reach: float) -> None:
         count = len(scenes)
         self._table = np.array([scene.table_height for scene in scenes])
         self._table_centre = np.array([scene.table_centre for scene in scenes]).T.copy()
         self._table_half = np.array([scene.table_size for scene in scenes]).T / 2
+        edge = self._table_half - np.abs(self._table_centre)
+        beside_the_tip = max(scene.magnet_reach for scene in scenes)
+        self._is_table_everywhere = bool(np.all(edge >= reach + beside_the_tip))
+        """No tool and no part gets beyond the edge of any table."""
         rows = max(len(scene.trays) for scene in scenes)
         self._tray = np.zeros((5, rows, count))
         self._tray[0] = FAR_AWAY
@@ -289,11 +296,12 @@ class _Surfaces:
 
     def under(self, rigs: Rigs, x: Floats, y: Floats, radius: Floats, bottom: Floats) -> Floats:
         """Highest of them, m, (K,), that is under any of a disc and not above `bottom`."""
-        table = self._table[rigs]
-        half_x, half_y = self._table_half[:, rigs]
-        centre_x, centre_y = self._table_centre[:, rigs]
-        beside = (np.abs(x - centre_x) > half_x + radius) | (np.abs(y - centre_y) > half_y + radius)
-        height = np.where(beside | (table > bottom + TOUCHING), table - GROUND_BELOW_TABLE, table)
+        height = table = self._table[rigs]
+        if not self._is_table_everywhere:
+            half_x, half_y = self._table_half[:, rigs]
+            centre_x, centre_y = self._table_centre[:, rigs]
+            beside = (np.abs(x - centre_x) > half_x + radius) | (np.abs(y - centre_y) > half_y + radius)
+            height = np.where(beside | (table > bottom + TOUCHING), table - GROUND_BELOW_TABLE, table)
         if not self._rows:
             return height
         tray_x, tray_y, c, s, top = self._tray[:, :, rigs]
