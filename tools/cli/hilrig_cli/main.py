@@ -11,6 +11,7 @@ import typer
 from hilrig_cli.commands import (
     certs,
     check,
+    compare,
     demo,
     export,
     figures,
@@ -22,6 +23,7 @@ from hilrig_cli.commands import (
     recover,
     registers,
     replay,
+    report,
     runs,
     services,
     up,
@@ -56,6 +58,8 @@ app.command(rich_help_panel=SERVICES)(services.recorder)
 app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
 app.command(rich_help_panel=REVIEW)(replay.replay)
+app.command(rich_help_panel=REVIEW)(compare.compare)
+app.command(rich_help_panel=REVIEW)(report.report)
 app.command(rich_help_panel=REVIEW)(verify.verify)
 app.command(rich_help_panel=REVIEW)(figures.figures)
 app.command(rich_help_panel=REVIEW)(recover.recover)

@@ -5,7 +5,7 @@ state that the controller had last been served. Five stages are differences of t
 both ways over the bus, is what remains. So the six add up exactly, and no clocks are compared (docs/timing.md).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hilrig_replay.columns import COMMAND, STATE, Rows
 from hilrig_replay.diagnosis import Evidence, Finding, diagnose
 from hilrig_replay.fitness import FitnessWatch, Lost
+from hilrig_replay.records import Records
 from hilrig_replay.run import Run
 from hilrig_runtime.errors import InputError
 
@@ -180,8 +181,12 @@ def _stages(states: Rows, commands: Rows) -> NDArray[np.void]:
     return samples
 
 
-def measure(run: Run) -> LatencyReport:
+def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyReport:
     """Go through a run once, a block at a time: its samples, their statistics and the judgement.
+
+    Args:
+        run: the recording.
+        also: gets each block on the way, with states, commands, parts and events, so that one pass serves several.
 
     Raises:
         InputError: nothing was commanded in it, or the file is damaged.
@@ -193,7 +198,9 @@ def measure(run: Run) -> LatencyReport:
     matcher = Matcher()
     found = []
     watch = FitnessWatch(run)
-    for block in run.blocks(frozenset({"state", "command"})):
+    for block in run.blocks(frozenset({"state", "command", "event"})):
+        if also is not None:
+            also(block)
         found.append(matcher.add(block.states, block.commands))
         watch.add(block.states, block.commands)
     samples = in_order(found)

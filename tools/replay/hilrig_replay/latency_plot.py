@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hilrig_replay.latency import STAGES, LatencyReport
-from hilrig_replay.palette import STAGE_COLORS, STAGE_NAMES
+from hilrig_replay.palette import INK, STAGE_COLORS, STAGE_NAMES
 from hilrig_replay.run import Run
 from hilrig_runtime.errors import InputError, OperationError
 
 FORMATS: Final = (".png", ".svg", ".pdf")
 
-_INK: Final = "#333333"
 _MARK: Final = "#d62728"
 _POINTS: Final = 20_000
 
@@ -47,6 +46,23 @@ def save_plot(report: LatencyReport, run: Run, path: Path) -> None:
     check_plot_path(path)
     if report.loop_ms is None:
         raise InputError(f"{run.path}: no latency samples, so there is nothing to draw")
+    save_figure(latency_figure(report, run), path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a picture; its ending tells the format.
+
+    Raises:
+        OperationError: it can't be written.
+    """
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+
+
+def latency_figure(report: LatencyReport, run: Run) -> Figure:
+    """The picture itself, of a report with samples."""
     figure = Figure(figsize=(11, 7), layout="constrained", dpi=110)
     (histogram, stages), (tail, history) = figure.subplots(2, 2, width_ratios=(1.3, 1))
     loop_ms = report.table["loop"] / 1e6
@@ -59,12 +75,9 @@ def save_plot(report: LatencyReport, run: Run, path: Path) -> None:
         f"Loop latency of {report.session}\n"
         f"{report.samples} samples, step {report.step_ms:g} ms, controller {report.controller or '(none)'} · {fitness}",
         fontsize=11,
-        color=_INK,
+        color=INK,
     )
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+    return figure
 
 
 def _histogram(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
@@ -103,8 +116,8 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
     for row, stage in enumerate(STAGES):
         statistics = report.stages_ms[stage]
         axes.barh(row, statistics.p50, color=STAGE_COLORS[stage], height=0.6)
-        axes.plot([statistics.p50, statistics.p99], [row, row], color=_INK, linewidth=1.2)
-        axes.plot([statistics.p99], [row], marker="|", color=_INK, markersize=9)
+        axes.plot([statistics.p50, statistics.p99], [row, row], color=INK, linewidth=1.2)
+        axes.plot([statistics.p99], [row], marker="|", color=INK, markersize=9)
         axes.annotate(
             f"{statistics.p50:.2f}",
             (statistics.p99, row),
@@ -112,7 +125,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
             textcoords="offset points",
             va="center",
             fontsize=8,
-            color=_INK,
+            color=INK,
         )
     axes.set_yticks(range(len(STAGES)), [STAGE_NAMES[stage] for stage in STAGES])
     axes.invert_yaxis()
@@ -163,8 +176,8 @@ def _history(axes: Axes, time_s: NDArray[np.float64], loop_ms: NDArray[np.float6
 
 
 def _label(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=9, loc="left", color=_INK)
-    axes.set_xlabel(x, fontsize=8, color=_INK)
-    axes.set_ylabel(y, fontsize=8, color=_INK)
-    axes.tick_params(labelsize=8, colors=_INK)
+    axes.set_title(title, fontsize=9, loc="left", color=INK)
+    axes.set_xlabel(x, fontsize=8, color=INK)
+    axes.set_ylabel(y, fontsize=8, color=INK)
+    axes.tick_params(labelsize=8, colors=INK)
     axes.spines[["top", "right"]].set_visible(False)

@@ -2,6 +2,7 @@
 
 from typing import Final
 
+INK: Final = "#333333"
 STAGE_NAMES: Final = {
     "register_wait": "register wait",
     "controller": "controller",

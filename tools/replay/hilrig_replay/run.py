@@ -83,9 +83,14 @@ class Run:
         return self._said("session", "controller")
 
     @property
+    def started(self) -> str:
+        """When the session began, UTC, as recorded; empty: the file does not say it."""
+        return self._said("session", "start")
+
+    @property
     def ended(self) -> str:
-        """How the recording ended; empty: the file does not say it."""
-        return self._said("summary", "ended")
+        """How the recording ended, and why; empty: the file does not say it."""
+        return ": ".join(filter(None, (self._said("summary", "ended"), self._said("summary", "reason"))))
 
     @cached_property
     def step_ns(self) -> int:

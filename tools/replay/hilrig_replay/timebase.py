@@ -16,6 +16,8 @@ class Timebase:
     def __init__(self) -> None:
         self.start_wall_ns = 0
         """The first state on the wall clock, ns since 1970-01-01 UTC; 0: none has come."""
+        self.origin_ns = 0
+        """What counts as time zero, ns from the first state: moved to align runs with each other."""
         self._offsets: dict[int, int] = {}
         self._anchor: tuple[int, int] = (0, 0)
 
@@ -38,12 +40,12 @@ class Timebase:
         """When the rows were sent, shape as `rows`: ns from the run's first state."""
         names = rows.dtype.names or ()
         if "sampled_ns" not in names:
-            return np.asarray(rows["wall_ns"] - self.start_wall_ns)
+            return np.asarray(rows["wall_ns"] - self.start_wall_ns - self.origin_ns)
         times = rows["sampled_ns"].copy()
         incarnations = rows["incarnation"]
         for incarnation, offset in self._offsets.items():
             times[incarnations == incarnation] += offset
-        return np.asarray(times)
+        return np.asarray(times - self.origin_ns)
 
     def steps(self, rows: Rows, step_ns: int) -> NDArray[np.int64]:
         """The simulation's step at the time of rows, shape as `rows`; where they don't say it, by the wall clock."""

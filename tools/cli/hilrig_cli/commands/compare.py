@@ -1,0 +1,76 @@
+"""`hilrig compare`: how one run differs from another."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+if TYPE_CHECKING:
+    from hilrig_replay.compare import Comparison
+
+
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="A.MCAP B.MCAP…", help="Recordings; the first is the reference.")
+    ],
+    align: Annotated[
+        str, typer.Option(help="What is time zero: motion, start, or an event's kind, such as part_picked.")
+    ] = "motion",
+    plot: Annotated[Path | None, typer.Option(help="Draw them (.png, .svg, .pdf).", show_default=False)] = None,
+    save: Annotated[
+        Path | None, typer.Option(metavar="BOTH.RRD", help="Write a rerun file with all arms.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Align runs in time and show how they differ from the first: positions, the tool, torques, loop latency."""
+    from hilrig_replay.compare import compare as compare_runs
+    from hilrig_replay.compare import save_comparison_plot
+    from hilrig_replay.rerun_view import save_rrd
+    from hilrig_replay.run import open_run
+
+    opened = [open_run(path) for path in runs]
+    comparison = compare_runs(opened, align)
+    if plot is not None:
+        save_comparison_plot(comparison, plot)
+    if save is not None:
+        save_rrd(opened, save)
+    if as_json:
+        print(json.dumps(comparison.as_dict()))
+    else:
+        _print(comparison)
+
+
+def _print(comparison: "Comparison") -> None:
+    from math import degrees
+
+    from rich.console import Console
+    from rich.table import Table
+
+    reference = comparison.summaries[0]
+    title = f"Against {reference.session}, aligned by {comparison.aligned_by}"
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column("")
+    for difference in comparison.differences:
+        table.add_column(difference.session, justify="right", overflow="fold")
+    each = comparison.differences
+    table.add_row("common time, s", *(f"{one.overlap_s:.2f}" for one in each), end_section=True)
+    table.add_row("tools apart, rms, mm", *(f"{one.tool_rms_mm:.3f}" for one in each))
+    table.add_row("tools apart, largest, mm", *(f"{one.tool_max_mm:.3f}" for one in each), end_section=True)
+    for joint, (name, unit) in enumerate((("θ1", "°"), ("θ2", "°"), ("d3", "mm"), ("θ4", "°"))):
+
+        def shown(value: float, in_mm: bool = unit == "mm") -> str:
+            return f"{value * 1000 if in_mm else degrees(value):.3f}"
+
+        figures = (f"{shown(one.position_rms[joint])} / {shown(one.position_max[joint])}" for one in each)
+        table.add_row(f"{name}, rms / largest, {unit}", *figures, end_section=joint == 3)
+    efforts = (" ".join(f"{value:.3f}" for value in one.effort_rms) for one in each)
+    table.add_row("τ1 τ2 τ3 τ4, rms, N·m (τ3: N)", *efforts, end_section=True)
+    for name, values in (
+        ("loop latency p50, ms more", [one.loop_p50_ms for one in each]),
+        ("loop latency p99, ms more", [one.loop_p99_ms for one in each]),
+    ):
+        table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
+    Console().print(table)

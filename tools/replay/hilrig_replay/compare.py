@@ -1,0 +1,166 @@
+"""Runs beside each other: aligned in time, how far they differ in motion, torque and latency.
+
+The first run is the reference. Runs are aligned by their first state, by the first motion of the arm, or by the first
+event of a kind; then every other run is interpolated at the reference's times, where both were recorded.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.run import Run
+from hilrig_replay.summary import Course, RunSummary, summarise
+from hilrig_runtime.errors import InputError
+
+ALIGNMENTS: Final = ("motion", "start")
+MOVING: Final = (0.01, 0.01, 0.005, 0.01)
+"""A joint faster than this moves; rad/s, rad/s, m/s, rad/s."""
+SHORTEST_S: Final = 0.1
+
+Four = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One run against the reference, over the time that both have."""
+
+    session: str
+    overlap_s: float
+    position_rms: Four
+    """Root mean square; rad, rad, m, rad."""
+    position_max: Four
+    """Largest magnitude; rad, rad, m, rad."""
+    tool_rms_mm: float
+    """Distance of the tools, root mean square, mm."""
+    tool_max_mm: float
+    effort_rms: Four
+    """N·m, N·m, N, N·m."""
+    loop_p50_ms: float | None
+    """Loop latency's median less the reference's, ms; None: one of them has none."""
+    loop_p99_ms: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Aligned runs, and their differences from the first."""
+
+    aligned_by: str
+    summaries: tuple[RunSummary, ...]
+    """Courses are on the aligned time axis."""
+    origins_s: tuple[float, ...]
+    """Aligned zero in each run's own time, s."""
+    differences: tuple[Difference, ...]
+    """One a run after the first."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return {
+            "aligned_by": self.aligned_by,
+            "runs": [
+                {**summary.as_dict(), "origin_s": origin}
+                for summary, origin in zip(self.summaries, self.origins_s, strict=True)
+            ],
+            "differences": [asdict(difference) for difference in self.differences],
+        }
+
+
+def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
+    """Compare runs with the first of them.
+
+    Args:
+        runs: two or more; their time axes are moved (`timebase.origin_ns`) to the aligned zero.
+        align: `motion`, `start`, or an event's kind such as `PART_PICKED`.
+
+    Raises:
+        InputError: fewer than two runs, one that does not have what it is to be aligned by, or no common time.
+    """
+    if len(runs) < 2:
+        raise InputError("a comparison needs two runs or more")
+    for run in runs:
+        run.timebase.origin_ns = 0
+    origins_ns = [origin_ns(run, align) for run in runs]
+    for run, origin in zip(runs, origins_ns, strict=True):
+        run.timebase.origin_ns = origin
+    summaries = [summarise(run) for run in runs]
+    reference = summaries[0]
+    return Comparison(
+        aligned_by=align,
+        summaries=tuple(summaries),
+        origins_s=tuple(origin / 1e9 for origin in origins_ns),
+        differences=tuple(_difference(reference, other) for other in summaries[1:]),
+    )
+
+
+def origin_ns(run: Run, align: str) -> int:
+    """Aligned zero in a run's own time, ns.
+
+    Raises:
+        InputError: it has no motion, or no such event.
+    """
+    if align == "start":
+        return 0
+    if align == "motion":
+        # Before the session the arm may still settle: motion counts from the first command on.
+        for block in run.blocks(frozenset({"state"})):
+            moving = (np.abs(block.states["velocity"]) > MOVING).any(axis=1) & (block.states["command_seq"] > 0)
+            found = block.states[moving][:1]
+            if len(found):
+                return int(run.time_ns(found)[0])
+        raise InputError(f"{run.path}: the arm never moves, so it can't be aligned by motion; --align start can")
+    wanted = align.upper().replace("-", "_").replace(" ", "_")
+    events = run.events
+    found = events[events["kind"] == wanted][:1]
+    if not len(found):
+        kinds = ", ".join(sorted(set(events["kind"]))) or "none"
+        raise InputError(f"{run.path}: has no event {wanted}; it has {kinds}")
+    return int(run.time_ns(found)[0])
+
+
+def _difference(reference: RunSummary, other: RunSummary) -> Difference:
+    ours, theirs = reference.course, other.course
+    low = max(ours.time_s[0], theirs.time_s[0])
+    high = min(ours.time_s[-1], theirs.time_s[-1])
+    if high - low < SHORTEST_S:
+        raise InputError(f"{reference.session} and {other.session} have no common time once they are aligned")
+    at = ours.time_s[(ours.time_s >= low) & (ours.time_s <= high)]
+    position = _at(theirs, theirs.position, at) - _at(ours, ours.position, at)
+    effort = _at(theirs, theirs.effort, at) - _at(ours, ours.effort, at)
+    apart_mm = np.linalg.norm(_at(theirs, theirs.tip, at) - _at(ours, ours.tip, at), axis=1) * 1e3
+    mine, its = reference.latency.loop_ms, other.latency.loop_ms
+    return Difference(
+        session=other.session,
+        overlap_s=float(high - low),
+        position_rms=_four(np.sqrt((position**2).mean(axis=0))),
+        position_max=_four(np.abs(position).max(axis=0)),
+        tool_rms_mm=float(np.sqrt((apart_mm**2).mean())),
+        tool_max_mm=float(apart_mm.max()),
+        effort_rms=_four(np.sqrt((effort**2).mean(axis=0))),
+        loop_p50_ms=None if mine is None or its is None else its.p50 - mine.p50,
+        loop_p99_ms=None if mine is None or its is None else its.p99 - mine.p99,
+    )
+
+
+def _at(course: Course, values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([np.interp(at, course.time_s, column) for column in values.T], axis=1)
+
+
+def save_comparison_plot(comparison: Comparison, path: Path) -> None:
+    """Draw aligned runs into a file, `.png`, `.svg` or `.pdf`.
+
+    Raises:
+        InputError: the ending names no format, or there is no such folder.
+        OperationError: it can't be written.
+    """
+    from hilrig_replay.latency_plot import check_plot_path, save_figure
+    from hilrig_replay.motion_plot import comparison_figure
+
+    check_plot_path(path)
+    save_figure(comparison_figure(comparison.summaries), path)
+
+
+def _four(values: NDArray[np.float64]) -> Four:
+    return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))

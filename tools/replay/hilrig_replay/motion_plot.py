@@ -1,0 +1,84 @@
+"""Pictures of what the arm did: joint positions and efforts over time, and the tool's way seen from above."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from hilrig_replay.palette import EFFORT_SYMBOLS, INK, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
+from hilrig_replay.scene import reach_outline
+from hilrig_replay.summary import Course, RunSummary
+from hilrig_sim.model import RigParameters
+
+SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""From rad and m to degrees and mm."""
+
+
+def motion_figure(course: Course, parameters: RigParameters) -> Figure:
+    """One run: positions, efforts, and the tool's way with trays and the reachable area."""
+    figure = Figure(figsize=(11, 5), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
+    position, effort = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
+    for joint in range(4):
+        color, values = JOINT_COLORS[joint], course.position[:, joint] * SHOWN[joint]
+        position.plot(course.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
+        effort.plot(course.time_s, course.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint])
+    label(position, "Positions: θ in °, d3 in mm", "", "")
+    label(effort, "Efforts: τ1 τ2 τ4 in N·m, τ3 in N", "time in the run, s", "")
+    for axes in (position, effort):
+        axes.legend(fontsize=7, ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False, borderaxespad=0.2)
+        axes.margins(x=0.01)
+    top = figure.add_subplot(grid[:, 1])
+    _from_above(top, parameters)
+    top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
+    label(top, "The tool's way from above, mm", "x", "y")
+    return figure
+
+
+def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
+    """Several runs on one aligned time axis: each joint a panel, and the tool's ways."""
+    figure = Figure(figsize=(11, 7), layout="constrained", dpi=110)
+    grid = figure.add_gridspec(4, 2, width_ratios=(1.5, 1))
+    for joint in range(4):
+        axes = figure.add_subplot(grid[joint, 0])
+        for number, summary in enumerate(runs):
+            color, course = RUN_COLORS[number % len(RUN_COLORS)], summary.course
+            values = course.position[:, joint] * SHOWN[joint]
+            axes.plot(course.time_s, values, color=color, linewidth=1.1, label=summary.session)
+        unit = "mm" if joint == 2 else "°"
+        label(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")
+    figure.axes[0].legend(fontsize=7, frameon=False)
+    top, tail = figure.add_subplot(grid[:2, 1]), figure.add_subplot(grid[2:, 1])
+    for number, summary in enumerate(runs):
+        course = summary.course
+        color = RUN_COLORS[number % len(RUN_COLORS)]
+        top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=color, linewidth=0.9)
+        ordered = np.sort(summary.latency.table["loop"]) / 1e6
+        tail.step(ordered, 1 - np.arange(len(ordered)) / max(len(ordered), 1), where="post", color=color, linewidth=1.2)
+    top.set_aspect("equal", adjustable="datalim")
+    label(top, "The tools' ways from above, mm", "", "")
+    tail.set_yscale("log")
+    tail.grid(color="#e5e5e5", linewidth=0.6)
+    label(tail, "Loop latency, ms: share of samples that took longer", "", "")
+    return figure
+
+
+def _from_above(axes: Axes, parameters: RigParameters) -> None:
+    for line in reach_outline(parameters.arm, 0.0):
+        axes.plot(line[:, 0] * 1e3, line[:, 1] * 1e3, color="#c5ced8", linewidth=0.8)
+    for tray in parameters.scene.trays:
+        for x, y, _ in tray.places:
+            axes.add_patch(Circle((x * 1e3, y * 1e3), 18.0, fill=False, edgecolor="#8a96a3", linewidth=0.8))
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def label(axes: Axes, title: str, x: str, y: str) -> None:
+    """Title and axes of a panel, the same everywhere."""
+    axes.set_title(title, fontsize=9, loc="left", color=INK)
+    axes.set_xlabel(x, fontsize=8, color=INK)
+    axes.set_ylabel(y, fontsize=8, color=INK)
+    axes.tick_params(labelsize=8, colors=INK)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,227 @@
+"""A run, or a class of runs, as one HTML file that needs nothing else: no network, no script, no other file."""
+
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from typing import Final
+
+from matplotlib.figure import Figure
+
+from hilrig_replay.latency import Statistics
+from hilrig_replay.latency_plot import latency_figure
+from hilrig_replay.motion_plot import motion_figure
+from hilrig_replay.palette import EFFORT_SYMBOLS, RUN_COLORS, STAGE_NAMES
+from hilrig_replay.run import Run
+from hilrig_replay.scene import parameters_of
+from hilrig_replay.summary import RunSummary, summarise
+from hilrig_replay.verify import Verification, verify
+
+_COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
+_GRAVE: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
+"""Kinds of events that a teacher looks for."""
+
+STYLE: Final = """
+:root { color-scheme: light; font: 15px/1.5 system-ui, sans-serif; color: #24292f; background: #f5f6f8; }
+body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 72rem; }
+h1 { font-size: 1.6rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 0 0 .6rem; }
+p { margin: .3rem 0; } .quiet { color: #5d6771; }
+section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8px;
+  padding: 1rem 1.2rem; margin: 1rem 0; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .8rem; }
+.facts div { border-left: 3px solid #4c78a8; padding-left: .6rem; } .facts b { display: block; font-size: 1.25rem; }
+.facts span { color: #5d6771; font-size: .85rem; }
+.scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } thead th { color: #5d6771; font-weight: 600; }
+img { max-width: 100%; height: auto; display: block; } li { margin: .25rem 0; }
+.good { color: #1a7f37; } .bad { color: #b35900; } summary { cursor: pointer; font-weight: 600; }
+@media print { body { max-width: none; } section, details { break-inside: avoid; } }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    summary: RunSummary
+    pictures: tuple[str, ...]
+    verified: Verification | None
+
+
+def report_html(runs: Sequence[Run], *, verified: bool = False) -> str:
+    """The report of one run, or of several with an overview that ranks them.
+
+    Args:
+        runs: what is reported.
+        verified: re-simulate each run too, and say whether it came out the same.
+
+    Raises:
+        InputError: a run has no commands, is damaged, or is not understood.
+    """
+    pages = [_page(run, verified) for run in runs]
+    if len(pages) == 1:
+        summary = pages[0].summary
+        title = f"Run {summary.session}"
+        body = f"<h1>{escape(title)}</h1>{_run(pages[0])}"
+    else:
+        title = f"{len(pages)} runs"
+        ranked = sorted(pages, key=_rank)
+        details = "".join(
+            f"<details><summary>{escape(page.summary.session)}</summary>{_run(page)}</details>" for page in ranked
+        )
+        body = f"<h1>{title}</h1>{_overview(ranked)}{details}"
+    return (
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{body}</body></html>\n"
+    )
+
+
+def _page(run: Run, verified: bool) -> _Page:
+    summary = summarise(run)
+    parameters = parameters_of(run.parameters_json)
+    pictures = [_picture(motion_figure(summary.course, parameters), "positions, efforts and the tool's way")]
+    if summary.latency.loop_ms is not None:
+        pictures.append(_picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
+    return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
+
+
+def _run(page: _Page) -> str:
+    summary = page.summary
+    who = summary.controller or "nobody"
+    about = f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · controlled by {who} · {summary.start}"
+    return (
+        f'<p class="quiet">{escape(about)}</p>'
+        f"<section>{_facts(page)}</section>"
+        f"<section><h2>Motion</h2>{page.pictures[0]}{_efforts(summary)}</section>"
+        f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.pictures[1:])}</section>"
+        f"<section><h2>Events</h2>{_events(summary)}</section>"
+    )
+
+
+def _facts(page: _Page) -> str:
+    summary = page.summary
+    facts = [(f"{summary.duration_s:.1f} s", f"length; it ended: {summary.ended or 'not said'}")]
+    if summary.task is not None:
+        error = summary.task.largest_error_mm
+        within = "none placed" if error is None else f"within {error:.1f} mm"
+        facts.append((f"{summary.task.placed} of {len(summary.task.parts)}", f"parts in their places, {within}"))
+    loop = summary.latency.loop_ms
+    if loop is not None:
+        facts.append((f"{loop.p50:.1f} ms", f"loop latency p50; p99 {loop.p99:.1f} ms"))
+    facts.append(
+        (f"{summary.motion.tool_path_m:.2f} m", f"way of the tool, at most {summary.motion.top_speed:.2f} m/s")
+    )
+    facts.append((f"{summary.motion.work_j:.1f} J", "work of the drives"))
+    if page.verified is not None:
+        facts.append(("verified" if page.verified.same else "diverges", page.verified.sentence()))
+    cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in facts)
+    return f'<div class="facts">{cells}</div>'
+
+
+def _efforts(summary: RunSummary) -> str:
+    motion = summary.motion
+    rows = [
+        ["largest, N·m (τ3: N)", *(f"{value:.2f}" for value in motion.peak_effort)],
+        ["at the register's limit", *(f"{share:.1%}" for share in motion.saturated_share)],
+    ]
+    return _table(["effort", *EFFORT_SYMBOLS], rows)
+
+
+def _latency(summary: RunSummary) -> str:
+    latency = summary.latency
+    rows = [] if latency.loop_ms is None else [["loop", *_figures(latency.loop_ms)]]
+    rows += [[STAGE_NAMES[stage], *_figures(statistics)] for stage, statistics in latency.stages_ms.items()]
+    rows.append(["tick lateness", *_figures(latency.jitter_ms.tick_lateness)])
+    fitness = (
+        '<p class="good">Fit for latency claims.</p>'
+        if latency.fit
+        else f'<p class="bad">Not fit for latency claims: {escape("; ".join(latency.reasons))}.</p>'
+    )
+    found = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
+    table = _table(["ms", *(column.replace("p999", "p99.9") for column in _COLUMNS)], rows)
+    return f"{table}{fitness}{f'<ul>{found}</ul>' if found else ''}"
+
+
+def _events(summary: RunSummary) -> str:
+    if not summary.events:
+        return "<p>Nothing happened.</p>"
+    rows = [[kind.replace("_", " ").lower(), str(count)] for kind, count in summary.events.items()]
+    return _table(["event", "times"], rows)
+
+
+def _overview(pages: Sequence[_Page]) -> str:
+    header = [
+        "run",
+        "parts placed",
+        "placing error, mm",
+        "loop p50, ms",
+        "p99, ms",
+        "way, m",
+        "work, J",
+        "alarms",
+        "fit",
+    ]
+    rows = []
+    for page in pages:
+        summary, loop = page.summary, page.summary.latency.loop_ms
+        task = summary.task
+        error = None if task is None else task.largest_error_mm
+        rows.append(
+            [
+                summary.session,
+                "–" if task is None else f"{task.placed} of {len(task.parts)}",
+                "–" if error is None else f"{error:.2f}",
+                "–" if loop is None else f"{loop.p50:.2f}",
+                "–" if loop is None else f"{loop.p99:.2f}",
+                f"{summary.motion.tool_path_m:.2f}",
+                f"{summary.motion.work_j:.1f}",
+                str(sum(summary.events.get(kind, 0) for kind in _GRAVE)),
+                "yes" if summary.latency.fit else "no",
+            ]
+        )
+    note = '<p class="quiet">Ranked by parts placed, then by placing error, then by the way of the tool.</p>'
+    return f"<section>{_table(header, rows)}{note}{_distributions(pages)}</section>"
+
+
+def _distributions(pages: Sequence[_Page]) -> str:
+    """Loop latencies of all runs side by side."""
+    measured = [page.summary for page in pages if page.summary.latency.samples]
+    if not measured:
+        return ""
+    figure = Figure(figsize=(11, 1.2 + 0.28 * len(measured)), layout="constrained", dpi=110)
+    axes = figure.subplots()
+    values = [summary.latency.table["loop"] / 1e6 for summary in reversed(measured)]
+    names = [summary.session for summary in reversed(measured)]
+    boxes = axes.boxplot(values, orientation="horizontal", whis=(1, 99), showfliers=False, patch_artist=True)
+    for box in boxes["boxes"]:
+        box.set(facecolor=RUN_COLORS[0], alpha=0.6)
+    axes.set_yticks(range(1, len(names) + 1), names, fontsize=7)
+    axes.set_xlabel("loop latency, ms (box: quartiles, whiskers: p1 and p99)", fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    return _picture(figure, "loop latencies of all runs")
+
+
+def _rank(page: _Page) -> tuple[float, float, float]:
+    task = page.summary.task
+    if task is None:
+        return (0.0, 0.0, page.summary.motion.tool_path_m)
+    error = task.largest_error_mm
+    return (-task.placed, float("inf") if error is None else error, page.summary.motion.tool_path_m)
+
+
+def _figures(statistics: Statistics) -> list[str]:
+    return [f"{getattr(statistics, column):.3f}" for column in _COLUMNS]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _picture(figure: Figure, what: str) -> str:
+    with BytesIO() as file:
+        figure.savefig(file, format="png")
+        data = b64encode(file.getvalue()).decode()
+    return f'<img alt="{escape(what, quote=True)}" src="data:image/png;base64,{data}">'
