@@ -29,6 +29,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from hilrig_modbus_edge.bridge import run as run_edge
+from hilrig_runtime.bus import Publisher
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus
 from hilrig_runtime.service import Service
@@ -164,10 +165,25 @@ def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG
     asyncio.run(body())
 
 
+class NowhereBus(MemoryBus):
+    """A bus that carries states and nothing else: what is published goes nowhere, and costs nothing."""
+
+    def publisher(self, key: str, traffic: topics.Traffic) -> Publisher:  # noqa: ARG002
+        return _Nowhere()
+
+
+class _Nowhere(Publisher):
+    def put(self, payload: bytes) -> None:
+        """Nobody listens."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
 def serve_alone(port: int, rigs: int, control: Connection) -> None:
-    """The edge with a bus on which nobody listens; nothing is kept for a recorder."""
+    """The edge with a bus that leads nowhere; nothing is kept for a recorder."""
     lab = lab_of(port, rigs)
-    bus = MemoryBus()
+    bus = NowhereBus()
     with Service("edge", lab, bus) as service:
         service.log.append = lambda *_: None  # type: ignore[method-assign]
         serve_ours(service, bus.hub.deliver, control)
