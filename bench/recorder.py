@@ -2,7 +2,8 @@
 
 A sender process publishes the log stream of a whole lab (500 rigs at 50 Hz by default) over the real bus; the
 recorder, as a user starts it, writes a file for each rig. Its processor time comes from its own health reports. The
-same messages go through the stock `mcap` writer in this process, in the same run: no bus, no sessions, one file.
+same messages go through the stock `mcap` writer in this process, in the same run: no bus, no sessions, one file, and
+a sender at work beside it, so that both are measured on a machine that is equally busy.
 """
 
 import json
@@ -41,7 +42,7 @@ VARIANTS = 200
 
 def main() -> int:
     if len(sys.argv) > 1 and sys.argv[1] == "--send":
-        send(load_lab(Path(sys.argv[2])), float(sys.argv[3]))
+        send(load_lab(Path(sys.argv[2])), float(sys.argv[3]), to_nobody="--to-nobody" in sys.argv)
         return 0
     return run(measure, "What does the recorder take without loss, and what does a message cost it?")
 
@@ -49,7 +50,7 @@ def main() -> int:
 def measure(report: Report, quick: bool) -> None:
     seconds = float(os.environ.get("HILRIG_BENCH_SECONDS", "10" if quick else "60"))
     rigs = int(os.environ.get("HILRIG_BENCH_RIGS", "500"))
-    raw = [raw_writer() for _ in range(1 if quick else 5)]
+    raw = raw_writer_beside_a_sender(rigs, 2 if quick else 5)
     raw_rate = report.add("raw mcap writer", "messages a CPU second", statistics.median(rate for rate, _ in raw), "1/s")
     report.add("raw mcap writer", "a message on disk", raw[0][1], "bytes")
     progress(f"{rigs} rigs at {HZ:g} Hz for {seconds:g} s")
@@ -102,7 +103,7 @@ def states(rig: str, number: int) -> list[bytes]:
     return made
 
 
-def send(lab: LabConfig, seconds: float) -> None:
+def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
     """Send the states of every rig of a lab within a session each, and say how many."""
     rigs = [rig.name for rig in lab.rigs]
     pool = [(STATE.key(lab.name, rig), states(rig, number)) for number, rig in enumerate(rigs)]
@@ -110,7 +111,10 @@ def send(lab: LabConfig, seconds: float) -> None:
     signal.signal(signal.SIGTERM, lambda *_: stopping.set())
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
         service.ready()
-        wait_for(service, lab)
+        if to_nobody:
+            print("sending", flush=True)
+        else:
+            wait_for(service, lab)
         sessions = [OpenSession(rig=rig, session=f"20260101T000000Z-{rig}-abcd") for rig in rigs]
         service.log.set_sessions(sessions)
         emit(service, sessions, Event.SESSION_START)
@@ -168,6 +172,22 @@ class Found:
     memory_late: int
 
 
+def raw_writer_beside_a_sender(rigs: int, runs: int) -> list[tuple[float, float]]:
+    """The raw writer, measured while a sender keeps the machine as busy as it is while the recorder is measured."""
+    with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
+        config = write_lab(Path(folder), rigs)
+        command = [sys.executable, __file__, "--send", str(config), "600", "--to-nobody"]
+        sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert sender.stdout is not None
+        try:
+            sender.stdout.readline()
+            return [raw_writer() for _ in range(runs)]
+        finally:
+            sender.terminate()
+            sender.wait(15)
+            sender.stdout.close()
+
+
 def raw_writer() -> tuple[float, float]:
     """Messages a CPU second and bytes a message of the stock writer, with the recorder's chunks and compression."""
     pool = [states(f"rig{number}", number) for number in range(5)]
@@ -190,9 +210,7 @@ def raw_writer() -> tuple[float, float]:
 
 def record(folder: Path, rigs: int, seconds: float) -> Found:
     """Let the recorder record a lab; what it cost and what is in its files."""
-    config = folder / "lab.toml"
-    names = "".join(f'[[rigs]]\nname = "rig{number}"\n' for number in range(rigs))
-    config.write_text(f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n{names}")
+    config = write_lab(folder, rigs)
     lab = load_lab(config)
     healths: list[Health] = []
     command = [sys.executable, "-m", "hilrig_cli", "recorder", "-c", str(config)]
@@ -229,6 +247,13 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
         memory_early=busy[len(busy) // 5].resident_bytes,
         memory_late=busy[-1].resident_bytes,
     )
+
+
+def write_lab(folder: Path, rigs: int) -> Path:
+    config = folder / "lab.toml"
+    names = "".join(f'[[rigs]]\nname = "rig{number}"\n' for number in range(rigs))
+    config.write_text(f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n{names}")
+    return config
 
 
 def finished_files(lab: LabConfig, recorder: subprocess.Popen[bytes], rigs: int) -> list[Path]:

@@ -20,7 +20,6 @@ SCHEMA_VERSION: Final = "hilrig.v1"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _FIXED_LENGTH: Final = _MESSAGE.size - 9
 _OPCODE: Final = int(Opcode.MESSAGE)
-_LOG_TIME_AT: Final = 15
 _pack: Final = _MESSAGE.pack
 
 
@@ -65,11 +64,6 @@ class MessageHead(NamedTuple):
 def message_head(record: bytes) -> MessageHead:
     """The head of a record that `encode_message` made."""
     return MessageHead(*_MESSAGE.unpack_from(record)[2:])
-
-
-def log_time_of(record: bytes) -> int:
-    """Its arrival alone, ns."""
-    return int.from_bytes(record[_LOG_TIME_AT : _LOG_TIME_AT + 8], "little")
 
 
 def encode_message(channel_id: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> bytes:

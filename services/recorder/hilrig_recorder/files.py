@@ -20,7 +20,7 @@ from hilrig_recorder.disk import Disk
 from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
 from hilrig_recorder.reserve import Reserve
 from hilrig_recorder.sessions import SECOND_NS, Recording, Sink
-from hilrig_recorder.writer import RunWriter, part_path
+from hilrig_recorder.writer import RunWriter, compressor, part_path
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import RecorderConfig
 from hilrig_runtime.errors import InputError
@@ -85,6 +85,7 @@ class Files:
         self._space_due_ns = 0
         self._full = False
         self._bytes_closed = 0
+        self._compress = compressor()
         self._reserve = Reserve(self.folder)
         self._reserve.hold()
 
@@ -233,7 +234,7 @@ class Files:
         path = folder / file_name(recording.session, number)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            writer = RunWriter(path, on_failure=on_failure)
+            writer = RunWriter(path, on_failure=on_failure, compress=self._compress)
         except OSError as error:
             self._report(recording, f"{path}: can't be recorded: {error.strerror}")
             return None

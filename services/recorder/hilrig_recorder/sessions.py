@@ -13,11 +13,12 @@ import re
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, Protocol
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message, log_time_of, message_head
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message, message_head
 from hilrig_recorder.intake import Arrival
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, is_name, parse_rig_key
@@ -142,8 +143,10 @@ class Shelf(Protocol):
 class _Rig:
     name: str
     recordings: list[Recording] = field(default_factory=list)
-    # Encoded messages and nothing about them: for a large lab these are a hundred thousand objects.
-    preroll: deque[bytes] = field(default_factory=deque)
+    # Encoded messages and nothing about them, in blocks with the time of their end: for a large lab these are a
+    # hundred thousand objects, and forgetting them must not cost as much as recording them.
+    preroll: deque[tuple[int, list[bytes]]] = field(default_factory=deque)
+    newest: list[bytes] = field(default_factory=list)
     # log time, transport, recorder: losses within the pre-roll
     losses: deque[tuple[int, int, int]] = field(default_factory=deque)
     sources: dict[str, "_Source"] = field(default_factory=dict)
@@ -190,6 +193,7 @@ class SessionBook:
         self._sources: dict[tuple[str, int], _Source] = {}
         self._recordings: dict[str, Recording] = {}
         self._over: dict[str, int] = {}
+        self._wall_ns = 0
         self._clock_offset_ns: int | None = None
         self._clock_step_ns = -_SETTLING_NS
         self._refused: set[str] = set()
@@ -207,7 +211,7 @@ class SessionBook:
     def accept(self, arrival: Arrival, now_ns: int) -> None:
         """Take one batch."""
         batch = arrival.batch
-        log_time = arrival.wall_ns
+        log_time = self._wall_ns = arrival.wall_ns
         source = self._source(arrival, now_ns)
         streams = source.streams
         for entry in batch.entries:
@@ -224,7 +228,7 @@ class SessionBook:
             channel_id = stream.channel_id
             record = encode_message(channel_id, sequence, log_time, publish_ns, payload)
             rig = stream.rig
-            rig.preroll.append(record)
+            rig.newest.append(record)
             for recording in rig.recordings:
                 if not recording.selective or recording.wants(channel_id, sequence, publish_ns):
                     recording.add(channel_id, log_time, record)
@@ -393,9 +397,10 @@ class SessionBook:
         for _, transport, recorder in rig.losses:
             recording.tally.lost_transport += transport
             recording.tally.lost_recorder += recorder
-        for record in rig.preroll:
+        horizon_ns = self._wall_ns - self._preroll_ns
+        for record in chain.from_iterable((*(block for _, block in rig.preroll), rig.newest)):
             head = message_head(record)
-            if recording.wants(head.channel_id, head.sequence, head.publish_time):
+            if head.log_time >= horizon_ns and recording.wants(head.channel_id, head.sequence, head.publish_time):
                 recording.add(head.channel_id, head.log_time, record)
         self._recordings[session] = recording
         rig.recordings.append(recording)
@@ -424,16 +429,22 @@ class SessionBook:
         self._clock_offset_ns = offset_ns
         horizon = wall_ns - self._preroll_ns
         for rig in self._rigs.values():
+            if rig.newest:
+                rig.preroll.append((wall_ns, rig.newest))
+                rig.newest = []
             # A clock set back would keep what is stamped in its future for ever.
-            while rig.preroll and not horizon <= log_time_of(rig.preroll[0]) <= wall_ns:
+            while rig.preroll and not horizon <= rig.preroll[0][0] <= wall_ns:
                 rig.preroll.popleft()
             while rig.losses and not horizon <= rig.losses[0][0] <= wall_ns:
                 rig.losses.popleft()
+        heard: dict[str, int] = {}
+        for source in self._sources.values():
+            heard[source.name] = max(heard.get(source.name, 0), source.last_ns)
         for recording in self.recordings:
             if recording.seen is not None and now_ns - recording.opened_ns > _SETTLING_NS:
                 recording.forget_seen()
             if recording.end_wall_ns is None:
-                self._watch_keeper(recording, now_ns)
+                self._watch_keeper(recording, heard.get(recording.keeper, 0), now_ns)
             elif self._is_complete(recording, now_ns):
                 self._close(recording, "ended", recording.end_reason)
         for session, until_ns in list(self._over.items()):
@@ -441,11 +452,7 @@ class SessionBook:
                 del self._over[session]
         self._forget_sources(now_ns)
 
-    def _watch_keeper(self, recording: Recording, now_ns: int) -> None:
-        heard_ns = max(
-            (source.last_ns for source in self._sources.values() if source.name == recording.keeper),
-            default=recording.opened_ns,
-        )
+    def _watch_keeper(self, recording: Recording, heard_ns: int, now_ns: int) -> None:
         if now_ns - max(heard_ns, recording.opened_ns) > KEEPER_SILENCE_NS:
             reason = f"{recording.keeper} was not heard for {KEEPER_SILENCE_NS // SECOND_NS} s"
             # Not over for good: when the keeper comes back and states it, it goes on in a next file.

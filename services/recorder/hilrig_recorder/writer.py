@@ -55,6 +55,11 @@ _COMPRESSION: Final = b"zstd"
 _COMPRESSOR: Final = zstandard.ZstdCompressionParameters.from_level(1, source_size=16 * 1024)
 
 
+def compressor() -> Callable[[bytes], bytes]:
+    """What compresses chunks; for one thread, and best shared by all files of it: its tables then stay in the cache."""
+    return zstandard.ZstdCompressor(compression_params=_COMPRESSOR).compress
+
+
 def part_path(path: Path) -> Path:
     """What a recording is called while it is written."""
     return path.with_name(path.name + PART_SUFFIX)
@@ -111,6 +116,7 @@ class RunWriter:
         library: str = LIBRARY,
         part: Path | None = None,
         on_failure: Callable[[OSError], None] | None = None,
+        compress: Callable[[bytes], bytes] | None = None,
     ) -> None:
         self.path = path
         self.part = part_path(path) if part is None else part
@@ -123,7 +129,7 @@ class RunWriter:
         self.given_up = 0
         """Messages that the disk did not take."""
         self._on_failure = on_failure
-        self._compress = zstandard.ZstdCompressor(compression_params=_COMPRESSOR).compress
+        self._compress = compressor() if compress is None else compress
         self._records: list[bytes] = []
         self._pending_bytes = 0
         self._first_ns = 0
