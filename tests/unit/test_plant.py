@@ -103,7 +103,7 @@ def test_no_joint_is_ever_outside_its_limits(
             assert np.all(np.isfinite(plant.velocity))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(joints, speeds)
 def test_without_efforts_energy_only_falls_through_any_impacts(
     position: tuple[float, ...], velocity: tuple[float, ...]
