@@ -29,6 +29,8 @@ OPENS_A_WINDOW = ("hilrig replay", "hilrig live")
 TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose up": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
+    "hilrig play": "tests/rig/test_recorder_play.py",
+    "hilrig record ": "tests/rig/test_recorder_process.py",
     "make demo": "tests/rig/test_demo.py",
 }
 """Beginning of a command, and the test that runs what it does."""
