@@ -5,8 +5,9 @@ import struct
 from typing import Any
 
 from hilrig_modbus_edge.client import Client
-from hilrig_modbus_edge.device import Device, DeviceSettings
+from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.registers import Table
+from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.service import Arrival
 from hilrig_schemas import Event, JointState, TorqueCommand

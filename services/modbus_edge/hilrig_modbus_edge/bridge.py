@@ -12,8 +12,9 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from hilrig_modbus_edge.device import Device, DeviceSettings
+from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Limits, RigServer, bind
+from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle

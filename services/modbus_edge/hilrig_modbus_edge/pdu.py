@@ -14,7 +14,8 @@ from pymodbus.constants import DeviceInformation, ExcCodes
 from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
 from hilrig_modbus_edge.client import Client
-from hilrig_modbus_edge.device import Device, ModbusError
+from hilrig_modbus_edge.device import Device
+from hilrig_modbus_edge.errors import ModbusError
 from hilrig_modbus_edge.registers import Table
 
 Handler = Callable[[Device, Client, bytes, int], bytes]

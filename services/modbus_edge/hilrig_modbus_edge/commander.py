@@ -1,0 +1,128 @@
+"""The standing command of one rig: four torques, the magnet, and whose word they are.
+
+Every accepted write goes out at once as one `TorqueCommand` with the next number. What stands is repeated with its
+number, so that the simulation can tell a held torque from a lost edge. One message is used again and again: a write
+sets what changed.
+"""
+
+from typing import Final
+
+from hilrig_modbus_edge import codec
+from hilrig_modbus_edge.client import NO_BASIS, Client, Served
+from hilrig_modbus_edge.settings import Outlet
+from hilrig_runtime.clock import Clock
+from hilrig_schemas import TorqueCommand
+
+_OF_A_WRITE: Final = (
+    "controller",
+    "basis_incarnation",
+    "basis_step",
+    "state_arrived_ns",
+    "state_served_ns",
+    "state_injected_ns",
+    "write_arrived_ns",
+)
+
+
+class Commander:
+    """See the module."""
+
+    def __init__(self, rig: str, clock: Clock, outlet: Outlet, repeat_ns: int) -> None:
+        self.torque = bytearray(8)
+        """The four torque registers, big-endian; `write` or `say` send them."""
+        self.echo = 0
+        """The controller's echo word, 16 bit; his next write carries it."""
+        self._monotonic_ns = clock.monotonic_ns
+        self._wall_ns = clock.wall_ns
+        self._outlet = outlet
+        self._repeat_ns = repeat_ns
+        self._repeat_due_ns = clock.monotonic_ns()
+        self._message = TorqueCommand(rig=rig, effort=(0.0, 0.0, 0.0, 0.0), safe=True)
+        self._session_told = ""
+        # Whose word it is and what it was based on: most writes change neither.
+        self._writer: Client | None = None
+        self._basis: Served | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a torque stands that is not zero."""
+        return any(self.torque)
+
+    @property
+    def magnet(self) -> bool:
+        """Whether the magnet is asked to be on."""
+        return self._message.magnet
+
+    @magnet.setter
+    def magnet(self, on: bool) -> None:
+        self._message.magnet = on
+
+    @property
+    def session(self) -> str:
+        """Id of the session that commands belong to; empty: none."""
+        return self._message.session
+
+    @session.setter
+    def session(self, session: str) -> None:
+        self._message.session = session
+
+    def zero(self) -> None:
+        """No torque, from the next command on."""
+        self.torque[:] = bytes(8)
+
+    def reset(self) -> None:
+        """No torque and the arm back at its start pose, from the next command on."""
+        self.zero()
+        self._message.resets += 1
+
+    def write(self, client: Client, arrived_ns: int) -> None:
+        """Send what stands as the word of a controller whose write came at `arrived_ns`, monotonic clock."""
+        message = self._message
+        if client is not self._writer:
+            self._writer = client
+            message.controller = client.address
+            message.safe = False
+        message.echo = self.echo
+        basis = client.basis
+        if basis is not self._basis:
+            self._basis = basis
+            (
+                message.basis_incarnation,
+                message.basis_step,
+                message.state_arrived_ns,
+                message.state_served_ns,
+                message.state_injected_ns,
+            ) = basis or NO_BASIS
+        message.write_arrived_ns = arrived_ns
+        self._send()
+
+    def say(self) -> None:
+        """Send what stands as the edge's own word, which no controller's loop is measured by."""
+        message = self._message
+        message.safe = not self.moves
+        for field in _OF_A_WRITE:
+            message.ClearField(field)
+        self._writer = self._basis = None
+        self._send()
+
+    def say_session(self) -> None:
+        """Let the simulation know of a session that began with a write that moved nothing."""
+        if self._message.session != self._session_told:
+            self.say()
+
+    def repeat_if_due(self, now_ns: int) -> None:
+        """Say again what stands, if nothing was said for the time between repetitions; ns, monotonic clock."""
+        if now_ns >= self._repeat_due_ns:
+            self._repeat_due_ns = now_ns + self._repeat_ns
+            self._outlet.repeat_command(self._message)
+
+    def _send(self) -> None:
+        message = self._message
+        message.effort[:] = codec.effort_of(self.torque)
+        message.seq += 1
+        self._session_told = message.session
+        now_ns = self._monotonic_ns()
+        message.wall_ns = self._wall_ns()
+        message.sent_ns = now_ns
+        self._repeat_due_ns = now_ns + self._repeat_ns
+        self._outlet.send_command(message)
