@@ -74,6 +74,7 @@ COLUMNS = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 
 def print_report(report: "LatencyReport") -> None:
     """Print one run's latency as a table for people."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -82,10 +83,11 @@ def print_report(report: "LatencyReport") -> None:
 
     console = Console()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
-    table = Table(title=title, title_justify="left", title_style="bold")
+    # Without rules between the columns it fits a terminal of 80 characters.
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("ms", no_wrap=True)
     for column in COLUMNS:
-        table.add_column(column.replace("p999", "p99.9"), justify="right")
+        table.add_column(column.replace("p999", "p99.9"), justify="right", no_wrap=True)
     if report.loop_ms is not None:
         table.add_row("loop", *_figures(report.loop_ms), style="bold", end_section=True)
         for stage, statistics in report.stages_ms.items():
