@@ -6,6 +6,7 @@ one reduction along the first axis, whose order of additions is the same for any
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +20,20 @@ Floats = NDArray[np.float64]
 
 FEW_RIGS: Final = 64
 """Up to so many, weights are stored once a rig: the same products, without the cost of broadcasting."""
+
+
+@cache
+def _packed(tableau: Tableau) -> tuple[Floats, Floats]:
+    """Weights of all sums of a step, one after the other, (terms, 1, 1): what they are, and what a second adds.
+
+    First those of the stages and of the end, each led by the 1 of the state at the step's start; then those of the
+    position's change and of its error.
+    """
+    led = [(1.0, row) for row in (*tableau.a[1:], tableau.b)]
+    bare = [tableau.b, tableau.error_weights]
+    one = [value for lead, row in led for value in (lead, *(0.0 for _ in row))] + [0.0 for row in bare for _ in row]
+    scaled = [value for _, row in led for value in (0.0, *row)] + [value for row in bare for value in row]
+    return np.array(one)[:, np.newaxis, np.newaxis], np.array(scaled)[:, np.newaxis, np.newaxis]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,25 +74,23 @@ class FixedStep:
         self._result = np.empty((STAGE_ROWS, count))
         self._result4 = self._result[:4]
 
-        def weights(row: tuple[float, ...], *, with_start: bool) -> Floats:
-            scaled = np.array(row)[:, np.newaxis, np.newaxis] * lengths
-            table = np.concatenate([np.ones_like(scaled[:1]), scaled]) if with_start else scaled
-            few = count <= FEW_RIGS
-            return np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy() if few else table
+        one, scaled = _packed(tableau)
+        table = one + scaled * lengths
+        if count <= FEW_RIGS:
+            table = np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy()
+        used = 0
 
-        def terms(row: tuple[float, ...], values: Floats, *, with_start: bool) -> _Sum:
-            number = len(row) + with_start
+        def terms(number: int, values: Floats) -> _Sum:
+            nonlocal used
+            used += number
             products = self._products[:number]
-            return _Sum(values[:number], weights(row, with_start=with_start), products, *products[:2])
+            return _Sum(values[:number], table[used - number : used], products, *products[:2])
 
         self._stages: list[StageViews] = [stage_views(self._states[i], self._slots[1 + i]) for i in range(stages)]
-        self._following = [
-            (terms(tableau.a[i], self._slots, with_start=True), self._states[i], self._stages[i])
-            for i in range(1, stages)
-        ]
-        self._end = terms(tableau.b, self._slots, with_start=True)
-        self._quadrature = terms(tableau.b, self._states, with_start=False)
-        self._error = terms(tableau.error_weights, self._states, with_start=False) if tableau.embedded else None
+        self._following = [(terms(1 + i, self._slots), self._states[i], self._stages[i]) for i in range(1, stages)]
+        self._end = terms(1 + stages, self._slots)
+        self._quadrature = terms(stages, self._states)
+        self._error = terms(stages, self._states) if tableau.embedded else None
 
     def advance(self, position: Floats, velocity: Floats, effort: Floats, error: Floats | None = None) -> None:
         """Move `position` and `velocity`, (4, N), on by one step under constant `effort`, (4, N).
