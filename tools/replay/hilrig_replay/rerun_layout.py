@@ -33,7 +33,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
     scene = rrb.Spatial3DView(
         name="Arm",
         origin=_path(roots[0], "scene") if len(roots) == 1 else "/",
-        contents=[f"+ {_path(root, 'scene')}/**" for root in roots],
+        contents=[f"+ {path}/**" for root in roots for path in (_path(root, "scene"), f"/{arm_path(root)}")],
         background=rrb.Background(color=_BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
@@ -96,6 +96,11 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
+
+
+def arm_path(root: str) -> str:
+    """Entity path of a rig's URDF: rerun's loader takes a path of a single part only."""
+    return f"{root}_arm" if root else "arm"
 
 
 def _path(root: str, path: str) -> str:

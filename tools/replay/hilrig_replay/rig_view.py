@@ -31,7 +31,7 @@ from hilrig_replay.palette import (
     rgb,
 )
 from hilrig_replay.records import Records
-from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL
+from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL, arm_path
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_replay.timebase import Timebase
 from hilrig_sim.model import PartParameters, RigParameters
@@ -120,15 +120,16 @@ class RigView:
         self._static("scene/reach", rr.LineStrips3D(outline, colors=[rgb(_REACH_COLOR)], radii=[0.0012]))
 
     def _write_arm(self, arm: ArmPicture) -> None:
-        frames = self._path("scene").replace("/", "_") + "_"
+        path = arm_path(self._root)
+        frames = f"{path}_"
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "arm.urdf"
             file.write_text(arm.urdf, encoding="utf-8")
             tree = UrdfTree.from_file_path(
                 file,
-                entity_path_prefix=self._path("scene"),
+                entity_path_prefix=path,
                 frame_prefix=frames,
-                static_transform_entity_path=self._path("scene/arm_fixed"),
+                static_transform_entity_path=f"{path}/fixed",
             )
         tree.log_urdf_to_recording(self._stream)
         # The URDF has named frames, all else the tree of paths: this hangs the arm's root into the scene.
@@ -142,7 +143,9 @@ class RigView:
             if number < len(paths):
                 # As it comes, a primitive is drawn transparent with its edges.
                 solid: Any = {"box": rr.Boxes3D, "cylinder": rr.Cylinders3D, "sphere": rr.Ellipsoids3D}[shape]
-                self._stream.log(paths[number], solid.from_fields(fill_mode="solid"), static=True)
+                # Of several arms in one scene each has its run's colour; what stands still is the same for all.
+                own = None if self._color is None or link == arm.root else [rgb(self._color)]
+                self._stream.log(paths[number], solid.from_fields(fill_mode="solid", colors=own), static=True)
 
     def _place_part(self, part: PartParameters) -> None:
         path = f"scene/parts/{part.name}"
@@ -172,7 +175,8 @@ class RigView:
 
     def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
         shades = [rgb(color) for color in colors] if self._color is None else [rgb(self._color)] * len(names)
-        lines = rr.SeriesLines(names=list(names), colors=shades, widths=[width] * len(names))
+        whose = f"{self._root} " if self._root else ""
+        lines = rr.SeriesLines(names=[whose + name for name in names], colors=shades, widths=[width] * len(names))
         self._static(path, lines)
 
     def _lane_legend(self, lane: str, colors: Mapping[str, str]) -> None:

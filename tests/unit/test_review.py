@@ -1,0 +1,180 @@
+"""Summaries, comparisons and reports: figures that a scripted run makes known, and pages that stand alone."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilrig_replay.compare import compare, save_comparison_plot
+from hilrig_replay.report import report_html
+from hilrig_replay.run import Run, open_run
+from hilrig_replay.scene import tips
+from hilrig_replay.summary import COURSE_POINTS, summarise
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import JointState
+from recordings import PARAMETERS, Made, Script, make, position, record, write
+
+
+def named(folder: Path, name: str, script: Script, made: list[Made] | None = None) -> Run:
+    return open_run(write(folder / f"{name}.mcap", made or make(script), script=script, session=name))
+
+
+def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=10.0)))
+    summary = summarise(run)
+    t = np.arange(0, 10.0, 0.001)
+    way = tips(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
+    assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(way, axis=0), axis=1).sum(), rel=0.01)
+    work = np.abs(run.states["effort"] * run.states["velocity"]).sum() * 0.02
+    assert summary.motion.work_j == pytest.approx(work)
+    assert summary.motion.saturated_share == (0, 0, 0, 0)
+    assert summary.events == {"SESSION_END": 1, "SESSION_START": 1}
+    assert summary.task is not None
+    assert (summary.task.placed, len(summary.task.parts)) == (0, 4)
+
+
+def test_saturation_is_the_share_of_steps_at_the_registers_limit(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    made = make(script)
+    states = [one.message for one in made if isinstance(one.message, JointState)]
+    for state in states[:50]:
+        state.effort[2] = -32.767
+    summary = summarise(named(tmp_path, "run", script, made))
+    assert summary.motion.saturated_share == (0, 0, 0.25, 0)
+    assert summary.motion.peak_effort[2] == 32.767
+
+
+def test_a_course_stays_short_however_long_the_run(tmp_path: Path) -> None:
+    script = Script(seconds=10.0, step_ms=1.0, poll_ms=50.0)
+    course = summarise(named(tmp_path, "run", script)).course
+    assert COURSE_POINTS <= len(course.time_s) < 2 * COURSE_POINTS
+    assert np.allclose(np.diff(course.time_s), course.time_s[1], atol=2e-4)
+
+
+def test_a_run_does_not_differ_from_itself(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    (difference,) = compare([named(tmp_path, "one", script), named(tmp_path, "two", script)]).differences
+    assert difference.position_max == (0, 0, 0, 0)
+    assert difference.tool_max_mm == 0
+    assert difference.effort_rms == (0, 0, 0, 0)
+    assert (difference.loop_p50_ms, difference.loop_p99_ms) == (0, 0)
+
+
+def test_a_difference_that_was_put_in_is_found(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    made = make(script)
+    for one in made:
+        if isinstance(one.message, JointState):
+            one.message.position[2] += 0.005
+    other = named(tmp_path, "two", script, made)
+    (difference,) = compare([named(tmp_path, "one", script), other], "start").differences
+    assert difference.position_rms == pytest.approx((0, 0, 0.005, 0), abs=1e-9)
+    assert difference.tool_rms_mm == pytest.approx(5.0)
+
+
+def test_runs_are_aligned_by_an_event(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    made = make(script)
+    late = [one for one in made if one.publish_wall_ns > made[0].publish_wall_ns + 1_000_000_000]
+    runs = [named(tmp_path, "one", script), named(tmp_path, "late", script, late)]
+    by_event = compare(runs, "session-end")
+    # A second is missing at the beginning of the late run: seen from the end, they are the same.
+    assert by_event.origins_s[0] - by_event.origins_s[1] == pytest.approx(1.0, abs=0.03)
+    assert by_event.differences[0].tool_max_mm < 2.0
+    assert runs[1].time_s(runs[1].states)[-1] == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_slower_controller_shows_in_the_comparison(tmp_path: Path) -> None:
+    runs = [named(tmp_path, "quick", Script(seconds=8.0)), named(tmp_path, "slow", Script(seconds=8.0, delay_ms=40.0))]
+    comparison = compare(runs)
+    assert comparison.differences[0].loop_p50_ms == pytest.approx(40, abs=1)
+    assert json.loads(json.dumps(comparison.as_dict()))["differences"][0]["session"] == "slow"
+
+
+@pytest.mark.parametrize(
+    ("align", "words"),
+    [("part_picked", "has no event PART_PICKED; it has SESSION_END, SESSION_START"), ("motion", "the arm never moves")],
+)
+def test_what_can_not_be_aligned_is_said(tmp_path: Path, align: str, words: str) -> None:
+    script = Script(seconds=2.0)
+    made = make(script)
+    for one in made:
+        if isinstance(one.message, JointState):
+            one.message.velocity[:] = [0.0] * 4
+    run = named(tmp_path, "run", script, made)
+    with pytest.raises(InputError, match=words):
+        compare([run, run], align)
+
+
+def test_one_run_is_no_comparison(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="two runs or more"):
+        compare([named(tmp_path, "run", Script(seconds=1.0))])
+
+
+def test_a_comparison_is_drawn(tmp_path: Path) -> None:
+    script = Script(seconds=2.0)
+    comparison = compare([named(tmp_path, "one", script), named(tmp_path, "two", script)])
+    save_comparison_plot(comparison, tmp_path / "both.svg")
+    assert "aligned time" in (tmp_path / "both.svg").read_text() or (tmp_path / "both.svg").stat().st_size > 20_000
+
+
+class _Page(HTMLParser):
+    """Tags that are open, what a page refers to, and its text."""
+
+    VOID = frozenset({"meta", "img", "br", "!doctype"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.sources: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.sources.extend(value or "" for name, value in attrs if name in ("src", "href", "action"))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.text += f"{data} "
+
+
+def test_a_report_is_one_page_that_needs_no_other(tmp_path: Path) -> None:
+    text = report_html([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0))])
+    page = _Page(text)
+    assert page.open == []
+    assert len(page.sources) == 2
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert not re.search(r"https?://|@import|url\(|<script|<link", text)
+    for words in ("run-1", "register wait", "controlled by 192.0.2.7:40001", "0 of 4", "Not fit for latency claims"):
+        assert words in page.text, words
+    assert "pass between reading the positions and writing the torques" in page.text
+
+
+def test_a_class_is_ranked_with_each_run_below(tmp_path: Path) -> None:
+    script = Script(seconds=3.0)
+    placed = make(script)
+    spot = PARAMETERS.scene.trays[0].places[0]
+    for one in placed:
+        if isinstance(one.message, JointState):
+            for part in one.message.parts:
+                if part.name == "red":
+                    part.x, part.y, part.z = spot[0] + 0.001, spot[1], spot[2] + PARAMETERS.scene.parts[0].size[2] / 2
+    runs = [named(tmp_path, "nothing", script), named(tmp_path, "one-part", script, placed)]
+    page = _Page(report_html(runs))
+    assert page.text.index("one-part") < page.text.index("nothing")
+    assert "1 of 4" in page.text
+    assert "1.00" in page.text
+
+
+def test_what_a_recording_says_is_text_and_never_markup(tmp_path: Path) -> None:
+    text = report_html([named(tmp_path, "a<b>&c", Script(seconds=1.0))])
+    assert "a&lt;b&gt;&amp;c" in text
+    assert "<b>&c" not in text
