@@ -8,6 +8,7 @@ import stat
 import struct
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,6 +27,7 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
 from labs import hilrig
+from waiting import eventually
 
 pytestmark = pytest.mark.rig
 
@@ -154,6 +156,26 @@ def test_a_client_without_tls_is_refused_and_holds_nobody_up(rig: EdgeRig, lab: 
         while plain.recv(100):
             pass
     assert "no TLS" in rig.event(Event.CONNECTION_REFUSED).text
+
+
+def test_unfinished_handshakes_count_as_connections(lab: Lab) -> None:
+    [port] = free_ports(1)
+    with running_edge(tls=lab.tls(port), max_connections_per_host=2) as rig:
+        with ExitStack() as idlers:
+            for _ in range(2):
+                idlers.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+            third = idlers.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+            assert third.recv(1) == b""
+            assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
+        # They are gone, and with them what they took.
+        eventually(lambda: answers(rig, lab))
+
+
+def answers(rig: EdgeRig, lab: Lab) -> bool:
+    try:
+        return bool(talk(rig, lab.client("operator"), READ))
+    except OSError:
+        return False
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion.TLSv1_1")

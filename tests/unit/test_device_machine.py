@@ -59,7 +59,7 @@ class Model:
         return True
 
 
-@settings(max_examples=60, stateful_step_count=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=40, stateful_step_count=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 class DeviceMachine(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:

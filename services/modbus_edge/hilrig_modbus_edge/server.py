@@ -108,7 +108,9 @@ class RigServer:
             return "its address is not in the rig's networks (allow in lab.toml)"
         if len(self.connections) + len(self.gates) >= limits.connections:
             return f"the rig has {limits.connections} connections already (edge.max_connections)"
-        if self.device.connections_of(host) >= limits.connections_per_host:
+        # Who is still shaking hands counts, or one host could keep all others out with it.
+        of_host = self.device.connections_of(host) + sum(gate.host == host for gate in self.gates)
+        if of_host >= limits.connections_per_host:
             return f"its host has {limits.connections_per_host} connections already (edge.max_connections_per_host)"
         return ""
 

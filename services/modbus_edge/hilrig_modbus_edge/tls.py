@@ -64,6 +64,7 @@ class TlsGate(asyncio.Protocol):
     def __init__(self, server: "RigServer", policy: TlsPolicy) -> None:
         self._server = server
         self._policy = policy
+        self.host = ""
         self._early = bytearray()
         self._task: asyncio.Task[None] | None = None
 
@@ -73,6 +74,7 @@ class TlsGate(asyncio.Protocol):
         self._transport = transport
         peer = self._server.admit(transport)
         if peer is not None:
+            self.host = peer[0]
             self._server.gates.add(self)
             self._task = asyncio.get_running_loop().create_task(self._shake_hands(*peer))
 

@@ -1,0 +1,122 @@
+"""Our functions against pymodbus's classes: it writes the requests and reads the answers, we do what is between."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymodbus.pdu import DecodePDU, ModbusPDU
+from pymodbus.pdu.bit_message import (
+    ReadCoilsRequest,
+    ReadDiscreteInputsRequest,
+    WriteMultipleCoilsRequest,
+    WriteSingleCoilRequest,
+)
+from pymodbus.pdu.exceptionresponse import ExceptionResponse
+from pymodbus.pdu.mei_message import ReadDeviceInformationRequest
+from pymodbus.pdu.register_message import (
+    MaskWriteRegisterRequest,
+    ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
+    ReadWriteMultipleRegistersRequest,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
+from device_bench import Bench
+from hilrig_modbus_edge import pdu
+
+WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=4)
+DECODER = DecodePDU(is_server=False)
+
+
+def ask(bench: Bench, request: ModbusPDU) -> ModbusPDU:
+    """What pymodbus makes of our answer to its request."""
+    client = next(iter(bench.device.clients), None) or bench.connect()
+    data = bytes((request.function_code,)) + request.encode()
+    answer = pdu.answer(bench.device, client, data, bench.clock.monotonic_ns())
+    decoded = DECODER.decode(answer)
+    assert decoded is not None
+    return decoded
+
+
+def fresh() -> Bench:
+    bench = Bench()
+    bench.state(1)
+    return bench
+
+
+@given(WORDS)
+def test_registers_that_pymodbus_writes_it_reads_back(words: list[int]) -> None:
+    bench, count = fresh(), len(words)
+    written = ask(bench, WriteMultipleRegistersRequest(address=0, registers=words))
+    assert (written.address, written.count) == (0, count)
+    assert ask(bench, ReadHoldingRegistersRequest(address=0, count=count)).registers == words
+    request = ReadWriteMultipleRegistersRequest(
+        read_address=0, read_count=count, write_address=0, write_registers=words[::-1]
+    )
+    assert ask(bench, request).registers == words[::-1]
+
+
+@given(st.integers(0, 3), st.integers(0, 0xFFFF), st.integers(0, 0xFFFF), st.integers(0, 0xFFFF))
+def test_single_and_masked_writes(address: int, word: int, and_mask: int, or_mask: int) -> None:
+    bench = fresh()
+    written = ask(bench, WriteSingleRegisterRequest(address=address, registers=[word]))
+    assert (written.address, written.registers) == (address, [word])
+    masked = ask(bench, MaskWriteRegisterRequest(address=address, and_mask=and_mask, or_mask=or_mask))
+    assert (masked.address, masked.and_mask, masked.or_mask) == (address, and_mask, or_mask)  # type: ignore[attr-defined]
+    wanted = (word & and_mask) | (or_mask & (0xFFFF - and_mask))
+    assert ask(bench, ReadHoldingRegistersRequest(address=address, count=1)).registers == [wanted]
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_coils(on: bool) -> None:
+    bench = fresh()
+    assert list(ask(bench, WriteSingleCoilRequest(address=0, bits=[on])).bits) == [on]
+    assert ask(bench, ReadCoilsRequest(address=0, count=1)).bits[0] == on
+    written = ask(bench, WriteMultipleCoilsRequest(address=0, bits=[not on]))
+    assert (written.address, written.count) == (0, 1)
+    assert ask(bench, ReadCoilsRequest(address=0, count=1)).bits[0] != on
+
+
+@given(st.integers(0, 15), st.integers(1, 16))
+def test_discrete_inputs_are_the_bits_of_the_status_word(address: int, count: int) -> None:
+    bench = fresh()
+    reply = ask(bench, ReadDiscreteInputsRequest(address=address, count=count))
+    if address + count > 16:
+        assert (reply.function_code, reply.exception_code) == (0x82, 2)
+        return
+    [status] = ask(bench, ReadInputRegistersRequest(address=1, count=1)).registers
+    assert list(reply.bits[:count]) == [bool(status >> bit & 1) for bit in range(address, address + count)]
+
+
+@given(st.integers(0, 40), st.integers(1, 60))
+def test_input_registers_are_slices_of_one_block(address: int, count: int) -> None:
+    bench = fresh()
+    whole = ask(bench, ReadInputRegistersRequest(address=0, count=36)).registers
+    reply = ask(bench, ReadInputRegistersRequest(address=address, count=count))
+    if address + count > 36:
+        assert isinstance(reply, ExceptionResponse)
+        assert reply.exception_code == 2
+    else:
+        assert reply.registers == whole[address : address + count]
+
+
+@pytest.mark.parametrize(("code", "objects"), [(1, [0, 1, 2]), (2, [0, 1, 2, 4, 5]), (3, [0, 1, 2, 4, 5])])
+def test_identification_streams(code: int, objects: list[int]) -> None:
+    reply = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=0))
+    assert list(reply.information) == objects  # type: ignore[attr-defined]
+    assert reply.information[0] == b"hilrig"  # type: ignore[attr-defined]
+    # A stream goes on where it is asked to, and starts again where there is nothing.
+    later = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=2))
+    assert list(later.information) == [number for number in objects if number >= 2]  # type: ignore[attr-defined]
+    nowhere = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=99))
+    assert list(nowhere.information) == objects  # type: ignore[attr-defined]
+
+
+@given(st.binary(min_size=1, max_size=253))
+def test_whatever_is_asked_is_answered(request: bytes) -> None:
+    bench = fresh()
+    reply = pdu.answer(bench.device, bench.connect(), request, bench.clock.monotonic_ns())
+    assert reply[0] & 0x7F == request[0] & 0x7F
+    assert 2 <= len(reply) <= 253
+    if reply[0] & 0x80:
+        assert reply[1] in (1, 2, 3, 4)
