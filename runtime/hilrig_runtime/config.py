@@ -126,8 +126,8 @@ class RecorderConfig(Section):
     """Recordings are `<folder>/<lab>/<rig>/<session>.mcap`."""
     preroll_s: NotNegative = 2.0
     """What a recording holds from before its session's start, s."""
-    queue_entries: Annotated[int, Field(ge=1)] = 200_000
-    """Messages that may wait for the disk; more are dropped and counted."""
+    queue_entries: Annotated[int, Field(ge=1)] = 500_000
+    """Messages that may wait for the disk; more are dropped and counted. The default is 20 s of 500 rigs."""
     rotate_mib: Annotated[int, Field(ge=0)] = 1024
     """A session goes on in a next file when its file is this large, MiB; 0: never."""
     rotate_min: NotNegative = 0.0

@@ -30,8 +30,9 @@ def test_a_recorder_that_is_told_to_end_finishes_its_files(tmp_path: Path, numbe
     assert metadata(path)["hilrig.config"]["rig"] == "rig1"
     sent = senders.sent["rig1"]
     # All that was sent up to some moment, and nothing is missing in between.
-    last = max(sequence for _, sequence, _ in found)
-    assert {key for key in sent if key[1] <= last} - set(found) == set()
+    for stream in ("/state", "/command"):
+        last = max(sequence for channel, sequence, _ in found if channel == stream)
+        assert {key for key in sent if key[0] == stream and key[1] <= last} - set(found) == set()
     assert len(found) > 150
 
 

@@ -14,6 +14,10 @@ from hilrig_runtime.config import RecorderConfig
 from hilrig_runtime.errors import HilrigError
 
 KEEP_PERIOD_S: Final = 60.0
+HEAD_START_S: Final = 2.0
+PAUSES: Final = 3.0
+"""Recovering pauses so many times as long as it works."""
+MIN_PAUSE_S: Final = 0.002
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +39,7 @@ class Housekeeping:
         self._clock = clock
         self._on_trouble = on_trouble
         self._ended = threading.Event()
+        self._resumed_ns = clock.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
         self._thread.start()
 
@@ -46,13 +51,24 @@ class Housekeeping:
     def _run(self) -> None:
         for draft in self._folder.glob(f"*/*{RECOVERING_SUFFIX}"):
             draft.unlink(missing_ok=True)
+        # First the sessions that go on get their next files.
+        if self._parts:
+            self._ended.wait(HEAD_START_S)
+        self._resumed_ns = self._clock.monotonic_ns()
         for part in self._parts:
-            if self._ended.is_set():
+            if not self._pause():
                 return
             self._recover(part)
         while not self._ended.is_set():
             self._tidy()
             self._ended.wait(KEEP_PERIOD_S)
+
+    def _pause(self) -> bool:
+        """Leave the processor to the recording, most of the time; whether to go on."""
+        worked_s = (self._clock.monotonic_ns() - self._resumed_ns) * 1e-9
+        ended = self._ended.wait(max(MIN_PAUSE_S, PAUSES * worked_s))
+        self._resumed_ns = self._clock.monotonic_ns()
+        return not ended
 
     def _recover(self, part: Path) -> None:
         try:
@@ -62,7 +78,7 @@ class Housekeeping:
             path = recovered_path(part)
             if path.exists():
                 path = path.with_name(f"{path.stem}.recovered{path.suffix}")
-            recovery = recover(part, path, go_on=lambda: not self._ended.is_set())
+            recovery = recover(part, path, go_on=self._pause)
             if recovery.path is None:
                 # It was finished, and only its name was missing.
                 part.replace(path)

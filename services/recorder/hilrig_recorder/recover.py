@@ -13,7 +13,7 @@ from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from hilrig_recorder.scan import Chunk, Damage, DamagedError, Message, is_whole, open_chunk, scan
+from hilrig_recorder.scan import Chunk, Damage, DamagedError, Message, is_whole, message_keys, open_chunk, scan
 from hilrig_recorder.writer import LIBRARY, PART_SUFFIX, RunWriter, lock_file
 from hilrig_runtime.errors import InputError, OperationError
 
@@ -91,10 +91,9 @@ def read_tail(path: Path) -> Tail:
     for chunk in chunks:
         if chunk.last_ns >= last_ns - TAIL_NS:
             with contextlib.suppress(DamagedError):
-                for message in open_chunk(chunk):
-                    if isinstance(message, Message):
-                        keys.add((message.channel_id, message.sequence, message.publish_time))
-                        last[message.channel_id] = (message.sequence, message.publish_time)
+                for key in message_keys(chunk):
+                    keys.add(key)
+                    last[key[0]] = key[1:]
     return Tail(end, keys, last, last_ns)
 
 

@@ -139,6 +139,23 @@ def open_chunk(chunk: Chunk) -> Iterator[Message | Schema | Channel]:
     return _contents(raw)
 
 
+def message_keys(chunk: Chunk) -> Iterator[tuple[int, int, int]]:
+    """Channel, sequence and publish time of a chunk's messages: much quicker than `open_chunk`.
+
+    Raises:
+        DamagedError: as `open_chunk`.
+    """
+    raw = _decompress(chunk)
+    head, message_head, size = _HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, _HEAD.size
+    message, offset, end = int(Opcode.MESSAGE), 0, len(raw) - size - _MESSAGE_HEAD.size
+    while offset <= end:
+        opcode, length = head(raw, offset)
+        if opcode == message:
+            channel_id, sequence, _, publish_time = message_head(raw, offset + size)
+            yield channel_id, sequence, publish_time
+        offset += size + length
+
+
 def is_whole(buffer: Buffer) -> bool:
     """Whether a file is finished: it begins and ends as it should, and its index matches its checksum."""
     view = memoryview(buffer)

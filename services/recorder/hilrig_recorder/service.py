@@ -32,9 +32,10 @@ _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
 _ANSWER_TIMEOUT_S: Final = 1.0
 _ELDER_PERIOD_NS: Final = 10 * SECOND_NS
-_LAST_BATCHES_NS: Final = SECOND_NS // 2
+_LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
 """When it is told to stop, the recorder waits so long for what the others still have to say."""
-_FINISH_TIMEOUT_S: Final = 0.5
+_DRAIN_NS: Final = SECOND_NS // 2
+_FINISH_TIMEOUT_S: Final = 0.4
 
 logger = logging.getLogger(__name__)
 
@@ -140,13 +141,14 @@ class Recorder:
         service.ready()
         while not service.stopping.is_set():
             due_ns = self._turn(due_ns)
+        # What may still arrive is waited for a little while, and what has arrived is written.
         deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_NS
-        while self._goes_on(deadline_ns):
+        while self._book.recordings and clock.monotonic_ns() < deadline_ns:
             due_ns = self._turn(due_ns)
-
-    def _goes_on(self, deadline_ns: int) -> bool:
-        # What has arrived is written in any case; what may still arrive is waited for a little while.
-        return self._intake.depth > 0 or bool(self._book.recordings and self._clock.monotonic_ns() < deadline_ns)
+        self._stream.close()
+        deadline_ns = clock.monotonic_ns() + _DRAIN_NS
+        while self._intake.depth > 0 and clock.monotonic_ns() < deadline_ns:
+            due_ns = self._turn(due_ns)
 
     def _turn(self, due_ns: int) -> int:
         now_ns = self._clock.monotonic_ns()
