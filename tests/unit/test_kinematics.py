@@ -120,6 +120,24 @@ def test_many_poses_at_once_are_the_same_as_one_by_one() -> None:
         np.testing.assert_array_equal(jacobians[:, :, index], kinematics.jacobian(ARM, many[:, index]))
 
 
+def test_the_inverse_of_many_poses_is_that_of_each() -> None:
+    rng = np.random.default_rng(2)
+    poses = np.stack([*rng.uniform(-0.65, 0.65, (2, 300)), rng.uniform(-0.08, 0.15, 300), rng.uniform(-7, 7, 300)])
+    # The edge of the workspace, where the arm is straight, is among them.
+    poses[:, 0] = 0.6, 0.0, 0.1, 0.0
+    many = kinematics.inverse_many(ARM, poses)
+    found = 0
+    for index in range(300):
+        mine = many[~np.isnan(many[:, 0, index]), :, index]
+        try:
+            one_by_one = kinematics.inverse(ARM, poses[:, index])
+        except UnreachableError:
+            one_by_one = np.empty((0, 4))
+        assert sorted(map(tuple, mine)) == sorted(map(tuple, one_by_one))
+        found += len(mine)
+    assert found > 300
+
+
 def test_reach_is_a_ring_less_what_the_stops_cut_off() -> None:
     reach = kinematics.reach(ARM)
     assert reach.outer == pytest.approx(0.6)

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 _EDGE: Final = 1e-12
 """How far beyond the edge of reach, relative, is still on it: rounding."""
+_HALF_DIGITS: Final = 1e-6
+"""What rounding may make of joints near a singularity, rad."""
 _UNITS: Final = ("°", "°", " mm", "°")
 
 
@@ -94,7 +96,7 @@ def in_reach(arm: ArmParameters, x: ArrayLike, y: ArrayLike) -> NDArray[np.bool_
     """Whether the tool gets to points of the plane, m, (…), with either elbow."""
     inside = np.zeros(np.broadcast(x, y).shape, dtype=np.bool_)
     for theta1, theta2, exists in _elbows(arm, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)):
-        inside |= exists & _within(arm, 0, _into(arm, 0, theta1)) & _within(arm, 1, theta2)
+        inside |= exists & _within(arm, 0, theta1) & _within(arm, 1, theta2)
     return inside
 
 
@@ -126,7 +128,7 @@ def inverse(arm: ArmParameters, pose: ArrayLike) -> Floats:
         raise UnreachableError(
             f"{where} is too near: {distance * 1e3:.1f} mm from joint 1, {inner * 1e3:.1f} mm is the least"
         )
-    d3 = _on_edge(arm, 2, arm.l1 - z)
+    d3 = float(_on_edge(arm, 2, arm.l1 - z))
     if not _within(arm, 2, d3):
         top, bottom = (arm.l1 - arm.lower[2]) * 1e3, (arm.l1 - arm.upper[2]) * 1e3
         raise UnreachableError(
@@ -135,7 +137,7 @@ def inverse(arm: ArmParameters, pose: ArrayLike) -> Floats:
     solutions: list[tuple[float, float, float, float]] = []
     blocked: list[str] = []
     for theta1_raw, theta2_raw, _ in _elbows(arm, np.array(x), np.array(y)):
-        theta1, theta2 = _on_edge(arm, 0, float(_into(arm, 0, theta1_raw))), _on_edge(arm, 1, float(theta2_raw))
+        theta1, theta2 = float(theta1_raw), float(theta2_raw)
         over = [j for j, angle in ((0, theta1), (1, theta2)) if not _within(arm, j, angle)]
         if over:
             blocked.extend(_limit_sentence(arm, j, (theta1, theta2)[j]) for j in over)
@@ -150,16 +152,56 @@ def inverse(arm: ArmParameters, pose: ArrayLike) -> Floats:
     return np.array(unique)
 
 
+def inverse_many(arm: ArmParameters, poses: ArrayLike) -> Floats:
+    """As `inverse`, for many poses at once: (4, n) gives (branches, 4, n), NaN where a branch has no solution.
+
+    The branches are both elbows and, for each, every turn of θ4 that its range has room for.
+    """
+    x, y, z, yaw = np.asarray(poses, dtype=np.float64)
+    turn = 2 * math.pi
+    d3 = _on_edge(arm, 2, arm.l1 - z)
+    branches = []
+    for number, (theta1_raw, theta2_raw, exists) in enumerate(_elbows(arm, x, y)):
+        theta1, theta2 = theta1_raw, theta2_raw
+        possible = exists & _within(arm, 0, theta1) & _within(arm, 1, theta2) & _within(arm, 2, d3)
+        if number:
+            # A straight arm has one elbow.
+            possible &= theta2 != 0
+        rest = yaw - theta1 - theta2
+        first = np.ceil((arm.lower[3] - rest) / turn - 1e-9)
+        for k in range(int((arm.upper[3] - arm.lower[3]) / turn) + 1):
+            theta4 = _on_edge(arm, 3, rest + (first + k) * turn)
+            valid = possible & _within(arm, 3, theta4)
+            branches.append(np.where(valid, np.stack([theta1, theta2, d3, theta4]), np.nan))
+    return np.stack(branches)
+
+
 def _elbows(arm: ArmParameters, x: Floats, y: Floats) -> list[tuple[Floats, Floats, NDArray[np.bool_]]]:
     """θ1, θ2 of both elbows, and whether the distance allows them."""
     cosine = (x * x + y * y - arm.l2**2 - arm.l3**2) / (2 * arm.l2 * arm.l3)
     exists = np.abs(cosine) <= 1 + 4 * _EDGE
     bend = np.arccos(np.clip(cosine, -1.0, 1.0))
     found = []
-    for theta2 in (bend, -bend):
-        theta1 = np.arctan2(y, x) - np.arctan2(arm.l3 * np.sin(theta2), arm.l2 + arm.l3 * np.cos(theta2))
-        found.append((theta1, theta2, exists))
+    for elbow in (bend, -bend):
+        shoulder = np.arctan2(y, x) - np.arctan2(arm.l3 * np.sin(elbow), arm.l2 + arm.l3 * np.cos(elbow))
+        theta1, theta2 = _off_the_stop(arm, x, y, _into(arm, 0, shoulder), elbow)
+        found.append((_on_edge(arm, 0, theta1), _on_edge(arm, 1, theta2), exists))
     return found
+
+
+def _off_the_stop(arm: ArmParameters, x: Floats, y: Floats, theta1: Floats, theta2: Floats) -> tuple[Floats, Floats]:
+    """The same pose with θ1 at its limit, where rounding put it beyond.
+
+    Near a singularity a pose tells its joints to half the digits only. A θ1 that is so little beyond its limit is set
+    to it, and θ2 then points link 2 at the pose again; kept where that is the pose.
+    """
+    at_limit = np.clip(theta1, arm.lower[0], arm.upper[0])
+    elbow_x, elbow_y = arm.l2 * np.cos(at_limit), arm.l2 * np.sin(at_limit)
+    pointing = np.arctan2(y - elbow_y, x - elbow_x)
+    away = np.hypot(elbow_x + arm.l3 * np.cos(pointing) - x, elbow_y + arm.l3 * np.sin(pointing) - y)
+    turned = np.arctan2(np.sin(pointing - at_limit), np.cos(pointing - at_limit))
+    better = (at_limit != theta1) & (np.abs(at_limit - theta1) < _HALF_DIGITS) & (away < _EDGE)
+    return np.where(better, at_limit, theta1), np.where(better, turned, theta2)
 
 
 def _radius(arm: ArmParameters, theta2: float) -> float:
@@ -178,11 +220,12 @@ def _within(arm: ArmParameters, joint: int, value: ArrayLike) -> NDArray[np.bool
     return np.asarray((arm.lower[joint] <= np.asarray(value)) & (np.asarray(value) <= arm.upper[joint]))
 
 
-def _on_edge(arm: ArmParameters, joint: int, value: float) -> float:
-    """A value that rounding put just outside a limit is on it."""
+def _on_edge(arm: ArmParameters, joint: int, value: ArrayLike) -> Floats:
+    """Values that rounding put just outside a limit are on it."""
     low, high = arm.lower[joint], arm.upper[joint]
     slack = _EDGE * max(1.0, abs(low), abs(high))
-    return min(max(value, low), high) if low - slack <= value <= high + slack else value
+    values = np.asarray(value, dtype=np.float64)
+    return np.where((values >= low - slack) & (values <= high + slack), np.clip(values, low, high), values)
 
 
 def _turns(arm: ArmParameters, theta4: float) -> list[float]:
@@ -190,7 +233,7 @@ def _turns(arm: ArmParameters, theta4: float) -> list[float]:
     turn = 2 * math.pi
     first = math.ceil((arm.lower[3] - theta4) / turn - 1e-9)
     last = math.floor((arm.upper[3] - theta4) / turn + 1e-9)
-    angles = (_on_edge(arm, 3, theta4 + k * turn) for k in range(first, last + 1))
+    angles = (float(_on_edge(arm, 3, theta4 + k * turn)) for k in range(first, last + 1))
     return [angle for angle in angles if _within(arm, 3, angle)]
 
 
