@@ -89,7 +89,7 @@ def test_an_impact_never_adds_energy_and_leaves_nothing_moving_outwards(
         assert pushed or abs(push[j]) <= 1e-9
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(joints, speeds, st.lists(efforts, min_size=1, max_size=6))
 def test_no_joint_is_ever_outside_its_limits(
     position: tuple[float, ...], velocity: tuple[float, ...], sequence: list[tuple[float, ...]]
@@ -103,7 +103,7 @@ def test_no_joint_is_ever_outside_its_limits(
             assert np.all(np.isfinite(plant.velocity))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(joints, speeds)
 def test_without_efforts_energy_only_falls_through_any_impacts(
     position: tuple[float, ...], velocity: tuple[float, ...]
