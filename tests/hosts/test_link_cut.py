@@ -56,8 +56,8 @@ def test_a_cable_pulled_for_five_seconds_loses_nothing(tmp_path: Path) -> None:
     found = recorded([path])
     assert len(found) == len(set(found))
     missing = set(sent) - set(found)
-    assert not missing, f"{len(missing)} of {len(sent)} are missing"
     summary = metadata(path)["hilrig.summary"]
+    assert not missing, f"{len(missing)} of {len(sent)} are missing: {sorted(missing)[0][:2]}…; stated: {summary}"
     assert (summary["lost_transport"], summary["lost_recorder"], summary["clock_steps"]) == ("0", "0", "0")
 
 

@@ -82,8 +82,7 @@ def test_a_session_by_hand_and_its_refusals(tmp_path: Path) -> None:
             ended = hilrig("record", "stop", "rig1", "--config", config)
             assert ended.returncode == 0, ended.stderr
             assert session in ended.stdout
-            eventually(lambda: files_of(lab, "rig1", "*.2.mcap"))
-            [first, last] = files_of(lab, "rig1")
+            [first, last] = eventually(lambda: len(files_of(lab, "rig1")) == 2 and files_of(lab, "rig1"), timeout_s=20)
             assert first.name == f"{session}.mcap"
             assert metadata(last)["hilrig.session"]["session"] == session
             assert metadata(last)["hilrig.summary"]["reason"] == "ended by hand"
