@@ -21,8 +21,10 @@ from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, parse_rig_key
 
-PERIOD_S: Final = 0.04
-"""How often what has come in is drawn, s."""
+VIEWER_PERIOD_S: Final = 0.04
+"""How often what has come in is drawn into a viewer, s."""
+FILE_PERIOD_S: Final = 0.5
+"""The same into a file, whose index, kept in memory until its end, grows with each piece."""
 START_TIMEOUT_S: Final = 5.0
 """A rig that does not answer within this time is not there, s."""
 SILENCE_NS: Final = 2_000_000_000
@@ -132,8 +134,8 @@ class Follower:
             self._handles.pop().close()
 
 
-def follow(follower: Follower, over: Callable[[], bool], stopping: threading.Event) -> None:
-    """Draw until `over()` says so or `stopping` is set.
+def follow(follower: Follower, over: Callable[[], bool], stopping: threading.Event, period_s: float) -> None:
+    """Draw every `period_s` until `over()` says so or `stopping` is set.
 
     Raises:
         OperationError: nothing runs there.
@@ -141,7 +143,7 @@ def follow(follower: Follower, over: Callable[[], bool], stopping: threading.Eve
     try:
         if not follower.find(stopping):
             return
-        while not over() and not stopping.wait(PERIOD_S):
+        while not over() and not stopping.wait(period_s):
             follower.step()
         follower.step()
     finally:

@@ -22,7 +22,7 @@ def live(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
 ) -> None:
     """Follow a running rig: the same view as of a recording, as it happens; until it is closed, or Ctrl-C."""
-    from hilrig_replay.live import Follower, follow
+    from hilrig_replay.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
     from hilrig_replay.rerun_layout import layout
     from hilrig_replay.streams import to_file, to_viewer
     from hilrig_replay.viewer import browser_address, free_port, running_viewer
@@ -61,4 +61,5 @@ def live(
 
         closing.callback(stream.disconnect)
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
-        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say), over, stopping)
+        period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S
+        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say), over, stopping, period_s)
