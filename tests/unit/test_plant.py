@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from hilrig_runtime.errors import InputError
 from hilrig_sim.dynamics import ReducedDynamics, mass_matrix
+from hilrig_sim.limits import Happening
 from hilrig_sim.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
-from hilrig_sim.plant import Happening, Plant
+from hilrig_sim.plant import Plant
 from hilrig_sim.stops import stop_outward
 from recordings import PARAMETERS
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from hilrig_sim import kinematics
+from hilrig_sim.limits import TOOL_CONTACT_FLAG, Happening, PlantEvent
 from hilrig_sim.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
-from hilrig_sim.plant import TOOL_CONTACT_FLAG, Happening, Plant, PlantEvent
-from hilrig_sim.world import GROUND_BELOW_TABLE, NONE
+from hilrig_sim.plant import Plant
+from hilrig_sim.surfaces import GROUND_BELOW_TABLE
+from hilrig_sim.world import NONE
 
 ARM = ArmParameters()
 TABLE = -0.06

@@ -6,8 +6,6 @@ next one depends on is in the published state, but for the speed of a part that 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Final
 
 import numpy as np
@@ -16,43 +14,19 @@ from numpy.typing import NDArray
 from hilrig_runtime.errors import InputError
 from hilrig_sim.dynamics import ReducedDynamics
 from hilrig_sim.integrators import TABLEAUS, Tableau
+from hilrig_sim.limits import Happening, LimitFlags, PlantEvent, any_true
 from hilrig_sim.model import RigParameters
 from hilrig_sim.stepping import FixedStep
 from hilrig_sim.stops import crossing, stop_outward
-from hilrig_sim.world import ALL, NONE, TOUCHING, World
+from hilrig_sim.surfaces import TOUCHING
+from hilrig_sim.world import ALL, NONE, World
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-TOOL_CONTACT_FLAG: Final = 1 << 8
-
-
 _TRUE: Final = b"\x01"
 _FALSE: Final = b"\x00"
-
-
-class Happening(Enum):
-    """What a step may bring that is worth an event."""
-
-    LIMIT_HIT = "limit hit"
-    PART_PICKED = "part picked"
-    PART_DROPPED = "part dropped"
-
-
-@dataclass(frozen=True, slots=True)
-class PlantEvent:
-    """Something that happened to one rig in a step."""
-
-    happening: Happening
-    rig: int
-    joint: int = 0
-    """1 to 4 at a limit; 0: the tool, on what lies below it."""
-    upper: bool = False
-    speed: float = 0.0
-    """Of the joint at the impact; rad/s or m/s."""
-    part: int = NONE
-    """Index of the part in the rig's scene."""
 
 
 class Plant:
@@ -93,7 +67,6 @@ class Plant:
         """d3 up to which nothing can be below the tool, m, (N,)."""
         self._at_lower = np.zeros((4, count), dtype=np.bool_)
         self._at_upper = np.zeros((4, count), dtype=np.bool_)
-        self._below = np.zeros(count, dtype=np.bool_)
         self._switched = np.zeros(count, dtype=np.bool_)
         self._low = np.zeros(count, dtype=np.bool_)
         self._contact_known = np.full((4, count), np.nan)
@@ -103,9 +76,7 @@ class Plant:
         self._contact_unknown = np.zeros(count, dtype=np.bool_)
         self._start_position = np.empty((4, count))
         self._start_velocity = np.empty((4, count))
-        self._flags = [0] * count
-        self._flagged = False
-        self._flag_key = b""
+        self._limits = LimitFlags(self._stop[2])
         self._touching_plane = False
         self._nothing_held = (np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_))
         self._held = self._nothing_held
@@ -121,7 +92,7 @@ class Plant:
     @property
     def limit_flags(self) -> Sequence[int]:
         """For each rig: bit j-1 joint j on its lower stop, bit 3+j on its upper one, bit 8 tool on what is below it."""
-        return self._flags
+        return self._limits.flags
 
     def tool(self, rigs: Ints | slice) -> Floats:
         """Poses (x, y, z, yaw) of the tools of some rigs, (4, K); (1)–(4)."""
@@ -232,9 +203,9 @@ class Plant:
         np.greater_equal(position, self._upper, upper)
         at_lower, at_upper = lower.tobytes(), upper.tobytes()
         if not (_TRUE in at_lower or _TRUE in at_upper):
-            if self._flagged:
+            if self._limits.any:
                 self._touching_plane = False
-                self._update_flags(None)
+                self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
             return
         arriving = velocity.copy()
         plane = 2 * self.count
@@ -249,7 +220,7 @@ class Plant:
         speed34, lower34, upper34 = velocity[2:], lower[2:], upper[2:]
         np.maximum(speed34, 0.0, out=speed34, where=lower34)
         np.minimum(speed34, 0.0, out=speed34, where=upper34)
-        self._update_flags(arriving)
+        self._limits.update(lower, upper, self._upper[2], arriving, self._events)
 
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
@@ -330,37 +301,6 @@ class Plant:
         mass = dynamics.mass_matrix_12(position[1])
         velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
 
-    def _update_flags(self, arriving: Floats | None) -> None:
-        """Restate the limit flags where they changed, and tell of the limits that were hit at velocities `arriving`."""
-        np.less(self._upper[2], self._stop[2], self._below)
-        key = self._at_lower.tobytes() + self._at_upper.tobytes() + self._below.tobytes()
-        if key == self._flag_key:
-            return
-        self._flag_key = key
-        self._flagged = False
-        touching = self._at_lower.any(axis=0) | self._at_upper.any(axis=0)
-        for rig in np.flatnonzero(touching | (np.asarray(self._flags) != 0)):
-            flags = 0
-            for joint in range(4):
-                if self._at_lower[joint, rig]:
-                    flags |= 1 << joint
-                if self._at_upper[joint, rig]:
-                    flags |= TOOL_CONTACT_FLAG if joint == 2 and self._below[rig] else 1 << (4 + joint)
-            new = flags & ~self._flags[rig]
-            self._flags[rig] = flags
-            self._flagged |= flags != 0
-            if new and arriving is not None:
-                self._tell_hits(int(rig), new, arriving)
-
-    def _tell_hits(self, rig: int, new: int, arriving: Floats) -> None:
-        for joint in range(4):
-            for upper in (False, True):
-                if new & (1 << (4 * upper + joint)):
-                    hit = PlantEvent(Happening.LIMIT_HIT, rig, joint + 1, upper, abs(float(arriving[joint, rig])))
-                    self._events.append(hit)
-        if new & TOOL_CONTACT_FLAG:
-            self._events.append(PlantEvent(Happening.LIMIT_HIT, rig, 0, True, abs(float(arriving[2, rig]))))
-
     def _begin_anew(self) -> None:
         """Derive everything from position, velocity and the world's parts."""
         self.dynamics.set_payload(self.world.payload())
@@ -372,7 +312,7 @@ class Plant:
         np.less_equal(self.position, self._lower, self._at_lower)
         np.greater_equal(self.position, self._upper, self._at_upper)
         self._touching_plane = bool(self._at_lower[:2].any() or self._at_upper[:2].any())
-        self._update_flags(None)
+        self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
 
     def _world_changed(self) -> None:
         """Forget what was known of what lies below the tools."""
@@ -386,8 +326,3 @@ class Plant:
 def _sides(position: Floats, lower: Floats, upper: Floats) -> Floats:
     """+1 where joints 1 and 2 are on their upper stops, -1 on their lower ones, else 0, (2, N)."""
     return (position[:2] >= upper[:2]).astype(np.float64) - (position[:2] <= lower[:2])
-
-
-def any_true(mask: Bools) -> bool:
-    """Whether any element is true: for a few elements, ten times as fast as `mask.any()`."""
-    return _TRUE in mask.tobytes()

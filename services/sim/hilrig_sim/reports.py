@@ -8,7 +8,8 @@ from hilrig_runtime.rate import Tick
 from hilrig_schemas import Event
 from hilrig_schemas.v1.event_pb2 import LimitData, OverrunData, PartData, WatchdogData
 from hilrig_sim.commands import CommandFollower
-from hilrig_sim.plant import Happening, Plant, PlantEvent
+from hilrig_sim.limits import Happening, PlantEvent
+from hilrig_sim.plant import Plant
 
 QUIET_NS: Final = 250_000_000
 """A rig's limit is told of at most once in so long: a joint may rattle at its stop."""
