@@ -161,7 +161,7 @@ def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int,
             missed = (stall_ns + late_ns) // step_ns
             at_ns += missed * step_ns
             late_ns += stall_ns - missed * step_ns
-        ticks[step] = (at_ns + late_ns, late_ns + missed * step_ns, missed)
+        ticks[step] = (at_ns + late_ns, late_ns, missed)
         at_ns += step_ns
         step += 1
     return ticks

@@ -26,6 +26,14 @@ class Lost:
     recorder: int
 
 
+def behind_ns(states: Rows, step_ns: int) -> NDArray[np.int64]:
+    """How late each tick was for the deadline that it was meant for, shape (n,), ns.
+
+    After a stall the loop gives up the deadlines that are over, and `lateness_ns` is against the one it took up again.
+    """
+    return np.asarray(states["lateness_ns"] + states["missed_steps"].astype(np.int64) * step_ns)
+
+
 class FitnessWatch:
     """What speaks against a recording, collected block by block."""
 
@@ -51,11 +59,12 @@ class FitnessWatch:
             self._last_command = commands[-1:].copy()
 
     def _add_states(self, states: Rows) -> None:
-        self._lateness.append(states["lateness_ns"].copy())
+        behind = behind_ns(states, self._run.step_ns)
+        self._lateness.append(behind)
         self._missed += int(states["missed_steps"].sum())
-        late = np.flatnonzero((states["missed_steps"] > 0) | (states["lateness_ns"] > self._run.step_ns))
+        late = np.flatnonzero(behind > self._run.step_ns)
         times = self._run.time_ns(states[late])
-        self.stalls.extend(zip(times.tolist(), states["lateness_ns"][late].tolist(), strict=True))
+        self.stalls.extend(zip(times.tolist(), behind[late].tolist(), strict=True))
         delay = states["log_ns"] - states["wall_ns"]
         low, high = int(delay.min()), int(delay.max())
         if self._delay_ns is not None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from hilrig_replay.columns import Names, Rows
+from hilrig_replay.fitness import behind_ns
 from hilrig_replay.latency import STAGES, Matcher, join_commands
 from hilrig_replay.palette import (
     EFFORT_SYMBOLS,
@@ -208,7 +209,7 @@ class RigView:
         self._scalars("position", times, q * _SHOWN)
         self._scalars("velocity", times, states["velocity"] * _SHOWN)
         self._scalars("effort/applied", times, states["effort"])
-        self._scalars("lateness", times, states["lateness_ns"][:, None] / 1e6)
+        self._scalars("lateness", times, behind_ns(states, self._drawn.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)
         self._lane("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._lane("part", states, self._names.texts(states["held_part"]))
