@@ -38,6 +38,7 @@ CLOCK_STEP_NS: Final = 50_000_000
 """A wall clock that moves against a monotonic one by more than this has been set."""
 RETRY_NS: Final = 10 * SECOND_NS
 """A session that could not be recorded is tried again after this."""
+_FORGET_PERIOD_NS: Final = SECOND_NS // 2
 _SETTLING_NS: Final = 15 * SECOND_NS
 _MEMORY_NS: Final = 120 * SECOND_NS
 _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
@@ -194,6 +195,7 @@ class SessionBook:
         self._recordings: dict[str, Recording] = {}
         self._over: dict[str, int] = {}
         self._wall_ns = 0
+        self._forget_due_ns = 0
         self._clock_offset_ns: int | None = None
         self._clock_step_ns = -_SETTLING_NS
         self._refused: set[str] = set()
@@ -427,16 +429,9 @@ class SessionBook:
         if self._clock_offset_ns is not None and abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
             self._count_clock_step(now_ns)
         self._clock_offset_ns = offset_ns
-        horizon = wall_ns - self._preroll_ns
-        for rig in self._rigs.values():
-            if rig.newest:
-                rig.preroll.append((wall_ns, rig.newest))
-                rig.newest = []
-            # A clock set back would keep what is stamped in its future for ever.
-            while rig.preroll and not horizon <= rig.preroll[0][0] <= wall_ns:
-                rig.preroll.popleft()
-            while rig.losses and not horizon <= rig.losses[0][0] <= wall_ns:
-                rig.losses.popleft()
+        if now_ns >= self._forget_due_ns:
+            self._forget_due_ns = now_ns + _FORGET_PERIOD_NS
+            self._forget_preroll(wall_ns)
         heard: dict[str, int] = {}
         for source in self._sources.values():
             heard[source.name] = max(heard.get(source.name, 0), source.last_ns)
@@ -451,6 +446,18 @@ class SessionBook:
             if now_ns > until_ns:
                 del self._over[session]
         self._forget_sources(now_ns)
+
+    def _forget_preroll(self, wall_ns: int) -> None:
+        horizon = wall_ns - self._preroll_ns
+        for rig in self._rigs.values():
+            if rig.newest:
+                rig.preroll.append((wall_ns, rig.newest))
+                rig.newest = []
+            # A clock set back would keep what is stamped in its future for ever.
+            while rig.preroll and not horizon <= rig.preroll[0][0] <= wall_ns:
+                rig.preroll.popleft()
+            while rig.losses and not horizon <= rig.losses[0][0] <= wall_ns:
+                rig.losses.popleft()
 
     def _watch_keeper(self, recording: Recording, heard_ns: int, now_ns: int) -> None:
         if now_ns - max(heard_ns, recording.opened_ns) > KEEPER_SILENCE_NS:

@@ -189,9 +189,7 @@ class RunWriter:
             self._last_ns = log_time
         elif log_time < self._first_ns:
             self._first_ns = log_time
-        index = self._indexes[channel_id]
-        index.append(log_time)
-        index.append(pending)
+        self._indexes[channel_id] += (log_time, pending)
         self._records.append(record)
         self._pending_bytes = pending + len(record)
 
