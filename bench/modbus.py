@@ -250,7 +250,7 @@ def serve_whole(port: int, rigs: int, control: Connection) -> None:
     there.close()
     here.recv()
     try:
-        with Service("edge", lab, ZenohBus(lab.bus, "edge", express=lab.express)) as service:
+        with Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
             serve_ours(service, None, control)
     finally:
         here.close()
@@ -281,7 +281,7 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
 
 def send_states(lab: LabConfig, control: Connection) -> None:
     """In the simulation's place: states at 50 Hz, and every command received."""
-    with Service("sim", lab, ZenohBus(lab.bus, "sim", express=lab.express)) as service:
+    with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
         senders = [service.sender(topics.STATE, rig.name) for rig in lab.rigs]
         service.latest(topics.COMMAND)
         control.send(1)

@@ -151,8 +151,8 @@ class BusConfig(Section):
     """mesh: port of the simulation; the edge and the recorder take the next two."""
     router: str = "tcp/127.0.0.1:7447"
     """router: endpoint of the zenoh router."""
-    express: bool | None = None
-    """Send each control message at once instead of batching; default: when there are at most 16 rigs."""
+    express: bool = False
+    """Send each control message by itself, at the price of processor time, instead of with others that wait."""
 
 
 class RigSettings(Section):
@@ -227,11 +227,6 @@ class LabConfig(Section):
         """Modbus/TCP Security port of each rig, from `edge.tls.first_port` on; none without TLS."""
         tls = self.edge.tls
         return {} if tls is None else {rig.name: tls.first_port + index for index, rig in enumerate(self.rigs)}
-
-    @property
-    def express(self) -> bool:
-        """Whether control messages are sent one by one."""
-        return len(self.rigs) <= 16 if self.bus.express is None else self.bus.express
 
     def scene_of(self, rig: RigSettings) -> SceneConfig:
         """The scene around a rig: its own, or the lab's."""

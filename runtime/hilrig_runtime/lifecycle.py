@@ -65,7 +65,7 @@ def _open_bus(lab: LabConfig, name: str, stopping: threading.Event) -> Bus | Non
     waiting = False
     while not stopping.is_set():
         try:
-            return ZenohBus(lab.bus, name, express=lab.express)
+            return ZenohBus(lab.bus, name)
         except OperationError as error:
             if lab.bus.topology != "router":
                 raise

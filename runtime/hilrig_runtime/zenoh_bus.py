@@ -132,8 +132,8 @@ class _ZenohPublisher(Publisher):
 class ZenohBus(Bus):
     """See `hilrig_runtime.bus.Bus`. Raises `OperationError` where the session can't be opened."""
 
-    def __init__(self, bus: BusConfig, service: str, *, express: bool = True) -> None:
-        self._express = express
+    def __init__(self, bus: BusConfig, service: str) -> None:
+        self._express = bus.express
         try:
             self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service))
         except zenoh.ZError as error:

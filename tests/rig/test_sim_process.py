@@ -31,7 +31,7 @@ class SimProcess:
             self.process = subprocess.Popen(
                 [*HILRIG, "sim", "--config", str(config)], stdout=log, stderr=log, cwd=config.parent
             )
-        self.bus = ZenohBus(self.lab.bus, "edge", express=True)
+        self.bus = ZenohBus(self.lab.bus, "edge")
         key = self.lab.name
         self.bus.subscribe(STATE.key(key, "*"), lambda _, payload: self.states.append(STATE.decode(payload)))
         self.bus.subscribe(EVENT.key(key, "*"), lambda _, payload: self.events.append(EVENT.decode(payload)))
