@@ -9,6 +9,7 @@ server that libmodbus makes. Latency is what `hilrig latency` finds in the recor
 import json
 import multiprocessing
 import multiprocessing.connection
+import os
 import statistics
 import subprocess
 import sys
@@ -29,6 +30,8 @@ from hilrig_schemas.topics import STATE, Traffic
 
 QUESTION = "How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?"
 STEPS_MS = (20.0, 5.0, 1.0)
+QUIET_SHARE = 0.002
+"""Of one processor, taken away by the host on average, that a run may have had."""
 
 
 def measure(report: Report, quick: bool) -> None:
@@ -46,10 +49,21 @@ def measure(report: Report, quick: bool) -> None:
     report.add("bare zenoh, 50 Hz", "round trip p99", zenoh_p99, "µs")
 
     for step_ms in STEPS_MS:
-        measured = []
-        for number in range(runs):
-            progress(f"the rig at a step of {step_ms:g} ms, run {number + 1} of {runs}")
-            measured.append(rig_loop(client, step_ms, seconds))
+        runs_of_step: list[tuple[float, dict[str, Any], dict[str, Any]]] = []
+        # On a virtual machine the host may take the processors away for tens of milliseconds: such a run says nothing
+        # of the rig, so up to as many again are made, and the quietest count. How much was taken is reported.
+        while len(runs_of_step) < runs or (
+            len(runs_of_step) < 2 * runs and sorted(share for share, _, _ in runs_of_step)[runs - 1] > QUIET_SHARE
+        ):
+            progress(f"the rig at a step of {step_ms:g} ms, run {len(runs_of_step) + 1}")
+            before, begin = stolen_s(), time.monotonic()
+            latency, figures = rig_loop(client, step_ms, seconds)
+            runs_of_step.append(((stolen_s() - before) / (time.monotonic() - begin), latency, figures))
+        quietest = sorted(runs_of_step, key=lambda run: run[0])[:runs]
+        report.add(f"rig, {step_ms:g} ms", "runs made", len(runs_of_step), "count")
+        report.add(f"rig, {step_ms:g} ms", "runs counted", len(quietest), "count")
+        report.add(f"rig, {step_ms:g} ms", "taken away by the host", max(run[0] for run in quietest), "processors")
+        measured = [(latency, figures) for _, latency, figures in quietest]
         add_loop(report, step_ms, measured)
         if step_ms == STEPS_MS[0]:
             reads = [client_figures for _, client_figures in measured]
@@ -78,6 +92,14 @@ def add_loop(report: Report, step_ms: float, measured: list[tuple[dict[str, Any]
     else:
         report.bar("1 ms step: loop p50 in steps", loop["p50"] / step_ms, "<=", 1.05)
         report.bar("1 ms step: loop p99 in steps", loop["p99"] / step_ms, "<=", 2.0)
+
+
+def stolen_s() -> float:
+    """Processor time that the host has taken from this virtual machine since its start, s; 0 where it is not told."""
+    stat = Path("/proc/stat")
+    if not stat.exists():
+        return 0.0
+    return int(stat.read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
 def median(runs: list[dict[str, Any]], group: str, key: str) -> float:

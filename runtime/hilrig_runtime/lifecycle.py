@@ -16,7 +16,7 @@ from typing import Final
 from hilrig_runtime.bus import Bus
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.realtime import prefer_latency
+from hilrig_runtime.realtime import prefer_latency, yield_to_others
 from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 
@@ -47,6 +47,8 @@ def run_service(
     if name in CLOSES_THE_LOOP:
         # Before the bus is opened: its threads inherit it.
         prefer_latency()
+    else:
+        yield_to_others()
     stopping = threading.Event()
     stop_on_signals(stopping)
     if stop_with_parent:

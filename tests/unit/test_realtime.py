@@ -48,6 +48,22 @@ def test_the_thread_and_those_that_it_starts_get_short_slices_and_sharp_timers()
         assert slices == [realtime.SLICE_NS, realtime.SLICE_NS]
 
 
+def _stepped_back(connection: Connection) -> None:
+    realtime.yield_to_others()
+    connection.send(os.getpriority(os.PRIO_PROCESS, 0))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no nice values")
+def test_what_records_steps_back_behind_what_closes_the_loop() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    process = multiprocessing.get_context("spawn").Process(target=_stepped_back, args=(theirs,))
+    process.start()
+    assert ours.poll(20)
+    assert ours.recv() == min(19, before + realtime.BACKGROUND_NICE)
+    process.join(10)
+
+
 def test_an_unknown_machine_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "abacus")
     interval = sys.getswitchinterval()
