@@ -45,6 +45,8 @@ RATE = 4.0
 ERROR_FILTER_S = 0.03
 STALE_S = 0.025  # positions that stay the same for so long are new ones all the same
 LEAD_S = 0.02  # an effort acts that much later than it is written: until the rig's next step, and half of it
+SHORT_CYCLE_S = 0.030  # a controller that is slower than that moves the arm more slowly
+CYCLE_LEAD = 1.25  # of a cycle beyond the usual period: three quarters on the way, half of one acting
 LAG_SHARE = 0.15  # of what is seen of the lag is learnt at a time
 LARGEST_LAG_S = 0.25
 
@@ -164,13 +166,14 @@ def efforts_for(
 
 
 class Move:
-    """An S-curve from joints to joints: all start and arrive together, at rest."""
+    """An S-curve from joints to joints: all start and arrive together, at rest; `slowed` so many times."""
 
-    def __init__(self, start: np.ndarray, goal: np.ndarray) -> None:
+    def __init__(self, start: np.ndarray, goal: np.ndarray, slowed: float = 1.0) -> None:
         self.start, self.goal = start, goal
         way = np.abs(goal - start)
         # Peaks of the quintic: 15/8 of the mean speed, 10/sqrt(3) ways over the time squared.
-        self.duration = max(0.1, float(max((1.875 * way / SPEED).max(), np.sqrt(5.774 * way / ACCELERATION).max())))
+        fastest = float(max((1.875 * way / SPEED).max(), np.sqrt(5.774 * way / ACCELERATION).max()))
+        self.duration = slowed * max(0.1, fastest)
 
     def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Joints, their speeds and accelerations."""
@@ -233,8 +236,9 @@ class Controller:
         self._seen_s = 0.0
         self._error = np.zeros(4)
         self._error_rate = np.zeros(4)
-        self._filtered = np.zeros(4)
         self._last_s = self._cycle_s = 0.0
+        self.usual_cycle_s = PERIOD_S
+        """From one update to the next, as a rule."""
         self.magnet = False
         self.placed = 0
         self.done = False
@@ -246,6 +250,9 @@ class Controller:
         """Efforts for positions read at `now_s`: N·m, N·m, N, N·m from rad, rad, m, rad."""
         self._cycle_s = min(max(0.0, now_s - self._last_s), 0.1)
         self._last_s = now_s
+        # On a slow network a cycle takes longer, and so does an effort's way to the arm.
+        self.usual_cycle_s += 0.1 * (self._cycle_s - self.usual_cycle_s)
+        lead_s = LEAD_S + CYCLE_LEAD * max(0.0, self.usual_cycle_s - PERIOD_S)
         if self._move is None:
             self._stages = plan(self._task, joints)
             self._stage = next(self._stages)
@@ -253,7 +260,7 @@ class Controller:
         self._advance(now_s, joints)
         assert self._move is not None
         # What is asked for acts a little later.
-        coming, speed, acceleration = self._move.at(now_s - self._began_s + LEAD_S)
+        coming, speed, acceleration = self._move.at(now_s - self._began_s + lead_s)
         feedforward, matrix = efforts_for(coming, speed, acceleration, self._held_mass)
         self._compare(now_s, joints)
         feedback = RATE * (FRICTION * self._error + matrix @ (RATE * self._error + 2 * self._error_rate))
@@ -271,11 +278,12 @@ class Controller:
             return
         self._seen, self._seen_s = joints, now_s
         then, speed, _ = self._move.at(now_s - self._began_s - self.lag_s)
-        self._error = then - joints
+        error = then - joints
+        # A filtered difference quotient: right on a ramp, however seldom positions come.
+        share = 1.0 - math.exp(-since_s / ERROR_FILTER_S)
+        self._error_rate += share * ((error - self._error) / max(since_s, 1e-3) - self._error_rate)
+        self._error = error
         self.largest_error = np.maximum(self.largest_error, np.abs(self._error))
-        share = 1.0 - math.exp(-min(since_s, STALE_S) / ERROR_FILTER_S)
-        self._filtered += share * (self._error - self._filtered)
-        self._error_rate = (self._error - self._filtered) / ERROR_FILTER_S
         # An error along the motion is a delay: on a curve that is right, the arm is only late.
         fast = float(speed[:2] @ speed[:2])
         if fast > 0.5:
@@ -283,7 +291,8 @@ class Controller:
             self.lag_s = min(max(self.lag_s + LAG_SHARE * late_s, 0.0), LARGEST_LAG_S)
 
     def _begin(self, now_s: float, start: np.ndarray) -> None:
-        self._move = Move(start, self._stage.goal)
+        # An effort stands for a cycle: the longer that is, the slower a motion it can follow.
+        self._move = Move(start, self._stage.goal, max(1.0, self.usual_cycle_s / SHORT_CYCLE_S))
         self._began_s = now_s
         self._switched_s = None
         self._say(self._stage.text)
@@ -296,8 +305,8 @@ class Controller:
             return
         if stage.switches and self._switched_s is None:
             self._near_s = self._near_s + self._cycle_s if np.all(np.abs(joints - stage.goal) < SETTLED) else 0.0
-            settled = self._near_s >= SETTLE_S
-            if settled or over_s > SETTLE_TIMEOUT_S:
+            settled = self._near_s >= max(SETTLE_S, 1.5 * self.usual_cycle_s)
+            if settled or over_s > SETTLE_TIMEOUT_S * max(1.0, self.usual_cycle_s / SHORT_CYCLE_S):
                 self._switched_s = now_s
                 self.magnet, self._held_mass = stage.magnet, stage.held_mass
             return
@@ -357,6 +366,9 @@ class Rig:
 def control(rig: Rig, controller: Controller, duration_s: float) -> dict:
     """Close the loop every `PERIOD_S` for `duration_s`; says how it went."""
     began_s = time.monotonic()
+    rig.read()
+    # A cycle is two requests, a read and a write.
+    controller.usual_cycle_s = max(PERIOD_S, 2 * (time.monotonic() - began_s))
     deadline_s, cycles, magnet, done_s = began_s, 0, False, None
     while (now_s := time.monotonic()) - began_s < duration_s:
         efforts = controller.update(now_s, rig.read())

@@ -3,7 +3,9 @@
 # Installs what is missing as root on Debian; elsewhere it says what is missing and goes on: a test that needs a
 # missing part says so when it is skipped.
 set -eu
-packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 xvfb xauth libvulkan1 mesa-vulkan-drivers"
+packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
+# Node.js may have come another way than by apt.
+command -v npm >/dev/null 2>&1 || packages="$packages nodejs npm"
 
 command -v dpkg-query >/dev/null 2>&1 || { echo "not a Debian system: tests may miss $packages" >&2; exit 0; }
 missing=""

@@ -196,11 +196,15 @@ def review(recorded: DemoRun, out: Path) -> Review:
     plot, rrd = out / "latency.png", out / "run.rrd"
     save_plot(latency, run, plot)
     save_rrd(run, rrd)
-    return Review(recorded, latency, verify(recorded.recording), _judge(run), plot, rrd)
+    return Review(recorded, latency, verify(recorded.recording), judge(run), plot, rrd)
 
 
-def _judge(run: Run) -> TaskResult:
-    """Where the parts are at the end of a run."""
+def judge(run: Run) -> TaskResult:
+    """Which parts stand in the tray at the end of a run.
+
+    Raises:
+        InputError: the recording does not say what its scene is.
+    """
     parts = run.parts
     last = parts[parts["step"] == parts["step"][-1]] if len(parts) else parts
     poses = [PartState(name=run.names[row["part"]], x=row["x"], y=row["y"], z=row["z"], yaw=row["yaw"]) for row in last]
