@@ -30,8 +30,10 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
+# Real time is tested alone, one test after the other; what has no clock uses both cores.
 test: .venv/dev system check ## everything that CI runs
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 tests/unit tests/contract
+	$(BIN)/pytest tests/rig tests/hosts tests/faults
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .
