@@ -30,12 +30,10 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-# Real time is tested alone, one test after the other; what has no clock uses both cores. A virtual machine's host may
-# take the processors away in the middle of a real-time test: what failed is tried once more, and both runs are shown.
-REAL_TIME := tests/rig tests/hosts tests/faults
+# Real time is tested alone, one test after the other; what has no clock uses both cores.
 test: .venv/dev system check ## everything that CI runs
 	$(BIN)/pytest -n 2 tests/unit tests/contract
-	$(BIN)/pytest $(REAL_TIME) || $(BIN)/pytest --last-failed --last-failed-no-failures none $(REAL_TIME)
+	$(BIN)/pytest tests/rig tests/hosts tests/faults
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .

@@ -82,10 +82,10 @@ def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_de
 
 
 def test_a_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A controller that only reads: its session is recorded by hand, so there is a file without a sample.
+    # A controller that writes without ever having read: what it writes answers no state, so there is no sample.
     from hilrig_cli import demo as module
 
-    controller = tmp_path / "reads_only.py"
+    controller = tmp_path / "never_reads.py"
     controller.write_text(
         "import sys, time\n"
         "from pymodbus.client import ModbusTcpClient\n"
