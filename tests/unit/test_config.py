@@ -21,6 +21,14 @@ def test_ports_follow_each_other_around_those_that_are_named() -> None:
     assert lab.ports == {"a": 5020, "b": 5021, "c": 5022}
 
 
+def test_addresses_are_those_that_the_edge_listens_on() -> None:
+    tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
+    plain, secured = "Modbus TCP", "Modbus TCP with TLS"
+    assert parse_lab("").addresses("rig1") == {plain: "127.0.0.1:5020"}
+    assert parse_lab(tls).addresses("rig1") == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
+    assert parse_lab("[edge]\nplain = false\n" + tls).addresses("rig1") == {secured: "127.0.0.1:8020"}
+
+
 def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
     file = tmp_path / "lab.toml"
     file.write_text('name = "robotics"\n')

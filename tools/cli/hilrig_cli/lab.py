@@ -41,9 +41,11 @@ def running_lab(
 
 def _check_ports(lab: LabConfig) -> None:
     """Say at once, and once, what each service would say: whoever else has the ports is heard on the bus like ours."""
-    wanted = [
-        (f"rig {rig!r}", lab.edge.host, port, "edge.first_port or the rig's port") for rig, port in lab.ports.items()
-    ]
+    wanted: list[tuple[str, str, int, str]] = []
+    if lab.edge.plain:
+        key = "edge.first_port or the rig's port"
+        wanted += [(f"rig {rig!r}", lab.edge.host, port, key) for rig, port in lab.ports.items()]
+    wanted += [(f"rig {rig!r}", lab.edge.host, port, "edge.tls.first_port") for rig, port in lab.tls_ports.items()]
     if lab.bus.topology == "mesh":
         ports = range(lab.bus.first_port, lab.bus.first_port + len(MESH_ORDER))
         wanted += [("the bus", lab.bus.host, port, "bus.first_port") for port in ports]

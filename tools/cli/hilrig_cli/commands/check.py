@@ -33,13 +33,15 @@ def check(
     for rig in lab.rigs:
         rig_parameters(lab, rig)
     if as_json:
-        print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports}))
+        print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return
     table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is good", title_justify="left")
-    for column in ("rig", "Modbus TCP", "step", "integrator"):
+    kinds = list(lab.addresses(lab.rigs[0].name))
+    for column in ("rig", *kinds, "step", "integrator"):
         table.add_column(column)
     for rig in lab.rigs:
-        address = f"{lab.edge.host}:{lab.ports[rig.name]}"
         substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
-        table.add_row(rig.name, address, f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
+        table.add_row(
+            rig.name, *lab.addresses(rig.name).values(), f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps
+        )
     Console().print(table)

@@ -33,7 +33,8 @@ def up(
     with running_lab(lab, config, say, stopping) as supervisor:
         if not stopping.is_set():
             for rig in lab.rigs:
-                print(f"{rig.name}: Modbus TCP at {lab.edge.host}:{lab.ports[rig.name]}, step {lab.sim.step_ms:g} ms")
+                addresses = ", ".join(f"{kind} at {address}" for kind, address in lab.addresses(rig.name).items())
+                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms")
             print(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
             print("running; Ctrl-C ends it", flush=True)
         viewer = None
