@@ -30,6 +30,25 @@ name = "left"
 name = "right"
 arm.masses_kg = [1.0, 1.0, 0.8]
 ```
+
+A class of 64 rigs, `rig1` to `rig64` at ports 5020 to 5083, all with a shorter second link; the teacher's own beside
+them, and the seventh at a port of its own (which frees 5026 for the eighth):
+
+```toml
+name = "robotics"
+
+[rigs]
+count = 64
+arm.l3_m = 0.25
+
+[[rigs.single]]
+name = "rig7"
+port = 6007
+
+[[rigs.single]]
+name = "teacher"
+allow = ["192.168.7.2/32"]
+```
 """
 
 

@@ -5,15 +5,21 @@ This is the edge where people type, so it is pydantic, and units are those that 
 """
 
 import tomllib
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, IPvAnyNetwork, PrivateAttr, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, IPvAnyNetwork, PrivateAttr, ValidationError, model_validator
 
+from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import Name, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
+
+MOST_RIGS = 10_000
+"""More than any machine steps in real time; a mistyped count is found here."""
 
 
 class ArmConfig(Section):
@@ -140,21 +146,6 @@ class RecorderConfig(Section):
     """With less space free on the disk recordings end, MiB."""
 
 
-class BusConfig(Section):
-    """How the services find each other."""
-
-    topology: Literal["mesh", "router"] = "mesh"
-    """mesh: services on one host, linked directly; router: everyone is a client of `router`."""
-    host: str = "127.0.0.1"
-    """mesh: address on which the services listen for each other."""
-    first_port: Port = 7447
-    """mesh: port of the simulation; the edge and the recorder take the next two."""
-    router: str = "tcp/127.0.0.1:7447"
-    """router: endpoint of the zenoh router."""
-    express: bool = False
-    """Send each control message by itself, at the price of processor time, instead of with others that wait."""
-
-
 class RigSettings(Section):
     """One rig: what differs from the lab's defaults."""
 
@@ -174,6 +165,39 @@ class RigSettings(Section):
         return self
 
 
+class RigsTable(Section):
+    """A class of rigs that are alike, `[rigs]`, and single ones beside them, `[[rigs.single]]`."""
+
+    count: Annotated[int, Field(ge=1, le=MOST_RIGS)] = 1
+    """How many there are; they are called <prefix>1, <prefix>2, …"""
+    prefix: Name = "rig"
+    allow: tuple[IPvAnyNetwork, ...] = ()
+    """As of a single rig, for all of them."""
+    arm: ArmConfig = ArmConfig()
+    scene: SceneConfig | None = None
+    single: tuple[RigSettings, ...] = ()
+    """Rigs of their own; one that is called like one of the class takes its place."""
+
+    def rigs(self) -> tuple[RigSettings, ...]:
+        """All of them: the class in order, then those that are no part of it."""
+        own = {rig.name: rig for rig in self.single}
+        names = [f"{self.prefix}{number}" for number in range(1, self.count + 1)]
+        alike = RigSettings(allow=self.allow, arm=self.arm, scene=self.scene)
+        members = [own.get(name) or alike.model_copy(update={"name": name}) for name in names]
+        return (*members, *(rig for rig in self.single if rig.name not in set(names)))
+
+    @model_validator(mode="after")
+    def _names_hold(self) -> "RigsTable":
+        for name, times in Counter(rig.name for rig in self.single).items():
+            if times > 1:
+                raise ValueError(f"two rigs are called {name!r}: names must be distinct")
+        return self
+
+
+def _listed(rigs: Any) -> Any:
+    return RigsTable.model_validate(rigs).rigs() if isinstance(rigs, dict) else rigs
+
+
 class LabConfig(Section):
     """A whole lab, as `lab.toml` describes it."""
 
@@ -183,7 +207,7 @@ class LabConfig(Section):
     recorder: RecorderConfig = RecorderConfig()
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
-    rigs: Annotated[tuple[RigSettings, ...], Field(min_length=1)] = (RigSettings(),)
+    rigs: Annotated[tuple[RigSettings, ...], BeforeValidator(_listed), Field(min_length=1)] = (RigSettings(),)
     _source: str = PrivateAttr("")
 
     @property
@@ -193,17 +217,26 @@ class LabConfig(Section):
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
-        names = [rig.name for rig in self.rigs]
-        for name in names:
-            if names.count(name) > 1:
+        for name, times in Counter(rig.name for rig in self.rigs).items():
+            if times > 1:
                 raise ValueError(f"two rigs are called {name!r}: names must be distinct")
         all_ports = [*self.ports.items(), *self.tls_ports.items()]
-        ports = [port for _, port in all_ports]
+        ports = Counter(port for _, port in all_ports)
         for rig, port in all_ports:
-            if ports.count(port) > 1:
+            if ports[port] > 1:
                 raise ValueError(f"rig {rig!r}: port {port} is taken by another rig: ports must be distinct")
             if port > 65535:
                 raise ValueError(f"rig {rig!r}: no port is left for it above {self.edge.first_port}")
+        return self
+
+    @model_validator(mode="after")
+    def _edges_command_rigs(self) -> "LabConfig":
+        edges = {} if self.bus.tls is None else self.bus.tls.edges
+        names = {rig.name for rig in self.rigs}
+        for edge, rigs in edges.items():
+            for rig in rigs:
+                if rig not in names:
+                    raise ValueError(f"bus.tls.edges.{edge}: no rig is called {rig!r}")
         return self
 
     @property
@@ -291,7 +324,7 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
 
 def _causes(error: ValidationError) -> list[Any]:
     """The mistakes, without the complaint that a list is too short for lack of an item that is itself mistaken."""
-    mistakes: list[Any] = list(error.errors())
+    mistakes = list(_flat(error, ()))
 
     def follows_from_another(mistake: Any) -> bool:
         place = mistake["loc"]
@@ -299,6 +332,17 @@ def _causes(error: ValidationError) -> list[Any]:
         return mistake["type"] == "too_short" and any(loc[: len(place)] == place for loc in inner)
 
     return [mistake for mistake in mistakes if not follows_from_another(mistake)]
+
+
+def _flat(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[Any]:
+    """Every mistake with its whole place; what a table's own validation found stands inside one of the lab's."""
+    for mistake in error.errors():
+        here: dict[str, Any] = {**mistake, "loc": (*place, *mistake["loc"])}
+        cause = mistake.get("ctx", {}).get("error")
+        if isinstance(cause, ValidationError):
+            yield from _flat(cause, here["loc"])
+        else:
+            yield here
 
 
 def _sentence(mistake: Any) -> str:

@@ -21,6 +21,20 @@ def test_ports_follow_each_other_around_those_that_are_named() -> None:
     assert lab.ports == {"a": 5020, "b": 5021, "c": 5022}
 
 
+def test_a_class_of_rigs_is_one_table_and_single_ones_stand_beside_it() -> None:
+    lab = parse_lab(
+        '[rigs]\ncount = 3\n[rigs.arm]\nl2_m = 0.2\n[[rigs.single]]\nname = "rig2"\nport = 6000\n'
+        '[[rigs.single]]\nname = "teacher"\n'
+    )
+    assert lab.ports == {"rig1": 5020, "rig2": 6000, "rig3": 5021, "teacher": 5022}
+    assert [rig.arm.l2_m for rig in lab.rigs] == [0.2, 0.3, 0.2, 0.3]
+
+
+def test_a_large_lab_is_read_at_once() -> None:
+    lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
+    assert lab.ports["seat-2000"] == 7019
+
+
 def test_addresses_are_those_that_the_edge_listens_on() -> None:
     tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
     plain, secured = "Modbus TCP", "Modbus TCP with TLS"
@@ -51,6 +65,11 @@ def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
         ("[[rigs]]\nport = 70000\n", r"rigs\[0\]\.port: expected less than or equal to 65535, found 70000"),
         ("[edge]\nfirst_port=65535\n[[rigs]]\nname='a'\n[[rigs]]\nname='b'\n", r"no port is left"),
         ("rigs = []\n", r"rigs: .*at least 1"),
+        ("[rigs]\ncount = 0\n", r"rigs\.count: expected greater than or equal to 1, found 0"),
+        ("[rigs]\ncount = 2\nports = 3\n", r"rigs\.ports: unknown key"),
+        ("[rigs]\n[[rigs.single]]\nname = 'a b'\n", r"rigs\.single\[0\]\.name: .*found 'a b'"),
+        ("[rigs]\n[[rigs.single]]\nname='a'\n[[rigs.single]]\nname='a'\n", r"rigs: two rigs are called 'a'"),
+        ("[rigs]\n[rigs.arm]\nl2_m = -1\n", r"rigs\.arm\.l2_m: expected greater than 0, found -1"),
     ],
 )
 def test_a_mistake_is_named_with_its_place(text: str, message: str) -> None:
