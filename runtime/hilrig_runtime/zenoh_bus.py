@@ -1,12 +1,5 @@
-"""The bus between processes, over zenoh.
+"""The bus between processes, over zenoh."""
 
-Scouting and gossip are off and endpoints explicit, so that who talks to whom is what the configuration says. In the
-mesh each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of them:
-every reader is linked to every writer, with no hop between and no other program needed. With a router everyone is
-its client.
-"""
-
-import json
 import logging
 import threading
 from collections.abc import Callable
@@ -16,12 +9,11 @@ import zenoh
 import zenoh.ext
 
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
-from hilrig_runtime.config import BusConfig
+from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.zenoh_config import MESH_ORDER, mesh_endpoint, zenoh_config
 from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
 from hilrig_schemas.topics import Traffic
-
-MESH_ORDER: Final = ("sim", "edge", "recorder")
 
 _HEARTBEAT_S: Final = 0.25
 _PRIORITIES: Final = {
@@ -31,43 +23,6 @@ _PRIORITIES: Final = {
 }
 
 logger = logging.getLogger(__name__)
-
-
-def mesh_endpoint(bus: BusConfig, service: str) -> str:
-    """Where a service listens for the others in the mesh."""
-    return f"tcp/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
-
-
-def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
-    """The zenoh configuration of `service`: one of `MESH_ORDER`, or any other name for a tool."""
-    listen: list[str] = []
-    if bus.topology == "router":
-        mode, connect = "client", [bus.router]
-    else:
-        mode = "peer"
-        earlier = MESH_ORDER.index(service) if service in MESH_ORDER else len(MESH_ORDER)
-        connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
-        if service in MESH_ORDER:
-            listen = [mesh_endpoint(bus, service)]
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
-        # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
-        # between tries; a peer opens at once and connects whenever the others come up, also for the second time.
-        "connect/timeout_ms": 500 if mode == "client" else -1,
-        "connect/exit_on_failure": mode == "client",
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        # Implicit shared memory can lose data, and a batch is larger than its threshold.
-        "transport/shared_memory/enabled": False,
-    }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
 
 
 class _Declared(Handle):
@@ -246,7 +201,8 @@ def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
 
 def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
     if bus.topology == "router":
-        return f"no zenoh router answers at {bus.router} (bus.router in lab.toml)"
+        certificate = "" if bus.tls is None else ", or it and our certificate do not trust each other: hilrig doctor"
+        return f"no zenoh router answers at {bus.router} (bus.router in lab.toml){certificate}"
     if service not in MESH_ORDER:
         return f"can't join the bus: {error}"
     # zenoh's text holds paths of its own sources; the system's reason stands before its error number.

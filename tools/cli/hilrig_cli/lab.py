@@ -12,7 +12,8 @@ from typing import Final
 from hilrig_cli.supervisor import START_ORDER, Supervisor
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.zenoh_bus import MESH_ORDER, ZenohBus
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.zenoh_config import MESH_ORDER
 from hilrig_schemas.topics import alive_key
 
 POLL_S: Final = 0.05

@@ -1,0 +1,131 @@
+"""zenoh's configuration out of a lab's: who listens, who connects, with which certificate.
+
+Scouting and gossip are off and endpoints explicit, so that who talks to whom is what the configuration says. In the
+mesh each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of them:
+every reader is linked to every writer, with no hop between and no other program needed. With a router everyone is
+its client.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from hilrig_runtime.access import TOOLS, access_control, identities
+from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
+from hilrig_runtime.errors import InputError
+
+MESH_ORDER: Final = ("sim", "edge", "recorder")
+
+
+def mesh_endpoint(bus: BusConfig, service: str) -> str:
+    """Where a service listens for the others in the mesh."""
+    kind = "tcp" if bus.tls is None else "tls"
+    return f"{kind}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
+
+
+def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
+    """The zenoh configuration of `service`: one of `MESH_ORDER`, or any other name for a tool.
+
+    Raises:
+        InputError: a certificate that the service needs is not there.
+    """
+    listen: list[str] = []
+    if bus.topology == "router":
+        mode, connect = "client", [bus.router]
+    else:
+        mode = "peer"
+        earlier = MESH_ORDER.index(service) if service in MESH_ORDER else len(MESH_ORDER)
+        connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
+        if service in MESH_ORDER:
+            listen = [mesh_endpoint(bus, service)]
+    settings: dict[str, Any] = _common() | {
+        "mode": mode,
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
+        # between tries; a peer opens at once and connects whenever the others come up, also for the second time.
+        "connect/timeout_ms": 500 if mode == "client" else -1,
+        "connect/exit_on_failure": mode == "client",
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
+    }
+    if bus.tls is not None:
+        settings |= _secured(bus.tls, own_identity(bus.tls, service))
+        if mode == "peer":
+            settings["access_control"] = access_control(bus.tls)
+    return _made(settings)
+
+
+def router_settings(bus: BusConfig, lab: str, listen: str) -> dict[str, Any]:
+    """Settings of the router of a lab, by their keys in a zenoh configuration; `listen` is its endpoint.
+
+    Raises:
+        InputError: a certificate that it needs is not there.
+    """
+    settings = _common() | {"mode": "router", "listen/endpoints": [listen]}
+    if bus.tls is not None:
+        settings |= _secured(bus.tls, "router")
+        settings["access_control"] = access_control(bus.tls, lab)
+    return settings
+
+
+def own_identity(tls: BusTlsConfig, service: str) -> str:
+    """Whose certificate `service` takes: of the names that its role has, the first one whose key is on this host.
+
+    Raises:
+        InputError: there is none.
+    """
+    roles = (service,) if service in MESH_ORDER else TOOLS
+    names = [identity.name for role in roles for identity in identities(tls) if identity.role == role]
+    for name in names:
+        if (tls.folder / f"{name}.key").exists():
+            return name
+    wanted = " or ".join(f"{name}.key" for name in names)
+    raise InputError(f"bus.tls.folder: {tls.folder} holds no {wanted}; hilrig certs makes certificates")
+
+
+def _common() -> dict[str, Any]:
+    return {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        # Implicit shared memory can lose data, and a batch is larger than its threshold.
+        "transport/shared_memory/enabled": False,
+    }
+
+
+def _secured(tls: BusTlsConfig, name: str) -> dict[str, Any]:
+    certificate, key = _file(tls, f"{name}.pem"), _file(tls, f"{name}.key")
+    return {
+        # Nothing else is spoken, whatever an endpoint says.
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": _file(tls, "ca.pem"),
+            "enable_mtls": True,
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        },
+    }
+
+
+def _file(tls: BusTlsConfig, name: str) -> str:
+    path: Path = tls.folder / name
+    try:
+        path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"bus.tls.folder: {path} can't be read: {error.strerror}; hilrig certs makes certificates"
+        ) from error
+    return str(path)
+
+
+def _made(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
