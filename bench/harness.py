@@ -96,19 +96,22 @@ class MissingPartError(Exception):
     """A system part that the benchmark needs is not on this machine."""
 
 
-def build_c(source: str) -> Path:
-    """Compile `bench/<source>` against libmodbus; gives the program.
+def build_c(source: str, library: str = "libmodbus") -> Path:
+    """Compile `bench/<source>` against a library, or against none; gives the program.
 
     Raises:
         MissingPartError: there is no C compiler or no libmodbus; the message says which package brings it.
     """
     if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
         raise MissingPartError("no C compiler: install gcc and pkg-config (Debian's packages of these names)")
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "libmodbus"], check=False, capture_output=True, text=True
-    )
-    if flags.returncode:
-        raise MissingPartError("no libmodbus to build with: install Debian's package libmodbus-dev")
+    flags: list[str] = []
+    if library:
+        asked = subprocess.run(
+            ["pkg-config", "--cflags", "--libs", library], check=False, capture_output=True, text=True
+        )
+        if asked.returncode:
+            raise MissingPartError(f"no {library} to build with: install Debian's package {library}-dev")
+        flags = asked.stdout.split()
     BUILD.mkdir(exist_ok=True)
     program = BUILD / Path(source).stem
     path = HERE / source
@@ -121,7 +124,7 @@ def build_c(source: str) -> Path:
             "-o",
             str(program),
             str(path),
-            *flags.stdout.split(),
+            *flags,
             "-lm",
             "-lpthread",
         ]

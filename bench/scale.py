@@ -1,0 +1,171 @@
+"""How many rigs does one machine carry, each with a controller of its own, all of them recorded?
+
+A lab of 1 to 256 rigs at a step of 20 ms runs as `hilrig up` starts it. A load generator in C holds a TCP connection to
+each rig and reads and writes once every 20 ms, with phases spread over the period. Latency is what the recordings say;
+processor time and memory are what the services' own health reports say. What is left of the machine is said too, for
+a figure is worth little beside neighbours that took their share.
+
+A loop closes within one step when the read, the write and both ways over the bus lie between two ticks. Controllers
+whose phases are spread evenly meet the tick in between with the share (rtt + bus) / step; those take two steps. So the
+99th percentile of many controllers is two steps, and the share within one step is what tells machines apart.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import harness
+import numpy as np
+from harness import Report, build_c, progress
+from numpy.typing import NDArray
+
+from hilrig_cli.demo import free_ports
+from hilrig_cli.lab import running_lab
+from hilrig_replay.latency import measure as latency_of
+from hilrig_replay.run import open_run
+from hilrig_runtime.clock import SYSTEM_CLOCK
+from hilrig_runtime.config import load_lab
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas import Health
+from hilrig_schemas.topics import HEALTH
+
+QUESTION = "How many rigs does one machine carry, each with a controller of its own, all of them recorded?"
+COUNTS = (1, 16, 64, 128, 256)
+PROMISED = 128
+STEP_MS = 20.0
+RIGS = os.environ.get("HILRIG_BENCH_RIGS", "")
+"""Numbers of rigs to try, with commas between them; empty: those above."""
+EDGES = int(os.environ.get("HILRIG_BENCH_EDGES", "1"))
+SETTLE_S = 2.0
+"""Sessions begin, files are opened: the first so many seconds of a run are not its steady state."""
+
+
+@dataclass
+class Found:
+    """What a run with some number of rigs gave."""
+
+    rigs: int
+    load: dict[str, Any]
+    steps: NDArray[np.int64]
+    """From a command's basis to the step at which it took effect, one a sample."""
+    loop_ms: NDArray[np.float64]
+    lost: int
+    recordings: int
+    wall_s: float
+    cpu_s: dict[str, float] = field(default_factory=dict)
+    """Processor time of each service while the load ran."""
+    resident_mib: dict[str, float] = field(default_factory=dict)
+    lateness_p99_ms: float = 0.0
+    overruns: int = 0
+
+
+def measure(report: Report, quick: bool) -> None:
+    build = build_c("scale_load.c", library="")
+    counts = tuple(map(int, RIGS.split(","))) if RIGS else COUNTS
+    for count in counts:
+        progress(f"{count} rigs")
+        found = carry(build, count, 6.0 if quick else 15.0)
+        add(report, found)
+    report.say(
+        "A loop of one step is read, write and both ways over the bus between two ticks. Phases are spread evenly, so "
+        "the 99th percentile is two steps wherever more than 1 % of the phases meet a tick; in ms it is two steps and "
+        "the jitter of the tick."
+    )
+
+
+def add(report: Report, found: Found) -> None:
+    case = f"{found.rigs} rigs"
+    within = float((found.steps <= 1).mean())
+    report.add(case, "loop p50", float(np.percentile(found.loop_ms, 50)), "ms")
+    report.add(case, "loop p99", float(np.percentile(found.loop_ms, 99)), "ms")
+    report.add(case, "within one step", 100 * within, "%")
+    report.add(case, "samples", len(found.steps), "count")
+    report.add(case, "lost", found.lost, "count")
+    wanted = found.rigs * found.wall_s / (STEP_MS * 1e-3)
+    report.add(case, "cycles made, of those meant", 100 * found.load["cycles"] / wanted, "%")
+    report.add(case, "read p50", found.load["read_us"]["p50"], "µs")
+    report.add(case, "read p99", found.load["read_us"]["p99"], "µs")
+    report.add(case, "tick lateness p99", found.lateness_p99_ms, "ms")
+    report.add(case, "overruns", found.overruns, "count")
+    for service, cpu_s in sorted(found.cpu_s.items()):
+        report.add(case, f"processor, {service}", 100 * cpu_s / found.wall_s, "% of a core")
+        report.add(case, f"memory, {service}", found.resident_mib[service], "MiB")
+    report.add(case, "processor, load generator", 100 * found.load["cpu_s"] / found.wall_s, "% of a core")
+    report.add(
+        case, "processor a rig, all services", 1e3 * sum(found.cpu_s.values()) / found.wall_s / found.rigs, "mcore"
+    )
+    if found.rigs == PROMISED:
+        report.bar(f"{case}: 99th percentile of the loop, in steps", float(np.percentile(found.steps, 99)), "<=", 2)
+        report.bar(f"{case}: loop within one step", 100 * within, ">=", 94, "%")
+        report.bar(f"{case}: messages lost", found.lost, "<=", 0)
+        report.bar(f"{case}: recordings of rigs", found.recordings / found.rigs, ">=", 1)
+
+
+def carry(load: Path, count: int, seconds: float) -> Found:
+    """Run a lab of `count` rigs under load; what came of it."""
+    with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
+        config = Path(folder) / "lab.toml"
+        port, bus_port = free_ports(20_000, count), free_ports(7447, 8)
+        config.write_text(
+            f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
+            f"[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = '{folder}'\n[rigs]\ncount = {count}\n"
+        )
+        lab = load_lab(config)
+        healths: dict[str, list[Health]] = {}
+
+        def hear(_: str, payload: bytes) -> None:
+            health = Health.FromString(payload)
+            healths.setdefault(f"{health.service} {health.instance}", []).append(health)
+
+        with (
+            running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event()),
+            ZenohBus(lab.bus, "tool") as bus,
+        ):
+            bus.subscribe(HEALTH.key(lab.name, "*", "*"), hear)
+            wall_ns = SYSTEM_CLOCK.wall_ns()
+            command = [str(load), "127.0.0.1", str(port), str(count), str(seconds + SETTLE_S), str(STEP_MS)]
+            output = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=seconds + 60).stdout
+        figures = json.loads(output)
+        begin_ns, end_ns = wall_ns + round(SETTLE_S * 1e9), wall_ns + round((SETTLE_S + figures["seconds"]) * 1e9)
+        found = in_recordings(Path(folder), count, figures, begin_ns)
+    for service, reports in healths.items():
+        steady = [health for health in reports if begin_ns <= health.wall_ns <= end_ns]
+        first, last = steady[0], steady[-1]
+        share = (last.cpu_ns - first.cpu_ns) / max(1, last.wall_ns - first.wall_ns)
+        found.cpu_s[service] = share * found.wall_s
+        found.resident_mib[service] = last.resident_bytes / 2**20
+        if service.startswith("sim"):
+            found.lateness_p99_ms = max(health.lateness_p99_ns for health in steady) / 1e6
+            found.overruns = last.overruns - first.overruns
+    return found
+
+
+def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: int) -> Found:
+    steps, loops, lost, recordings = [], [], 0, set()
+    for path in folder.rglob("*.mcap"):
+        run = open_run(path)
+        one = latency_of(run)
+        recordings.add(one.rig)
+        table = one.table[one.table["wall_ns"] >= begin_ns]
+        steps.append(table["step"].astype(np.int64) - table["basis_step"].astype(np.int64))
+        loops.append(table["loop"] / 1e6)
+        lost += one.lost.transport + one.lost.recorder
+    return Found(
+        rigs=count,
+        load=figures,
+        steps=np.concatenate(steps),
+        loop_ms=np.concatenate(loops),
+        lost=lost,
+        recordings=len(recordings),
+        wall_s=figures["seconds"],
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(harness.run(measure, QUESTION))
