@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.scan import Chunk, Message, open_chunk, scan
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas import Health
+from hilrig_schemas import Health, JointState
 from hilrig_schemas.topics import HEALTH
 from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
 from waiting import eventually
@@ -45,6 +47,19 @@ def fill(path: Path) -> None:
             pass
 
 
+def holds_messages(lab: LabConfig, rig: str) -> bool:
+    """Whether messages of a rig's session are on the disk."""
+    return any(
+        state.session
+        for part in files_of(lab, rig, "*.part")
+        for _, chunk in scan(part.read_bytes())
+        if isinstance(chunk, Chunk)
+        for message in open_chunk(chunk)
+        if isinstance(message, Message) and message.channel_id == CHANNEL_OF_TOPIC["state"]
+        for state in (JointState.FromString(message.data),)
+    )
+
+
 class Troubles:
     """What the recorder's health says, as it comes."""
 
@@ -72,7 +87,7 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
             try:
                 for rig in rigs:
                     senders.begin(rig)
-                eventually(lambda: all(senders.count(rig) > 100 for rig in rigs))
+                eventually(lambda: all(holds_messages(lab, rig) for rig in rigs), timeout_s=30)
                 fill(ballast)
                 for rig in rigs:
                     eventually(lambda rig=rig: files_of(lab, rig), timeout_s=30)
@@ -84,6 +99,9 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
                     found = recorded([full[rig]])
                     assert set(found) & set(senders.sent[rig])
                     assert len(found) == len(set(found))
+                # Longer than the pre-roll reaches back.
+                sent = senders.count(rigs[0])
+                eventually(lambda: senders.count(rigs[0]) > sent + 300)
                 ballast.unlink()
                 # Tried again ten seconds after it failed.
                 for rig in rigs:
@@ -103,6 +121,23 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
             found = recorded(files_of(lab, rig))
             numbers = {sequence for channel, sequence, _ in found if channel == "/state"}
             assert lost >= max(numbers) - min(numbers) + 1 - len(numbers) > 0
+
+
+@pytest.mark.rig
+def test_a_disk_that_is_full_before_the_first_chunk_is_written_holds_what_came_until_then(tmp_path: Path) -> None:
+    config, lab = make_lab(tmp_path, extra="recorder.min_free_mib = 0")
+    with tmpfs(tmp_path / "recordings", 600) as folder, sending(lab, ["rig1"]) as senders:
+        with RecorderProcess(config) as recorder:
+            wait_ready(lab, recorder)
+            senders.begin("rig1")
+            eventually(lambda: files_of(lab, "rig1", "*.part"), every_s=0.002)
+            fill(folder / "ballast")
+            [path] = eventually(lambda: files_of(lab, "rig1"), timeout_s=30)
+        found = metadata(path)
+        assert found["hilrig.summary"]["ended"] == "disk full"
+        assert found["hilrig.session"]["rig"] == "rig1"
+        # What was set aside has room for it.
+        assert recorded([path])
 
 
 @pytest.mark.rig

@@ -9,11 +9,12 @@ from typing import BinaryIO
 import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.records import Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_recorder.channels import CHANNEL_OF_TOPIC, CHANNELS, encode_message
+from hilrig_recorder.scan import scan
 from hilrig_recorder.writer import CHUNK_BYTES, RunWriter, part_path
 from hilrig_schemas import JointState
 
@@ -204,6 +205,37 @@ def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
         assert summary.statistics is not None
         assert summary.statistics.message_count == len(found)
         assert sum(summary.statistics.channel_message_counts.values()) == len(found)
+
+
+def test_what_did_not_fit_is_written_when_there_is_room_again(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    disk = SmallDisk(writer._file, writer.size)
+    writer._file = disk  # type: ignore[assignment]
+    added = fill(writer, 10)
+    with pytest.raises(OSError, match="No space left"):
+        writer.close_chunk()
+    disk.room = 1 << 20
+    writer.finish()
+    writer.publish()
+    assert (read(path), writer.given_up) == (added, 0)
+
+
+def test_what_is_known_at_the_beginning_stands_in_the_first_write(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, metadata=(Metadata("whose", {"rig": "rig1"}), Metadata("more", {})))
+    assert metadata_in(writer.part.read_bytes()) == {"whose": {"rig": "rig1"}, "more": {}}
+    added = fill(writer, 10)
+    writer.finish()
+    writer.publish()
+    assert read(path) == added
+    with path.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert found == {"whose": {"rig": "rig1"}, "more": {}}
+
+
+def metadata_in(content: bytes) -> dict[str, dict[str, str]]:
+    return {item.name: item.metadata for _, item in scan(content) if isinstance(item, Metadata)}
 
 
 def test_with_no_room_for_anything_it_says_so(tmp_path: Path) -> None:

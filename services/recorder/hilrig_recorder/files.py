@@ -15,6 +15,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
+from mcap.records import Metadata
+
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.disk import Disk
 from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
@@ -32,6 +34,7 @@ LOSS_NOTES: Final = 1000
 """Places of losses noted in a file; all are counted in its summary."""
 _FREE_SPACE_PERIOD_NS: Final = SECOND_NS
 _MIB: Final = 1024 * 1024
+_NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 @dataclass(slots=True, eq=False)
@@ -232,37 +235,36 @@ class Files:
                 self._on_failure(file, error)
 
         path = folder / file_name(recording.session, number)
+        about = Metadata("hilrig.session", self._session_values(recording, number, previous))
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            writer = RunWriter(path, on_failure=on_failure, compress=self._compress)
+            writer = RunWriter(path, metadata=(about,), on_failure=on_failure, compress=self._compress)
         except OSError as error:
             self._report(recording, f"{path}: can't be recorded: {error.strerror}")
             return None
         file = _File(recording, writer, number, self._clock.monotonic_ns())
         self._files[recording] = file
         self._disk.follow(writer)
-        self._note(
-            file,
-            "hilrig.session",
-            {
-                "session": recording.session,
-                "rig": recording.rig,
-                "lab": self._lab,
-                "controller": recording.controller,
-                "keeper": recording.keeper,
-                "start": iso(recording.start_wall_ns),
-                "start_wall_ns": str(recording.start_wall_ns),
-                "software_version": version("hilrig"),
-                "schema_version": SCHEMA_VERSION,
-                "machine": machine(),
-                "recorder": self._identity,
-                "part": str(number),
-                "previous": previous.name if previous is not None else "",
-            },
-        )
         self._ask_config(recording.rig)
         self.forget_trouble(recording.rig)
         return writer
+
+    def _session_values(self, recording: Recording, number: int, previous: Path | None) -> dict[str, str]:
+        return {
+            "session": recording.session,
+            "rig": recording.rig,
+            "lab": self._lab,
+            "controller": recording.controller,
+            "keeper": recording.keeper,
+            "start": iso(recording.start_wall_ns),
+            "start_wall_ns": str(recording.start_wall_ns),
+            "software_version": version("hilrig"),
+            "schema_version": SCHEMA_VERSION,
+            "machine": machine(),
+            "recorder": self._identity,
+            "part": str(number),
+            "previous": previous.name if previous is not None else "",
+        }
 
     def _write_config(self, file: _File, config: RigConfig) -> None:
         values = {
@@ -345,7 +347,7 @@ class Files:
         if file.failure is not None:
             return
         file.failure = error
-        if error.errno == errno.ENOSPC:
+        if error.errno in _NO_SPACE:
             # Every file on this disk ends now, while the space set aside is enough for all of them.
             self._reserve.release()
             self._full = True
@@ -359,7 +361,7 @@ class Files:
     def _end_failed(self, file: _File, error: OSError) -> None:
         recording = file.recording
         del self._files[recording]
-        end = "disk full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "write failed"
+        end = "disk full" if error.errno in _NO_SPACE else "write failed"
         reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
         self._finish(file, end, reason)
         self._report(recording, reason)
@@ -382,9 +384,8 @@ class Files:
             free = shutil.disk_usage(self.folder).free
         except OSError:
             return
-        was_full, self._full = self._full, free < self._config.min_free_mib * _MIB
-        if not self._full:
-            self._reserve.hold()
+        # A disk that was full is so until there is room to end the next files properly too.
+        was_full, self._full = self._full, free < self._config.min_free_mib * _MIB or self._no_room(self._full)
         if self._full and not was_full:
             text = (
                 f"{self.folder}: only {free // _MIB} MiB are free, {self._config.min_free_mib} are kept: no recording"
@@ -393,6 +394,9 @@ class Files:
             self._tell(Event(severity=Event.ERROR, text=text))
         elif was_full and not self._full:
             self.forget_trouble("")
+
+    def _no_room(self, was_full: bool) -> bool:
+        return not self._reserve.hold() and was_full
 
 
 def numbered(name: str, number: int) -> str:

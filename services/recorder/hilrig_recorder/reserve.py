@@ -20,17 +20,22 @@ class Reserve:
         self._path = folder / RESERVE_NAME
         self._folder = folder
 
-    def hold(self) -> None:
-        """Set the space aside, if it is not; where there is none, nothing is held."""
+    def hold(self) -> bool:
+        """Set the space aside, if it is not; whether it is. Where there is too little, nothing is held."""
         try:
-            wanted = min(RESERVE_BYTES, shutil.disk_usage(self._folder).total // _SHARE)
+            usage = shutil.disk_usage(self._folder)
+            wanted = min(RESERVE_BYTES, usage.total // _SHARE)
             if self._path.exists() and self._path.stat().st_size >= wanted:
-                return
+                return True
+            if usage.free < wanted:
+                return False
             with self._path.open("wb", buffering=0) as file:
-                for _ in range(max(1, wanted // len(_BLOCK))):
+                for _ in range(max(1, -(-wanted // len(_BLOCK)))):
                     file.write(_BLOCK[:wanted])
         except OSError:
             self.release()
+            return False
+        return True
 
     def release(self) -> None:
         """Give the space back."""

@@ -2,10 +2,10 @@
 
 Chunks of at most 64 KiB leave in one write each, so that a kill tears at most the last one; the index is collected
 on the way and written at the end. A write that fails is taken back to the last whole chunk, and the file can still
-be finished: where no space is left even for its index, the newest chunks make room for it.
+be finished: what did not fit is tried again then, and where no space is left even for the index, the newest chunks
+make room for it.
 """
 
-import contextlib
 import os
 import struct
 import sys
@@ -112,6 +112,7 @@ class RunWriter:
         *,
         schemas: tuple[Schema, ...] = SCHEMAS,
         channels: tuple[Channel, ...] = CHANNELS,
+        metadata: tuple[Metadata, ...] = (),
         profile: str = "",
         library: str = LIBRARY,
         part: Path | None = None,
@@ -143,14 +144,20 @@ class RunWriter:
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         try:
-            # One write: a laboratory may begin hundreds of files at once.
-            self._append(MCAP0_MAGIC + encoded(Header(profile, library), *schemas, *channels))
+            # One write: a laboratory may begin hundreds of files at once, and a file that is there says whose it is.
+            begin = MCAP0_MAGIC + encoded(Header(profile, library), *schemas, *channels)
+            self._append(begin + encoded(*metadata))
         except OSError:
             self.discard()
             raise
         self._schemas += schemas
         for channel in channels:
             self._know(channel)
+        offset = len(begin)
+        for item in metadata:
+            length = len(encoded(item))
+            self._metadata_indexes.append(MetadataIndex(offset, length, item.name))
+            offset += length
 
     # -- records ----------------------------------------------------------------------------------------------------
 
@@ -182,7 +189,7 @@ class RunWriter:
                 if self._on_failure is None:
                     raise
                 self._on_failure(error)
-            pending = 0
+            pending = self._pending_bytes
         if not pending:
             self._first_ns = self._last_ns = log_time
         elif log_time > self._last_ns:
@@ -204,14 +211,11 @@ class RunWriter:
         return self._first_ns if self._records else 0
 
     def close_chunk(self) -> None:
-        """Write what has come in since the last chunk; where the disk does not take it, it is given up."""
+        """Write what has come in since the last chunk; where the disk does not take it, it waits for `finish`."""
         if not self._records:
             return
         raw = b"".join(self._records)
         data = self._compress(raw)
-        count = len(self._records)
-        self._records.clear()
-        self._pending_bytes = 0
         head = _CHUNK.pack(
             Opcode.CHUNK.value,
             _CHUNK.size + len(data) - 9,
@@ -232,18 +236,20 @@ class RunWriter:
             entries = struct.pack(f"<{len(index)}Q", *index)
             pieces.append(_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX.value, 6 + len(entries), channel_id, len(entries)))
             pieces.append(entries)
-            index.clear()
         start = self.size
-        try:
-            self._append(b"".join(pieces))
-        except OSError:
-            self.given_up += count
-            raise
+        self._append(b"".join(pieces))
+        self.message_count += len(self._records)
         for channel_id, part in counts:
             self._chunks += _COUNT.pack(channel_id, part)
             self._totals[channel_id] += part
         self._chunks += _ENTRY.pack(start, self._first_ns, self._last_ns, len(data), len(raw), len(counts))
-        self.message_count += count
+        self._forget_pending()
+
+    def _forget_pending(self) -> None:
+        self._records.clear()
+        self._pending_bytes = 0
+        for index in self._indexes.values():
+            index.clear()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a named set of values."""
@@ -271,8 +277,11 @@ class RunWriter:
         Raises:
             OSError: there is not even room for the index of nothing; what stands in the file can be recovered.
         """
-        with contextlib.suppress(OSError):
+        try:
             self.close_chunk()
+        except OSError:
+            self.given_up += len(self._records)
+            self._forget_pending()
         while True:
             try:
                 self._end(last_words())
