@@ -12,6 +12,8 @@ decision 2 of docs/model.md.
 Vectors are (rows, rigs): one row a quantity, so that each operation runs along contiguous memory, and a rig's numbers
 do not depend on how many stand beside it. Nothing is allocated in a step, and no BLAS is used: its sums depend on
 the shape. Operands have one shape wherever that is cheap: numpy takes twice as long for a few numbers to be broadcast.
+Results go where no operand is: an array of one element that overlaps its own result is copied first, and a single
+rig's step would take half as long again.
 """
 
 from collections.abc import Sequence
@@ -36,8 +38,6 @@ class StageViews(NamedTuple):
     v1: Floats
     v2: Floats
     theta2: Floats
-    rates: Floats
-    a12: Floats
     a1: Floats
     a2: Floats
     a34: Floats
@@ -46,9 +46,20 @@ class StageViews(NamedTuple):
 
 def stage_views(state: Floats, rates: Floats) -> StageViews:
     """Views of a stage: `state` is (5, N) with rows θ̇1, θ̇2, ḋ3, θ̇4, θ2; `rates` (5, N) gets their derivatives."""
-    return StageViews(
-        state[:4], state[0], state[1], state[4], rates, rates[:2], rates[0], rates[1], rates[2:4], rates[4]
-    )
+    return StageViews(state[:4], state[0], state[1], state[4], rates[0], rates[1], rates[2:4], rates[4])
+
+
+class _Coefficients(NamedTuple):
+    """What the equations of the two links are formed with."""
+
+    coupling_twice: Floats
+    """l2 l3 M, for cosθ2 and for sinθ2, (2, N)."""
+    inertia: Floats
+    """A22 and I1, (2, N)."""
+    product: Floats
+    """I1 A22, (N,)."""
+    p_where_held: Floats | None = None
+    """Added to p = l2 l3 M cosθ2, (N,)."""
 
 
 class ReducedDynamics:
@@ -71,24 +82,33 @@ class ReducedDynamics:
         self.inertia = np.empty((2, count))
         """A22 = M l3², I1 = l2²(m1+M): each multiplies the other link's equation."""
         self._a22, self._i1 = self.inertia
-        self._i1_a22 = np.empty(count)
+        self._free = _Coefficients(self._coupling_twice, self.inertia, np.empty(count))
         self._inverse34 = np.empty((2, count))
         self._offset = np.empty((4, count))
         """What acts besides the efforts and the motion: the environment and gravity."""
+        self._acting = self._holding = self._free
+        self._held_key = b""
+        """What `_holding` was found for; a rig pressed onto a stop stays there for many steps."""
         # Scratch of one evaluation.
         self._force = np.empty((4, count))
         self._force1, self._force2, self._force34 = self._force[0], self._force[1], self._force[2:4]
         self._cos_sin = np.empty((2, count))
         self._cos, self._sin = self._cos_sin
-        self._w2_squared = np.empty(count)
-        self._w1_squared = np.empty(count)
+        self._w2 = np.empty(count)
+        self._w1_squared, self._w2_squared = np.empty(count), np.empty(count)
+        self._pull1, self._pull2 = np.empty(count), np.empty(count)
+        self._between = np.empty(count)
         self._q = np.empty((2, count))
         self._q1, self._q2 = self._q
+        self._own = np.empty((2, count))
         self._cross = np.empty((2, count))
         self._cross1, self._cross2 = self._cross
+        self._numerator = np.empty((2, count))
+        self._numerator1, self._numerator2 = self._numerator
+        self._p_held = np.empty(count)
+        self._p_squared = np.empty(count)
         self._determinant = np.empty(count)
-        self._scratch = np.empty(count)
-        self._held: tuple[Bools, Bools, Bools] | None = None
+        self._w2_rate = np.empty(count)
         self.set_payload(np.zeros(count))
 
     @classmethod
@@ -106,7 +126,8 @@ class ReducedDynamics:
         self._coupling_twice[:] = self.l2 * self.l3 * mass
         self._a22[:] = mass * self.l3 * self.l3
         self._i1[:] = self.l2 * self.l2 * (self.m1 + mass)
-        np.multiply(self._a22, self._i1, out=self._i1_a22)
+        np.multiply(self._a22, self._i1, out=self._free.product)
+        self._held_key = b""
         self._inverse34[0] = 1.0 / mass3
         self._inverse34[1] = 1.0 / self.j4
         self._offset[0] = self.torque_z
@@ -114,9 +135,35 @@ class ReducedDynamics:
         self._offset[2] = GRAVITY * mass3 - self.force_z
         self._offset[3] = self.torque_z
 
-    def hold(self, held1: Bools | None, held2: Bools | None = None) -> None:
-        """Say which joints 1 and 2 are held on a stop, (N,) each: they do not accelerate. None: no joint is."""
-        self._held = None if held1 is None or held2 is None else (held1 & ~held2, held2 & ~held1, held1 & held2)
+    def release(self) -> None:
+        """Let all joints move."""
+        self._acting = self._free
+
+    def hold(self, held1: Bools, held2: Bools, theta2: Floats) -> None:
+        """Let joints 1 and 2 not accelerate where they are held on a stop, (N,) each, with θ2 as it is there, (N,).
+
+        The equations stay; their coefficients become others where a joint is held. With θ1 held, A22·ẇ2 = Q2 is left;
+        with θ2 held both links turn as one body, α θ̈1 = Q1 + Q2 with α = I1 + 2p + A22; θ2 and so p do not change.
+        """
+        key = held1.tobytes() + held2.tobytes() + np.where(held2, theta2, 0.0).tobytes()
+        if key != self._held_key:
+            self._held_key = key
+            self._holding = self._coefficients_where_held(held1, held2, theta2)
+        self._acting = self._holding
+
+    def _coefficients_where_held(self, held1: Bools, held2: Bools, theta2: Floats) -> "_Coefficients":
+        only1, only2, both = held1 & ~held2, held2 & ~held1, held1 & held2
+        any_held = held1 | held2
+        alpha = self._i1 + 2 * (np.cos(theta2) * self.coupling) + self._a22
+        # ẇ1 = (A Q1 - p Q2) / (product - p²), ẇ2 = (I Q2 - p Q1) / (product - p²), with A, I, p and product chosen such
+        # that what is held comes out as zero to the last bit.
+        inertia = np.where(only2, alpha, np.where(any_held, 0.0, self.inertia))
+        inertia[1][only1] = 1.0
+        coupling = self._coupling_twice.copy()
+        coupling[0][any_held] = 0.0
+        product = np.where(only2, 2 * (alpha * alpha), np.where(only1, self._a22, self._free.product))
+        product[both] = 1.0
+        return _Coefficients(coupling, inertia, product, np.where(only2, -alpha, 0.0))
 
     def drive(self, effort: Floats, out: Floats) -> None:
         """All that acts on the joints apart from their motion, (4, N), from the efforts, (4, N)."""
@@ -135,52 +182,40 @@ class ReducedDynamics:
         sin: Any = np.sin,
     ) -> None:
         """Derivatives of a stage's state into its `rates`, (25)–(32), (38), (39); `drive` is (4, N)."""
-        velocity, v1, v2, theta2, _, a12, a1, a2, a34, theta2_rate = stage
+        velocity, v1, v2, theta2, a1, a2, a34, theta2_rate = stage
         force, force1, force2, force34 = self._force, self._force1, self._force2, self._force34
-        p, ps, q1, q2, determinant = self._cos, self._sin, self._q1, self._q2, self._determinant
-        w2_squared, w1_squared = self._w2_squared, self._w1_squared
+        cos_sin, p, ps, q1, q2 = self._cos_sin, self._cos, self._sin, self._q1, self._q2
+        coupling_twice, inertia, product, p_where_held = self._acting
         multiply(self.friction, velocity, force)
         subtract(drive, force, force)
         multiply(force34, self._inverse34, a34)
         cos(theta2, p)
         sin(theta2, ps)
-        multiply(self._cos_sin, self._coupling_twice, self._cos_sin)
-        add(v1, v2, w2_squared)
-        multiply(w2_squared, w2_squared, w2_squared)
-        multiply(w2_squared, ps, w2_squared)
+        multiply(cos_sin, coupling_twice, cos_sin)
+        if p_where_held is not None:
+            p = add(p, p_where_held, self._p_held)
+        w2, w2_squared, pull2 = self._w2, self._w2_squared, self._pull2
+        add(v1, v2, w2)
+        multiply(w2, w2, w2_squared)
+        multiply(w2_squared, ps, pull2)
+        w1_squared, pull1, between = self._w1_squared, self._pull1, self._between
         multiply(v1, v1, w1_squared)
-        multiply(w1_squared, ps, w1_squared)
-        subtract(force1, force2, q1)
-        add(q1, w2_squared, q1)
-        subtract(force2, w1_squared, q2)
-        multiply(p, p, determinant)
-        subtract(self._i1_a22, determinant, determinant)
-        multiply(self.inertia, self._q, a12)
+        multiply(w1_squared, ps, pull1)
+        subtract(force1, force2, between)
+        add(between, pull2, q1)
+        subtract(force2, pull1, q2)
+        p_squared, determinant = self._p_squared, self._determinant
+        multiply(p, p, p_squared)
+        subtract(product, p_squared, determinant)
+        own, cross, w2_rate = self._own, self._cross, self._w2_rate
+        multiply(inertia, self._q, own)
         multiply(q2, p, self._cross1)
         multiply(q1, p, self._cross2)
-        subtract(a12, self._cross, a12)
-        divide(a1, determinant, a1)
-        divide(a2, determinant, a2)
-        subtract(a2, a1, a2)
+        subtract(own, cross, self._numerator)
+        divide(self._numerator1, determinant, a1)
+        divide(self._numerator2, determinant, w2_rate)
+        subtract(w2_rate, a1, a2)
         theta2_rate[:] = v2
-        if self._held is not None:
-            self._hold_rates(stage)
-
-    def _hold_rates(self, stage: StageViews) -> None:
-        """Where a joint is held the other one moves alone: with its own row of the mass matrix."""
-        assert self._held is not None
-        only1, only2, both = self._held
-        together = self._scratch
-        # θ2 held: both links turn as one body, α θ̈1 = Q1 + Q2 with α = I1 + 2p + A22.
-        np.add(self._cos, self._cos, out=together)
-        np.add(together, self._i1, out=together)
-        np.add(together, self._a22, out=together)
-        np.add(self._q1, self._q2, out=self._determinant)
-        np.divide(self._determinant, together, out=stage.a1, where=only2)
-        np.divide(self._q2, self._a22, out=stage.a2, where=only1)
-        np.copyto(stage.a2, 0.0, where=only2)
-        np.copyto(stage.a1, 0.0, where=only1)
-        np.copyto(stage.a12, 0.0, where=both)
 
     def mass_matrix_12(self, theta2: Floats) -> tuple[Floats, Floats, Floats]:
         """Elements α = a11 + a12, a12, a22 of the mass matrix of joints 1 and 2, kg·m², (N,) each, (25)–(27)."""

@@ -194,7 +194,7 @@ class Plant:
         self._start_velocity[:] = velocity
         self._integrator.advance(position, velocity, effort, self.error)
         if held:
-            self.dynamics.hold(None)
+            self.dynamics.release()
         np.greater(position[2], self._free3, self._low)
         if any_true(self._low):
             self._find_contact()
@@ -225,14 +225,14 @@ class Plant:
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
         rates = self._integrator.accelerations(self.position, self.velocity, effort)
-        mass = self.dynamics.mass_matrix_12(self.position[1])
         # Only what rests on a stop can be held there; what moves off it is free.
         side = np.where(self.velocity[:2] == 0, _sides(self.position, self._lower, self._stop), 0.0)
-        _, _, held1, held2 = stop_outward(rates[0], rates[1], side[0], side[1], mass)
-        self._held = held1, held2
-        if not (any_true(held1) or any_true(held2)):
+        if not any_true(side * rates[:2] > 0):
             return False
-        self.dynamics.hold(held1, held2)
+        theta2 = self.position[1]
+        _, _, held1, held2 = stop_outward(rates[0], rates[1], side[0], side[1], self.dynamics.mass_matrix_12(theta2))
+        self._held = held1, held2
+        self.dynamics.hold(held1, held2, theta2)
         return True
 
     def _find_contact(self) -> None:
@@ -242,10 +242,10 @@ class Plant:
         place[:] = self.position
         place[2] = self._start_position[2]
         np.not_equal(place, self._contact_known, self._contact_differs)
-        np.logical_or.reduce(self._contact_differs, axis=0, out=self._contact_unknown)
-        np.logical_and(self._contact_unknown, self._low, self._contact_unknown)
-        if not any_true(self._contact_unknown):
+        np.logical_and(self._contact_differs, self._low, self._contact_differs)
+        if not any_true(self._contact_differs):
             return
+        np.logical_or.reduce(self._contact_differs, axis=0, out=self._contact_unknown)
         # A view where all are asked for: with few rigs, to pick columns costs more than to compute with them.
         rigs = np.flatnonzero(self._contact_unknown) if _FALSE in self._contact_unknown.tobytes() else ALL
         self._contact_known[:, rigs] = place[:, rigs]
@@ -259,8 +259,8 @@ class Plant:
         """Stop joints 1 and 2 at their limits: at the time within the step at which they get there."""
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
-        rigs = np.flatnonzero(beyond.any(axis=0))
-        if rigs.size:
+        if any_true(beyond):
+            rigs = np.flatnonzero(beyond.any(axis=0))
             limit = np.where(position[:2] > self._stop[:2], self._stop[:2], self._lower[:2])[:, rigs]
             q0, v0 = self._start_position[:, rigs], self._start_velocity[:, rigs]
             q1, v1 = position[:, rigs], velocity[:, rigs]
@@ -273,7 +273,7 @@ class Plant:
             arms = [self._arms[rig] for rig in rigs]
             dynamics = ReducedDynamics(arms)
             dynamics.set_payload(self.dynamics.payload[rigs])
-            dynamics.hold(self._held[0][rigs], self._held[1][rigs])
+            dynamics.hold(self._held[0][rigs], self._held[1][rigs], q0[1])
             acting = effort[:, rigs]
             plane, plane_rate = q0.copy(), v0.copy()
             FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, acting)
@@ -287,19 +287,20 @@ class Plant:
             mass = dynamics.mass_matrix_12(plane[1])
             resting = np.where(plane_rate[:2] == 0, side, 0.0)
             _, _, held1, held2 = stop_outward(rates[0], rates[1], resting[0], resting[1], mass)
-            dynamics.hold(held1, held2)
+            dynamics.hold(held1, held2, plane[1])
             rest.advance(plane, plane_rate, acting)
             # Joints 3 and 4 had the whole step already.
             position[:2, rigs], velocity[:2, rigs] = plane[:2], plane_rate[:2]
+            np.maximum(position[:2], self._lower[:2], out=position[:2])
+            np.minimum(position[:2], self._stop[:2], out=position[:2])
         # What is at a stop at the end, by a second impact in one step or since before, does not move outwards.
-        np.maximum(position[:2], self._lower[:2], out=position[:2])
-        np.minimum(position[:2], self._stop[:2], out=position[:2])
         self._stop_plane(self.dynamics, position, velocity, _sides(position, self._lower, self._stop))
 
     @staticmethod
     def _stop_plane(dynamics: ReducedDynamics, position: Floats, velocity: Floats, side: Floats) -> None:
-        mass = dynamics.mass_matrix_12(position[1])
-        velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
+        if any_true(side * velocity[:2] > 0):
+            mass = dynamics.mass_matrix_12(position[1])
+            velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
 
     def _begin_anew(self) -> None:
         """Derive everything from position, velocity and the world's parts."""
