@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
+from pymodbus.pdu import ModbusPDU
 
 # The arm's data sheet: metres, kilograms, newtons.
 L1, L2, L3 = 0.139, 0.300, 0.300
@@ -51,6 +52,7 @@ LAG_SHARE = 0.15  # of what is seen of the lag is learnt at a time
 LARGEST_LAG_S = 0.25
 
 PERIOD_S = 0.010
+RIG_STEP_S = 0.020
 CLEARANCE_Z = 0.025  # height of the tip while it travels: what it carries passes over everything
 HOVER = 0.001  # distance at which parts are taken and set down
 SETTLED = np.array([math.radians(0.05), math.radians(0.05), 0.0008, math.radians(1.0)])
@@ -334,18 +336,21 @@ class Rig:
 
     def read(self) -> np.ndarray:
         """Joint positions: rad, rad, m, rad, from degrees and millimetres times 100."""
-        answer = self._client.read_holding_registers(4, count=4)
-        if answer.isError():
-            raise ConnectionError(f"the rig refused to be read: {answer}")
-        values = np.array(answer.registers, dtype=np.uint16).astype(np.int16) / 100
-        return np.array([math.radians(values[0]), math.radians(values[1]), values[2] / 1000, math.radians(values[3])])
+        return joints_of(self._client.read_holding_registers(4, count=4))
 
     def write(self, efforts: np.ndarray) -> None:
         """Efforts: N·m, N·m, N, N·m, as thousandths."""
-        registers = np.rint(efforts * 1000).astype(np.int16).view(np.uint16)
-        answer = self._client.write_registers(0, [int(value) for value in registers])
+        answer = self._client.write_registers(0, registers_of(efforts))
         if answer.isError():
             raise ConnectionError(f"the rig refused a torque: {answer}")
+
+    def exchange(self, efforts: np.ndarray) -> np.ndarray:
+        """Write efforts and read positions in one request (function 23), on its way once there and back."""
+        return joints_of(
+            self._client.readwrite_registers(
+                read_address=4, read_count=4, write_address=0, values=registers_of(efforts)
+            )
+        )
 
     def switch(self, magnet: bool) -> None:
         """The magnet, on or off."""
@@ -363,23 +368,55 @@ class Rig:
             self._client.close()
 
 
-def control(rig: Rig, controller: Controller, duration_s: float) -> dict:
-    """Close the loop every `PERIOD_S` for `duration_s`; says how it went."""
+def joints_of(answer: ModbusPDU) -> np.ndarray:
+    """Joints that the rig answered."""
+    if answer.isError():
+        raise ConnectionError(f"the rig refused: {answer}")
+    values = np.array(answer.registers, dtype=np.uint16).astype(np.int16) / 100
+    return np.array([math.radians(values[0]), math.radians(values[1]), values[2] / 1000, math.radians(values[3])])
+
+
+def registers_of(efforts: np.ndarray) -> list[int]:
+    """Efforts as the registers hold them."""
+    return [int(value) for value in np.rint(efforts * 1000).astype(np.int16).view(np.uint16)]
+
+
+def control(rig: Rig, controller: Controller, duration_s: float, once: bool = False) -> dict:
+    """Close the loop every `PERIOD_S`, or as often as the network allows, for `duration_s`; says how it went.
+
+    With `once` it ends when the work is done, where that is earlier.
+    """
     began_s = time.monotonic()
-    rig.read()
-    # A cycle is two requests, a read and a write.
-    controller.usual_cycle_s = max(PERIOD_S, 2 * (time.monotonic() - began_s))
-    deadline_s, cycles, magnet, done_s = began_s, 0, False, None
+    joints, request_s = rig.read(), time.monotonic() - began_s
+    for _ in range(2):
+        asked_s = time.monotonic()
+        joints = rig.read()
+        request_s = min(request_s, time.monotonic() - asked_s)
+    # Reading, then writing, answers the newest positions, but is two requests. Where these take longer than a period,
+    # one request that does both makes the cycle half as long, and the answers no older.
+    slow = 2 * request_s > PERIOD_S
+    # Paced by the rig's steps, so that what is read is of one age; a slower network sets a pace of its own.
+    period_s = RIG_STEP_S if slow else PERIOD_S
+    controller.usual_cycle_s = max(period_s, request_s)
+    deadline_s, cycles, magnet, done_s = time.monotonic(), 0, False, None
     while (now_s := time.monotonic()) - began_s < duration_s:
-        efforts = controller.update(now_s, rig.read())
-        rig.write(efforts)
+        if not slow:
+            joints = rig.read()
+        efforts = controller.update(now_s, joints)
         if controller.magnet != magnet:
+            # Before the efforts that count on it: with nothing on the magnet, a part's weight too much lifts the quill.
             magnet = controller.magnet
             rig.switch(magnet)
+        if slow:
+            joints = rig.exchange(efforts)
+        else:
+            rig.write(efforts)
+        cycles += 1
         if controller.done and done_s is None:
             done_s = now_s - began_s
-        cycles += 1
-        deadline_s = max(deadline_s + PERIOD_S, time.monotonic() - PERIOD_S)
+            if once:
+                break
+        deadline_s = max(deadline_s + period_s, time.monotonic() - period_s)
         time.sleep(max(0.0, deadline_s - time.monotonic()))
     return {
         "placed": controller.placed,
@@ -400,6 +437,7 @@ def main() -> int:
     parser.add_argument("--host", default="127.0.0.1", help="address of the rig")
     parser.add_argument("--port", type=int, default=5020, help="Modbus TCP port of the rig")
     parser.add_argument("--duration", type=float, default=20.0, help="seconds to run")
+    parser.add_argument("--once", action="store_true", help="end when the work is done")
     parser.add_argument("--scene", type=Path, help="lab.toml whose [scene] is the task; default: hilrig's own scene")
     parser.add_argument("--json", action="store_true", help="one JSON object at the end, on standard output")
     options = parser.parse_args()
@@ -419,7 +457,7 @@ def main() -> int:
     try:
         rig = Rig(options.host, options.port)
         try:
-            result = control(rig, controller, options.duration)
+            result = control(rig, controller, options.duration, options.once)
         finally:
             rig.close()
     except (ConnectionError, ModbusException) as error:

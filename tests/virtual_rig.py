@@ -144,3 +144,63 @@ def work(rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_de
         if controller.done and done_s is None:
             done_s = len(rig.states) * rig.lab.sim.step_ms / 1e3
     return done_s
+
+
+class FarRig:
+    """A rig at the end of a slow network, in virtual time, for a controller that asks and waits for each answer.
+
+    It stands in for the example's `Rig` and for its `time`: only asking and sleeping let time pass.
+    """
+
+    def __init__(self, rig: VirtualRig, one_way_ms: float, seed: int) -> None:
+        self._rig = rig
+        self._one_way_ms = one_way_ms
+        self._random = np.random.default_rng(seed)
+        self._step_ms = rig.lab.sim.step_ms
+        self._now_ms = self._next_ms = 0.0
+        self._effort, self._magnet = np.zeros(4), False
+        self._pass(float(self._random.uniform(0, self._step_ms)))
+
+    def _pass(self, duration_ms: float) -> None:
+        self._now_ms += duration_ms
+        while self._next_ms <= self._now_ms:
+            self._rig.tick()
+            self._next_ms += self._step_ms
+
+    def _way(self) -> None:
+        self._pass(self._one_way_ms + 0.1 + self._random.exponential(0.5))
+
+    def _command(self) -> None:
+        self._rig.command(self._effort, magnet=self._magnet)
+
+    def read(self) -> np.ndarray:
+        self._way()
+        position = np.rint(np.array(self._rig.states[-1].position) * REGISTERS) / REGISTERS
+        self._way()
+        return position
+
+    def write(self, effort: np.ndarray) -> None:
+        self._way()
+        self._effort = np.rint(effort * 1000) / 1000
+        self._command()
+        self._way()
+
+    def exchange(self, effort: np.ndarray) -> np.ndarray:
+        self._way()
+        self._effort = np.rint(effort * 1000) / 1000
+        self._command()
+        position = np.rint(np.array(self._rig.states[-1].position) * REGISTERS) / REGISTERS
+        self._way()
+        return position
+
+    def switch(self, magnet: bool) -> None:
+        self._way()
+        self._magnet = magnet
+        self._command()
+        self._way()
+
+    def monotonic(self) -> float:
+        return self._now_ms / 1000
+
+    def sleep(self, duration_s: float) -> None:
+        self._pass(duration_s * 1000)

@@ -8,7 +8,7 @@ from hilrig_schemas import JointState, PartState
 from hilrig_sim.dynamics import forward_dynamics
 from hilrig_sim.model import ArmParameters, RigParameters
 from recordings import PARAMETERS
-from virtual_rig import VirtualRig, pick_and_place, work
+from virtual_rig import FarRig, VirtualRig, pick_and_place, work
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
@@ -28,6 +28,22 @@ def test_every_part_of_the_default_scene_is_placed_within_2_mm_whatever_the_late
     assert done_s is not None
     assert done_s < 16.0
     assert rig.kinds().count("PART_PICKED") == rig.kinds().count("PART_DROPPED") == 4
+
+
+@pytest.mark.parametrize("one_way_ms", [0.0, 3.0, 6.0, 9.5, 20.0, 30.0])
+def test_a_network_may_be_slow_where_each_request_waits_for_its_answer(
+    one_way_ms: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    example = pick_and_place()
+    with VirtualRig() as rig:
+        far = FarRig(rig, one_way_ms, seed=1)
+        monkeypatch.setattr(example, "time", far)
+        said = example.control(far, example.Controller(example.task_of({})), 40.0, once=True)
+        parts, held = last_parts(rig.states)
+    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    assert said["placed"] == result.placed == 4
+    assert result.largest_error_mm is not None
+    assert result.largest_error_mm < 2.0
 
 
 def test_its_model_of_the_arm_is_the_arms() -> None:
