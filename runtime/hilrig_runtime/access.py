@@ -33,6 +33,7 @@ RULES: Final[dict[str, Rule]] = {
     topics.TRAFFIC.name: Rule(("edge",), TOOLS),
     topics.CONFIG.name: Rule(("sim",), ("edge", "recorder", *TOOLS)),
     topics.LEASE.name: Rule(("edge",), ("operator",)),
+    topics.IMPAIRMENT.name: Rule(("edge",), ("operator",)),
     topics.LOG.name: Rule(SERVICES, ("recorder",)),
     topics.HEALTH.name: Rule(SERVICES, TOOLS),
     # A recorder asks whether another one records the lab already.

@@ -14,6 +14,7 @@ from pydantic import BeforeValidator, Field, IPvAnyNetwork, PrivateAttr, Validat
 
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import Name, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
@@ -157,6 +158,8 @@ class RigSettings(Section):
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None
     """Its own scene; default: the lab's."""
+    impairment: ImpairmentConfig | None = None
+    """Its own impairment; default: the lab's."""
 
     @model_validator(mode="after")
     def _no_reserved_name(self) -> "RigSettings":
@@ -207,6 +210,7 @@ class LabConfig(Section):
     recorder: RecorderConfig = RecorderConfig()
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
+    impairment: ImpairmentConfig = ImpairmentConfig()
     rigs: Annotated[tuple[RigSettings, ...], BeforeValidator(_listed), Field(min_length=1)] = (RigSettings(),)
     _source: str = PrivateAttr("")
 
@@ -271,6 +275,10 @@ class LabConfig(Section):
     def scene_of(self, rig: RigSettings) -> SceneConfig:
         """The scene around a rig: its own, or the lab's."""
         return self.scene if rig.scene is None else rig.scene
+
+    def impairment_of(self, rig: RigSettings) -> ImpairmentConfig:
+        """What is done to a rig's loop on purpose: its own, or the lab's."""
+        return self.impairment if rig.impairment is None else rig.impairment
 
     def rig(self, name: str) -> RigSettings:
         """The rig of that name.

@@ -1,17 +1,22 @@
 """The wire and file contract: messages (`v1/*.proto`) and the one registry of topics (`topics`)."""
 
 from hilrig_schemas.v1.event_pb2 import Event
-from hilrig_schemas.v1.health_pb2 import Health
+from hilrig_schemas.v1.health_pb2 import Health, RigReport
+from hilrig_schemas.v1.impairment_pb2 import ImpairmentRequest, ImpairmentStatus
 from hilrig_schemas.v1.joint_state_pb2 import JointState, PartState
 from hilrig_schemas.v1.lease_pb2 import LeaseRequest, LeaseStatus
 from hilrig_schemas.v1.log_batch_pb2 import LogBatch, LogEntry, OpenSession
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusRequest, ModbusTraffic
+from hilrig_schemas.v1.rig_batch_pb2 import RigBatch
 from hilrig_schemas.v1.rig_config_pb2 import RigConfig
+from hilrig_schemas.v1.roster_pb2 import Roster
 from hilrig_schemas.v1.torque_command_pb2 import TorqueCommand
 
 __all__ = [
     "Event",
     "Health",
+    "ImpairmentRequest",
+    "ImpairmentStatus",
     "JointState",
     "LeaseRequest",
     "LeaseStatus",
@@ -21,6 +26,9 @@ __all__ = [
     "ModbusTraffic",
     "OpenSession",
     "PartState",
+    "RigBatch",
     "RigConfig",
+    "RigReport",
+    "Roster",
     "TorqueCommand",
 ]

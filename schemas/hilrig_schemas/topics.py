@@ -13,7 +13,17 @@ from typing import Final, Generic, TypeVar
 
 from google.protobuf.message import Message
 
-from hilrig_schemas import Event, Health, JointState, LeaseStatus, LogBatch, ModbusTraffic, RigConfig, TorqueCommand
+from hilrig_schemas import (
+    Event,
+    Health,
+    ImpairmentStatus,
+    JointState,
+    LeaseStatus,
+    LogBatch,
+    ModbusTraffic,
+    RigConfig,
+    TorqueCommand,
+)
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -78,12 +88,13 @@ EVENT: Final = RigTopic("event", Event, Traffic.REPORT, channel="/event")
 TRAFFIC: Final = RigTopic("traffic", ModbusTraffic, Traffic.REPORT, channel="/traffic")
 CONFIG: Final = RigTopic("config", RigConfig, Traffic.QUERY)
 LEASE: Final = RigTopic("lease", LeaseStatus, Traffic.QUERY)
+IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
 """What a person asks of a service: the recorder begins and ends sessions by hand."""
 
-RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE)  # type: ignore[assignment]
+RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
 SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL)  # type: ignore[assignment]
 RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in RIG_TOPICS if topic.channel}
 

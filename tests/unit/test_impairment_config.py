@@ -1,0 +1,130 @@
+"""`[impairment]` as people write it: kinds as text or table, presets, schedules, and what is wrong with it."""
+
+from pathlib import Path
+
+import pytest
+
+from hilrig_runtime.config import parse_lab
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.impairment_config import (
+    PRESETS,
+    BernoulliLoss,
+    ConstantDelay,
+    GammaDelay,
+    GilbertElliottLoss,
+    ImpairmentConfig,
+    NormalDelay,
+    TraceDelay,
+    UniformDelay,
+    WayImpairment,
+)
+
+
+def test_without_it_the_loop_is_as_it_is() -> None:
+    lab = parse_lab("")
+    assert lab.impairment_of(lab.rigs[0]).ways.do_nothing
+    assert lab.impairment.ways.describe() == "none"
+
+
+@pytest.mark.parametrize(
+    ("text", "delay"),
+    [
+        ("constant:10", ConstantDelay(delay_ms=10)),
+        ("constant", ConstantDelay()),
+        ("uniform:5, 20", UniformDelay(low_ms=5, high_ms=20)),
+        ("normal:20,5", NormalDelay(mean_ms=20, std_ms=5)),
+        ("gamma:20,8", GammaDelay(mean_ms=20, std_ms=8)),
+        ("gamma:20,8,2.5", GammaDelay(mean_ms=20, std_ms=8, offset_ms=2.5)),
+    ],
+)
+def test_a_delay_is_a_kind_and_its_numbers(text: str, delay: object) -> None:
+    assert WayImpairment.model_validate(text).delay == delay
+
+
+def test_text_and_table_say_the_same() -> None:
+    as_text = parse_lab('[impairment]\ncommand = { delay = "gamma:20,8", loss = "gilbert:0.01,0.2" }\n')
+    as_table = parse_lab(
+        '[impairment.command.delay]\nkind = "gamma"\nmean_ms = 20\nstd_ms = 8\n'
+        '[impairment.command.loss]\nkind = "gilbert"\nto_bad = 0.01\nto_good = 0.2\n'
+    )
+    assert as_text.impairment == as_table.impairment
+    assert as_text.impairment.ways.command.loss == GilbertElliottLoss(to_bad=0.01, to_good=0.2)
+    assert as_text.impairment.ways.describe() == (
+        "state way none; command way gamma mean 20 ms, std 8 ms, offset 0 ms, "
+        "loss gilbert to bad 0.01, to good 0.2, rate bad 1, rate good 0"
+    )
+
+
+def test_what_is_said_of_a_way_stands_before_its_preset() -> None:
+    ways = ImpairmentConfig.model_validate({"preset": "vpn", "state": {"loss": "bernoulli:0.5"}}).ways
+    assert ways.command == PRESETS["vpn"].command
+    assert ways.state == WayImpairment(loss=BernoulliLoss(rate=0.5))
+
+
+def test_a_rig_can_have_its_own() -> None:
+    lab = parse_lab(
+        '[impairment]\npreset = "mobile"\n[[rigs]]\nname="a"\n[[rigs]]\nname="b"\nimpairment.preset = "none"\n'
+    )
+    assert [lab.impairment_of(rig).preset for rig in lab.rigs] == ["mobile", "none"]
+
+
+def test_a_setting_goes_through_json_unchanged() -> None:
+    for preset in PRESETS:
+        config = ImpairmentConfig.model_validate(
+            {"preset": preset, "state": "constant:3", "schedule": [{"at_s": 1, "preset": "vpn"}]}
+        )
+        assert ImpairmentConfig.model_validate_json(config.model_dump_json()) == config
+
+
+def test_a_trace_is_a_file_with_a_delay_a_line(tmp_path: Path) -> None:
+    trace = tmp_path / "trace.txt"
+    trace.write_text("# delays of a session, ms\n12.5\n3\n1e1\n")
+    way = WayImpairment.model_validate(f"trace:{trace}")
+    assert way.delay == TraceDelay(delays_ms=(12.5, 3.0, 10.0))
+    assert way.describe() == "trace of 3 delays, mean 8.5 ms"
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ("1\n\n2\n", r"trace.txt, line 2: expected a delay from 0 to 10000 ms, found ''"),
+        ("1\nnan\n", r"line 2: .* found 'nan'"),
+        ("1\n-3\n", r"line 2: .* found '-3'"),
+        ("1\n2,5\n", r"line 2: .* found '2,5'"),
+        ("# nothing\n", r"there is no delay in it"),
+        (None, r"can't be read: No such file"),
+    ],
+)
+def test_a_trace_with_gaps_is_refused(tmp_path: Path, lines: str | None, complaint: str) -> None:
+    trace = tmp_path / "trace.txt"
+    if lines is not None:
+        trace.write_text(lines)
+    with pytest.raises(InputError, match=complaint):
+        parse_lab(f"[impairment]\nstate = 'trace:{trace}'\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("preset = 'wlan'", r"impairment\.preset: no preset is called 'wlan': expected one of none, wired"),
+        ("state = 'constant:-3'", r"state\.delay\.constant\.delay_ms: expected greater than or equal to 0, found '-3'"),
+        ("state = 'constant:20ms'", r"state\.delay\.constant\.delay_ms: expected .*number.* found '20ms'"),
+        ("state = 'constant:nan'", r"delay_ms: expected .*"),
+        ("state = 'constant:20000'", r"delay_ms: expected less than or equal to 10000, found '20000'"),
+        ("state = 'poisson:3'", r"impairment\.state\.delay: no delay is called 'poisson': expected one of constant"),
+        ("state = 'uniform:5'", r"uniform takes low_ms, high_ms, found 'uniform:5'"),
+        ("state = 'gamma:5,2,1,1'", r"gamma takes mean_ms, std_ms, \[offset_ms\], found"),
+        ("state = 'uniform:9,5'", r"low_ms 9 is above high_ms 5"),
+        ("command.loss = 'bernoulli:1.5'", r"rate: expected less than or equal to 1, found '1.5'"),
+        ("command.loss = 'gilbert:0.1,0'", r"to_good: expected greater than 0"),
+        ("command.loss = 'none:1'", r"none takes no numbers"),
+        ("command.jitter = 3", r"impairment\.command\.jitter: unknown key"),
+        ("seed = -1", r"impairment\.seed: expected greater than or equal to 0"),
+        ("schedule = [{ preset = 'vpn' }]", r"impairment\.schedule\[0\]\.at_s: .*required"),
+        ("schedule = [{ at_s = 5 }, { at_s = 5 }]", r"at_s 5 stands after 5"),
+        ("schedule = [{ at_s = -5 }]", r"schedule\[0\]\.at_s: expected greater than or equal to 0"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(text: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        parse_lab(f"[impairment]\n{text}\n")
