@@ -36,6 +36,8 @@ RULES: Final[dict[str, Rule]] = {
     topics.IMPAIRMENT.name: Rule(("edge",), ("operator",)),
     topics.LOG.name: Rule(SERVICES, ("recorder",)),
     topics.HEALTH.name: Rule(SERVICES, TOOLS),
+    topics.ROSTER.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
+    topics.STATES.name: Rule(("sim",), ("edge",)),
     # A recorder asks whether another one records the lab already.
     topics.CONTROL.name: Rule(("recorder",), ("recorder", "operator")),
 }

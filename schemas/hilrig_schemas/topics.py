@@ -1,8 +1,8 @@
 """The one registry of topics: key on the bus, message type, kind of traffic, channel in a recording.
 
 No key string stands anywhere else. A key is `hil/<lab>/<rig>/<name>` for what concerns a rig and
-`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; `log`, `health`, `control` and `alive` are
-therefore no names for a rig.
+`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; their names, as `log` and
+`health`, are therefore no names for a rig.
 """
 
 import re
@@ -21,7 +21,9 @@ from hilrig_schemas import (
     LeaseStatus,
     LogBatch,
     ModbusTraffic,
+    RigBatch,
     RigConfig,
+    Roster,
     TorqueCommand,
 )
 
@@ -93,9 +95,13 @@ LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
 """What a person asks of a service: the recorder begins and ends sessions by hand."""
+ROSTER: Final = ServiceTopic("roster", Roster, Traffic.QUERY)
+"""Who runs, where, and for which rigs."""
+STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
+"""The states of a tick together, for the edges; a watcher of one rig takes that rig's `STATE`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
-SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL)  # type: ignore[assignment]
+SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, ROSTER, STATES)  # type: ignore[assignment]
 RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in RIG_TOPICS if topic.channel}
 
 ALIVE: Final = "alive"

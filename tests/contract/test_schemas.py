@@ -78,7 +78,11 @@ def test_what_is_no_rigs_key_is_refused(key: str) -> None:
 
 
 def test_control_is_what_closes_the_loop() -> None:
-    assert {topic.name for topic in topics.all_topics() if topic.traffic is Traffic.CONTROL} == {"state", "command"}
+    assert {topic.name for topic in topics.all_topics() if topic.traffic is Traffic.CONTROL} == {
+        "state",
+        "states",
+        "command",
+    }
 
 
 def test_no_key_stands_outside_the_registry() -> None:

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!hilrig_schemas/v1/rig_batch.proto\x12\thilrig.v1\"*\n\x08RigBatch\x12\x0c\n\x04rigs\x18\x01 \x03(\t\x12\x10\n\x08messages\x18\x02 \x03(\x0c\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!hilrig_schemas/v1/rig_batch.proto\x12\thilrig.v1\":\n\x08RigBatch\x12\x0e\n\x06source\x18\x01 \x01(\t\x12\x0c\n\x04rigs\x18\x02 \x03(\t\x12\x10\n\x08messages\x18\x03 \x03(\x0c\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,5 +32,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.rig_batch
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_RIGBATCH']._serialized_start=48
-  _globals['_RIGBATCH']._serialized_end=90
+  _globals['_RIGBATCH']._serialized_end=106
 # @@protoc_insertion_point(module_scope)
