@@ -12,6 +12,7 @@ from typing import Any, Self
 from hilrig_modbus_edge.bridge import run
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig
+from hilrig_runtime.logstream import entries_of
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.service import Service
 from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, TorqueCommand, topics
@@ -93,9 +94,9 @@ class EdgeRig:
         batch = LogBatch.FromString(payload)
         if batch.complete_sessions:
             self.sessions[:] = [session.session for session in batch.sessions]
-        for entry in batch.entries:
-            if topics.parse_rig_key(entry.key).topic is topics.TRAFFIC:
-                self.traffic.append(ModbusTraffic.FromString(entry.payload))
+        for key, _, _, message in entries_of(batch):
+            if topics.parse_rig_key(key).topic is topics.TRAFFIC:
+                self.traffic.append(ModbusTraffic.FromString(message))
 
 
 @contextmanager

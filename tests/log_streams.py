@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from google.protobuf.message import Message
 
+from hilrig_runtime.logstream import put_entries
 from hilrig_schemas import Event, JointState, LogBatch, OpenSession, TorqueCommand
 from hilrig_schemas.topics import COMMAND, EVENT, STATE, RigTopic
 
@@ -72,10 +73,7 @@ class FakeSource:
         """What was added since the last batch; `sessions` are stated completely where they are given."""
         self.sequence += 1
         batch = LogBatch(source=self.name, incarnation=self.incarnation, sequence=self.sequence)
-        for sent in self._waiting:
-            batch.entries.add(
-                key=sent.key, sequence=sent.sequence, publish_wall_ns=sent.publish_ns, payload=sent.payload
-            )
+        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._waiting])
         self._waiting.clear()
         if sessions is not None:
             batch.sessions.extend(sessions)

@@ -5,7 +5,7 @@ Recording is complete rather than early: entries are collected as they come and 
 path one list entry a message.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from hilrig_runtime.bus import Publisher
@@ -17,6 +17,26 @@ SESSIONS_PERIOD_NS: Final = 500_000_000
 
 Entry = tuple[str, int, int, bytes]
 """Key, sequence of the sender on that key, time of publication (ns, wall clock), encoded message."""
+
+
+def put_entries(batch: LogBatch, entries: Sequence[Entry]) -> None:
+    """Add messages to a batch."""
+    if entries:
+        # Whole columns at once: a tenth of what a record for each message would take.
+        keys, sequences, publish_wall_ns, payloads = zip(*entries, strict=True)
+        batch.keys.extend(keys)
+        batch.sequences.extend(sequences)
+        batch.publish_wall_ns.extend(publish_wall_ns)
+        batch.payloads.extend(payloads)
+
+
+def entries_of(batch: LogBatch) -> Iterable[Entry]:
+    """The messages of a batch, in order.
+
+    Raises:
+        ValueError: while it is iterated, that the columns are not equally long.
+    """
+    return zip(batch.keys, batch.sequences, batch.publish_wall_ns, batch.payloads, strict=True)
 
 
 class LogStream:
@@ -57,9 +77,7 @@ class LogStream:
             return
         self._sequence += 1
         batch = LogBatch(source=self._source, incarnation=self._incarnation, sequence=self._sequence)
-        add = batch.entries.add
-        for key, sequence, publish_wall_ns, payload in entries[:count]:
-            add(key=key, sequence=sequence, publish_wall_ns=publish_wall_ns, payload=payload)
+        put_entries(batch, entries[:count])
         del entries[:count]
         if self._sessions is not None and sessions_due:
             self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS

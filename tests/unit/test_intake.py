@@ -48,7 +48,7 @@ def test_a_full_queue_drops_and_says_where_and_how_many() -> None:
     offered(intake, source, 12)
     assert (intake.depth, intake.dropped) == (5, 7)
     arrivals = taken(intake)
-    assert [len(arrival.batch.entries) for arrival in arrivals] == [1] * 5 + [0]
+    assert [len(arrival.batch.keys) for arrival in arrivals] == [1] * 5 + [0]
     [drop] = arrivals[-1].dropped.values()
     assert (drop.count, drop.last_sequence, arrivals[-1].batches) == (7, 12, 7)
     assert intake.depth == 0
@@ -91,7 +91,7 @@ def test_events_and_statements_of_what_is_dropped_are_kept() -> None:
     edge.state("rig1", 6)
     intake.offer("key", edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]).SerializeToString())
     pile = taken(intake)[-1]
-    assert [entry.key for entry in pile.batch.entries] == ["hil/lab/rig1/event"]
+    assert list(pile.batch.keys) == ["hil/lab/rig1/event"]
     assert [session.session for session in pile.batch.sessions] == ["s1"]
     assert pile.dropped[KEY].count == 2
 
@@ -102,13 +102,18 @@ def test_one_batch_larger_than_the_queue_gets_in_when_it_is_empty() -> None:
     for number in range(10):
         source.state(f"rig{number}", 1)
     intake.offer("key", source.batch().SerializeToString())
-    assert [len(arrival.batch.entries) for arrival in taken(intake)] == [10]
+    assert [len(arrival.batch.keys) for arrival in taken(intake)] == [10]
 
 
 def test_what_is_no_batch_is_counted_and_passed_over() -> None:
     intake = Intake(3, ManualClock())
     intake.offer("key", b"\xff\xff\xff")
-    assert (intake.malformed, intake.take(0)) == (1, None)
+    uneven = FakeSource()
+    uneven.state("rig1", 1)
+    batch = uneven.batch()
+    batch.keys.append("hil/lab/rig2/state")
+    intake.offer("key", batch.SerializeToString())
+    assert (intake.malformed, intake.take(0)) == (2, None)
 
 
 def test_a_stuck_recorder_does_not_grow() -> None:
@@ -141,8 +146,8 @@ def test_offering_and_taking_at_once_loses_nothing_and_keeps_the_order() -> None
         arrival = intake.take(0.01)
         if arrival is None:
             continue
-        for entry in arrival.batch.entries:
-            assert entry.sequence == expected
+        for sequence in arrival.batch.sequences:
+            assert sequence == expected
             expected += 1
         for drop in arrival.dropped.values():
             dropped += drop.count

@@ -1,7 +1,7 @@
 """The recording stream: batches that lose nothing and keep the bytes as they were."""
 
 from hilrig_runtime.bus import Publisher
-from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream
+from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream, entries_of
 from hilrig_schemas import LogBatch, OpenSession
 
 
@@ -24,10 +24,10 @@ def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
     log.flush(0)
     (batch,) = out.batches
     assert (batch.source, batch.incarnation, batch.sequence) == ("sim/1", 7, 1)
-    assert [(e.sequence, e.publish_wall_ns, e.payload) for e in batch.entries] == [
-        (1, 100, b"\x00\xff"),
-        (2, 101, b"\x01\xff"),
-        (3, 102, b"\x02\xff"),
+    assert list(entries_of(batch)) == [
+        ("hil/lab/rig1/state", 1, 100, b"\x00\xff"),
+        ("hil/lab/rig1/state", 2, 101, b"\x01\xff"),
+        ("hil/lab/rig1/state", 3, 102, b"\x02\xff"),
     ]
 
 
@@ -47,7 +47,7 @@ def test_a_flush_is_due_once_a_period() -> None:
     for now in (1_000, 2_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
         log.append("k", 1, 0, b"")
         log.flush_if_due(now)
-    assert [len(batch.entries) for batch in out.batches] == [1, 3]
+    assert [len(batch.keys) for batch in out.batches] == [1, 3]
 
 
 def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_none() -> None:

@@ -24,10 +24,10 @@ def test_what_is_sent_is_on_the_bus_and_on_the_record_with_the_same_bytes() -> N
         for step in (1, 2):
             sender.send(JointState(rig="rig1", step=step))
         service.beat(clock.monotonic_ns())
-    entries = LogBatch.FromString(batches[0]).entries
-    assert [entry.payload for entry in entries] == seen
-    assert [entry.sequence for entry in entries] == [1, 2]
-    assert {entry.publish_wall_ns for entry in entries} == {clock.wall_ns()}
+    batch = LogBatch.FromString(batches[0])
+    assert list(batch.payloads) == seen
+    assert list(batch.sequences) == [1, 2]
+    assert set(batch.publish_wall_ns) == {clock.wall_ns()}
 
 
 def test_a_repetition_is_heard_but_not_recorded() -> None:
@@ -37,7 +37,7 @@ def test_a_repetition_is_heard_but_not_recorded() -> None:
     with make_service(hub, ManualClock()) as service:
         service.sender(STATE, "rig1").repeat(JointState(step=1))
     assert len(seen) == 1
-    assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).entries]
+    assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).keys]
 
 
 def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:

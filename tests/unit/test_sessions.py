@@ -6,6 +6,7 @@ import pytest
 
 from hilrig_recorder.intake import Arrival
 from hilrig_recorder.sessions import KEEPER_SILENCE_NS, LINGER_MAX_NS, Recording, SessionBook
+from hilrig_runtime.logstream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
 from log_streams import LAB, MS, SECOND, FakeSource, Sent
@@ -438,11 +439,8 @@ def test_what_is_not_understood_is_told_once_and_stops_nothing() -> None:
     desk = Desk()
     desk.start()
     batch = LogBatch(source="edge/1", incarnation=1, sequence=2)
-    for sequence in (1, 2):
-        batch.entries.add(key="hil/lab/rig1/nothing", sequence=sequence, payload=b"x")
-        batch.entries.add(key="hil/elsewhere/rig1/state", sequence=sequence, payload=b"x")
-        batch.entries.add(key="hil/lab/rig1/config", sequence=sequence, payload=b"x")
-        batch.entries.add(key="hil/lab/rig2/event", sequence=sequence, payload=b"\xff\xff")
+    keys = ("hil/lab/rig1/nothing", "hil/elsewhere/rig1/state", "hil/lab/rig1/config", "hil/lab/rig2/event")
+    put_entries(batch, [(key, sequence, 0, b"\xff\xff") for sequence in (1, 2) for key in keys])
     desk.take(batch)
     states = desk.states(2)
     assert len(desk.shelf.refused) == 4

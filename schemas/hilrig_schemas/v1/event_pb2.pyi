@@ -29,6 +29,7 @@ class Event(_message.Message):
         COMMAND_BACK: _ClassVar[Event.Kind]
         RESET: _ClassVar[Event.Kind]
         CONNECTION_REFUSED: _ClassVar[Event.Kind]
+        RECORDING: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -48,6 +49,7 @@ class Event(_message.Message):
     COMMAND_BACK: Event.Kind
     RESET: Event.Kind
     CONNECTION_REFUSED: Event.Kind
+    RECORDING: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]

@@ -7,32 +7,26 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class LogBatch(_message.Message):
-    __slots__ = ("source", "incarnation", "sequence", "entries", "sessions", "complete_sessions")
+    __slots__ = ("source", "incarnation", "sequence", "sessions", "complete_sessions", "keys", "sequences", "publish_wall_ns", "payloads")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
-    ENTRIES_FIELD_NUMBER: _ClassVar[int]
     SESSIONS_FIELD_NUMBER: _ClassVar[int]
     COMPLETE_SESSIONS_FIELD_NUMBER: _ClassVar[int]
+    KEYS_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCES_FIELD_NUMBER: _ClassVar[int]
+    PUBLISH_WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    PAYLOADS_FIELD_NUMBER: _ClassVar[int]
     source: str
     incarnation: int
     sequence: int
-    entries: _containers.RepeatedCompositeFieldContainer[LogEntry]
     sessions: _containers.RepeatedCompositeFieldContainer[OpenSession]
     complete_sessions: bool
-    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., entries: _Optional[_Iterable[_Union[LogEntry, _Mapping]]] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ...) -> None: ...
-
-class LogEntry(_message.Message):
-    __slots__ = ("key", "sequence", "publish_wall_ns", "payload")
-    KEY_FIELD_NUMBER: _ClassVar[int]
-    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
-    PUBLISH_WALL_NS_FIELD_NUMBER: _ClassVar[int]
-    PAYLOAD_FIELD_NUMBER: _ClassVar[int]
-    key: str
-    sequence: int
-    publish_wall_ns: int
-    payload: bytes
-    def __init__(self, key: _Optional[str] = ..., sequence: _Optional[int] = ..., publish_wall_ns: _Optional[int] = ..., payload: _Optional[bytes] = ...) -> None: ...
+    keys: _containers.RepeatedScalarFieldContainer[str]
+    sequences: _containers.RepeatedScalarFieldContainer[int]
+    publish_wall_ns: _containers.RepeatedScalarFieldContainer[int]
+    payloads: _containers.RepeatedScalarFieldContainer[bytes]
+    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ...) -> None: ...
 
 class OpenSession(_message.Message):
     __slots__ = ("rig", "session", "controller", "start_wall_ns")

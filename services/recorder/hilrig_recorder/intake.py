@@ -14,7 +14,8 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_runtime.clock import Clock
-from hilrig_schemas import LogBatch, LogEntry
+from hilrig_runtime.logstream import Entry, entries_of, put_entries
+from hilrig_schemas import LogBatch
 from hilrig_schemas.topics import EVENT
 
 _EVENT_SUFFIX: Final = f"/{EVENT.name}"
@@ -77,7 +78,10 @@ class Intake:
         except DecodeError:
             self.malformed += 1
             return
-        count = len(batch.entries)
+        count = len(batch.keys)
+        if not count == len(batch.sequences) == len(batch.publish_wall_ns) == len(batch.payloads):
+            self.malformed += 1
+            return
         with self._lock:
             self.received += count
             # An empty queue takes a batch of any size: a small capacity must not lock a large lab out.
@@ -98,16 +102,17 @@ class Intake:
             pile = self._dropping[batch.source] = Arrival(
                 LogBatch(source=batch.source, incarnation=batch.incarnation), wall_ns, batches=0
             )
-        kept: list[LogEntry] = []
-        for entry in batch.entries:
-            if entry.key.endswith(_EVENT_SUFFIX) and len(pile.batch.entries) + len(kept) < EVENT_LIMIT:
+        kept: list[Entry] = []
+        for entry in entries_of(batch):
+            key, sequence, *_ = entry
+            if key.endswith(_EVENT_SUFFIX) and len(pile.batch.keys) + len(kept) < EVENT_LIMIT:
                 kept.append(entry)
                 continue
-            drop = pile.dropped.setdefault(entry.key, Drop())
+            drop = pile.dropped.setdefault(key, Drop())
             drop.count += 1
-            drop.last_sequence = entry.sequence
+            drop.last_sequence = sequence
             self.dropped += 1
-        pile.batch.entries.extend(kept)
+        put_entries(pile.batch, kept)
         pile.batch.sequence = batch.sequence
         pile.batches += 1
         if batch.complete_sessions or batch.sessions:

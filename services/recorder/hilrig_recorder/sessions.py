@@ -20,6 +20,7 @@ from google.protobuf.message import DecodeError
 
 from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message, message_head
 from hilrig_recorder.intake import Arrival
+from hilrig_runtime.logstream import entries_of
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, is_name, parse_rig_key
 
@@ -216,17 +217,13 @@ class SessionBook:
         log_time = self._wall_ns = arrival.wall_ns
         source = self._source(arrival, now_ns)
         streams = source.streams
-        for entry in batch.entries:
-            key = entry.key
+        for key, sequence, publish_ns, payload in entries_of(batch):
             stream = streams.get(key) or self._stream(source, key)
             if stream is None:
                 continue
-            sequence = entry.sequence
             if sequence != stream.expected and not self._gap(source, stream, sequence, log_time):
                 continue
             stream.expected = sequence + 1
-            publish_ns = entry.publish_wall_ns
-            payload = entry.payload
             channel_id = stream.channel_id
             record = encode_message(channel_id, sequence, log_time, publish_ns, payload)
             rig = stream.rig
@@ -236,7 +233,7 @@ class SessionBook:
                     recording.add(channel_id, log_time, record)
             if channel_id == _EVENT_CHANNEL:
                 self._event(source, payload, publish_ns, now_ns)
-        self.messages += len(batch.entries)
+        self.messages += len(batch.keys)
         for key, drop in arrival.dropped.items():
             stream = streams.get(key) or self._stream(source, key)
             if stream is not None:
@@ -260,8 +257,8 @@ class SessionBook:
                     recording.tally.lost_batches += missing
         source.next_batch = max(source.next_batch, batch.sequence + 1)
         source.last_ns = now_ns
-        if batch.entries:
-            self._watch_clock(source, batch.entries[-1].publish_wall_ns, now_ns)
+        if batch.keys:
+            self._watch_clock(source, batch.publish_wall_ns[-1], now_ns)
         return source
 
     def _stream(self, source: _Source, key: str) -> _Stream | None:
