@@ -57,8 +57,8 @@ def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
     return _made(settings)
 
 
-def router_settings(bus: BusConfig, lab: str, listen: str) -> dict[str, Any]:
-    """Settings of the router of a lab, by their keys in a zenoh configuration; `listen` is its endpoint.
+def router_config(bus: BusConfig, lab: str, listen: str) -> zenoh.Config:
+    """The zenoh configuration of a lab's router that listens at the endpoint `listen`.
 
     Raises:
         InputError: a certificate that it needs is not there.
@@ -67,7 +67,7 @@ def router_settings(bus: BusConfig, lab: str, listen: str) -> dict[str, Any]:
     if bus.tls is not None:
         settings |= _secured(bus.tls, "router")
         settings["access_control"] = access_control(bus.tls, lab)
-    return settings
+    return _made(settings)
 
 
 def own_identity(tls: BusTlsConfig, service: str) -> str:

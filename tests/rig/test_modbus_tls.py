@@ -248,21 +248,60 @@ def test_the_command_makes_what_the_edge_and_its_clients_need(tmp_path: Path) ->
     folder = tmp_path / "certs"
     made = hilrig("certs", folder, "--client", "alice=operator", "--client", "bob", "--json")
     assert made.returncode == 0, made.stderr
-    assert {Path(path).name for path in json.loads(made.stdout)["written"]} == {
-        f"{name}.{kind}" for name in ("ca", "edge", "alice", "bob") for kind in ("pem", "key")
+    bus = [f"bus/{name}" for name in ("ca", "router", "sim", "edge", "recorder", "operator", "viewer")]
+    assert {str(Path(path).relative_to(folder)) for path in json.loads(made.stdout)["written"]} == {
+        f"{name}.{kind}" for name in ("ca", "edge", "alice", "bob", *bus) for kind in ("pem", "key")
     }
     assert stat.S_IMODE((folder / "alice.key").stat().st_mode) == 0o600
     assert role_of(ssl.PEM_cert_to_DER_cert((folder / "alice.pem").read_text())) == "operator"
     assert role_of(ssl.PEM_cert_to_DER_cert((folder / "bob.pem").read_text())) == ""
-    # A controller that is added later is signed by the same authority.
-    before = (folder / "ca.pem").read_bytes(), (folder / "edge.pem").read_bytes()
-    assert hilrig("certs", folder, "--client", "carol=observer").returncode == 0
-    assert before == ((folder / "ca.pem").read_bytes(), (folder / "edge.pem").read_bytes())
+    # A controller that is added later is signed by the same authority, and nothing else is touched.
+    added = hilrig("certs", folder, "--client", "carol=observer", "--json")
+    assert [Path(path).name for path in json.loads(added.stdout)["written"]] == ["carol.pem", "carol.key"]
     [port] = free_ports(1)
     files = Lab(folder, make_authority("unused", NOW, 1))
     with running_edge(tls=files.tls(port)) as rig:
         assert talk(rig, files.client("alice"), WRITE) == [bytes.fromhex("06 00 00 03 E8")]
         assert talk(rig, files.client("carol"), WRITE) == [bytes.fromhex("86 01")]
+
+
+def written(folder: Path, *arguments: str | Path) -> set[str]:
+    done = hilrig("certs", folder, *arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    return {Path(path).relative_to(folder).with_suffix("").as_posix() for path in json.loads(done.stdout)["written"]}
+
+
+def test_what_is_good_is_kept_and_what_is_not_is_made_anew(tmp_path: Path) -> None:
+    folder, lab_file = tmp_path / "certs", tmp_path / "lab.toml"
+    everything = written(folder)
+    assert written(folder) == set()
+    # An address that a certificate does not name, an edge that has none yet, one that is about to end.
+    assert written(folder, "--host", "rig.example") == {"edge", "bus/router"}
+    lab_file.write_text('[bus.tls]\nedges = {east = ["rig1"]}\n')
+    assert written(folder, "--config", lab_file, "--host", "rig.example") == {"bus/east"}
+    assert written(folder, "--days", "20000", "--host", "rig.example") == set()
+    (folder / "bus/sim.key").unlink()
+    assert written(folder, "--host", "rig.example") == {"bus/sim"}
+    assert written(folder, "--renew") == everything - {"ca", "bus/ca"}
+
+
+def test_what_ends_soon_is_made_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "certs"
+    written(folder)
+    soon = issue_client(make_authority("lab", NOW, 30), "observer", "observer", NOW, 20)
+    (folder / "observer.pem").write_bytes(soon.certificate_pem)
+    (folder / "observer.key").write_bytes(soon.key_pem)
+    assert written(folder) == {"observer"}
+
+
+def test_files_that_are_no_certificates_are_named(tmp_path: Path) -> None:
+    folder = tmp_path / "certs"
+    written(folder)
+    (folder / "bus/ca.key").write_text("no key")
+    done = hilrig("certs", folder)
+    assert done.returncode == 2
+    assert "bus/ca.pem and ca.key are no certificate and key" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
-"""Certificates for Modbus/TCP Security: an authority of the lab's own, the edge's certificate, the controllers'.
+"""Certificates: an authority of the lab's own, and what it issues for Modbus/TCP Security and for the bus.
 
-The specification puts a client's role into its certificate, as a UTF-8 string in the extension `ROLE_OID`. Elliptic
-keys on P-256, for they are small and every TLS library has them.
+The Modbus specification puts a client's role into its certificate, as a UTF-8 string in the extension `ROLE_OID`.
+Elliptic keys on P-256, for they are small and every TLS library has them.
 """
 
 import ipaddress
@@ -17,6 +17,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 ROLE_OID: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
 _UTF8_STRING: Final = 0x0C
+_BOTH_WAYS: Final = (ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH)
 _CLOCK_SKEW: Final = timedelta(minutes=5)
 
 
@@ -66,14 +67,27 @@ def make_authority(name: str, now: datetime, days: int) -> Identity:
 
 def issue_server(authority: Identity, hosts: Sequence[str], now: datetime, days: int) -> Identity:
     """A certificate for the edge; `hosts` are the names and addresses by which clients reach it."""
-    names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
-    return _issue(authority, hosts[0], ExtendedKeyUsageOID.SERVER_AUTH, names, now, days)
+    return _issue(authority, hosts[0], [ExtendedKeyUsageOID.SERVER_AUTH], _alternative_names(hosts), now, days)
+
+
+def issue_peer(authority: Identity, name: str, hosts: Sequence[str], now: datetime, days: int) -> Identity:
+    """A certificate for who connects and is connected to, as on the bus; `name` is what access control knows it by."""
+    return _issue(authority, name, _BOTH_WAYS, _alternative_names(hosts), now, days)
 
 
 def issue_client(authority: Identity, name: str, role: str, now: datetime, days: int) -> Identity:
     """A certificate for a controller; an empty role is left out."""
     extension = x509.UnrecognizedExtension(ROLE_OID, _utf8_string(role)) if role else None
-    return _issue(authority, name, ExtendedKeyUsageOID.CLIENT_AUTH, extension, now, days)
+    return _issue(authority, name, [ExtendedKeyUsageOID.CLIENT_AUTH], extension, now, days)
+
+
+def names_of(identity: Identity) -> set[str]:
+    """The names and addresses that a certificate is good for; none: it is no server's."""
+    try:
+        names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return set()
+    return {str(name.value) for name in names}
 
 
 def role_of(certificate_der: bytes) -> str:
@@ -89,7 +103,7 @@ def role_of(certificate_der: bytes) -> str:
 def _issue(
     authority: Identity,
     name: str,
-    purpose: x509.ObjectIdentifier,
+    purposes: Sequence[x509.ObjectIdentifier],
     extension: x509.ExtensionType | None,
     now: datetime,
     days: int,
@@ -100,7 +114,7 @@ def _issue(
         _builder(_name(name), issuer.subject, key.public_key(), now, days)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(sign_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), critical=False)
     )
     if extension is not None:
@@ -139,6 +153,10 @@ def _usage(*, sign_certificates: bool) -> x509.KeyUsage:
 
 def _name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+    return x509.SubjectAlternativeName([_general_name(host) for host in hosts])
 
 
 def _general_name(host: str) -> x509.GeneralName:

@@ -1,22 +1,23 @@
-"""`hilrig certs`: a lab's certificates for Modbus/TCP Security."""
+"""`hilrig certs`: a lab's certificates, for Modbus/TCP Security and for the bus."""
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson
+from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from hilrig_modbus_edge.certificates import Identity
+    from hilrig_runtime.config import LabConfig
 
 
 def certs(
     folder: Annotated[Path, typer.Argument(help="Where they are written.")] = Path("certs"),
+    config: Config = None,
     host: Annotated[
-        list[str] | None, typer.Option(help="Name or address by which clients reach the edge; may be given again.")
+        list[str] | None,
+        typer.Option(help="Name or address by which others reach the edge or the router; may be given again."),
     ] = None,
     client: Annotated[
         list[str] | None,
@@ -26,59 +27,84 @@ def certs(
             "Default: operator=operator and observer=observer.",
         ),
     ] = None,
-    days: Annotated[int, typer.Option(min=1, help="How long they are valid.")] = 365,
+    days: Annotated[
+        int, typer.Option(min=1, max=36_500, help="How long they are valid; an authority ten times as long.")
+    ] = 365,
+    renew: Annotated[bool, typer.Option("--renew", help="Make those anew too that are still good.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make an authority, a certificate for the edge and one for each controller.
+    """Make what a lab needs to let in nobody else: authorities, and a certificate for everyone.
 
-    An authority that is in the folder already is used again, and so is the edge's certificate where no --host is
-    given: so controllers can be added. Keep the authority's key to yourself.
+    The edge's and the controllers' are for Modbus/TCP Security; those in FOLDER/bus, signed by an authority of their
+    own, are for the services, the router and the commands. What is there already and good for long enough is kept, an
+    authority always, so controllers can be added. Keep the keys of the authorities, ca.key, to yourself.
     """
     from datetime import UTC, datetime
 
-    from hilrig_modbus_edge.certificates import issue_client, issue_server, load, make_authority
-    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_cli.certificate_folder import CertificateFolder
+    from hilrig_modbus_edge.certificates import issue_client, issue_peer, issue_server
+    from hilrig_runtime.access import identities
+    from hilrig_runtime.bus_config import BusTlsConfig
+    from hilrig_runtime.config import load_lab
 
+    lab = load_lab(config)
     now = datetime.now(UTC)
     clients = dict(_name_and_role(text) for text in client or ["operator=operator", "observer=observer"])
-    written: list[Path] = []
+    here = ["localhost", "127.0.0.1"]
 
-    def write(name: str, identity: "Identity") -> None:
-        for path, data, mode in (
-            (folder / f"{name}.pem", identity.certificate_pem, 0o644),
-            (folder / f"{name}.key", identity.key_pem, 0o600),
-        ):
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
-                file.write(data)
-            written.append(path)
+    controllers = CertificateFolder(folder, now, days, renew=renew)
+    authority = controllers.authority(f"hilrig {lab.name}: controllers")
+    edge_names = _distinct([*(host or []), *_reachable(lab.edge.host), *here])
+    if controllers.is_due("edge", edge_names):
+        controllers.write("edge", issue_server(authority, edge_names, now, days))
+    for name, role in clients.items():
+        if client or controllers.is_due(name):
+            controllers.write(name, issue_client(authority, name, role, now, days))
 
-    authority_files = (folder / "ca.pem", folder / "ca.key")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if all(path.exists() for path in authority_files):
-            try:
-                authority = load(*(path.read_bytes() for path in authority_files))
-            except ValueError as error:
-                raise InputError(f"{folder}: ca.pem and ca.key are no authority of ours: {error}") from error
-        else:
-            authority = make_authority(f"hilrig authority {now:%Y-%m-%d}", now, days)
-            write("ca", authority)
-        if host or not (folder / "edge.pem").exists():
-            write("edge", issue_server(authority, host or ["127.0.0.1", "localhost"], now, days))
-        for name, role in clients.items():
-            write(name, issue_client(authority, name, role, now, days))
-    except OSError as error:
-        raise OperationError(f"{error.filename or folder}: can't be written: {error.strerror}") from error
-    table = {key: str(folder / name) for key, name in (("certificate", "edge.pem"), ("key", "edge.key"))}
-    table["authority"] = str(folder / "ca.pem")
+    bus = CertificateFolder(folder / "bus", now, days, renew=renew)
+    authority = bus.authority(f"hilrig {lab.name}: bus")
+    router_names = _distinct([*_router_host(lab), *(host or []), *here])
+    service_names = _distinct([*_reachable(lab.bus.host), *here])
+    wanted = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
+    for name, names in ({"router": router_names} | wanted).items():
+        if bus.is_due(name, names):
+            bus.write(name, issue_peer(authority, name, names, now, days))
+
+    tables = {
+        "edge.tls": {
+            "certificate": str(folder / "edge.pem"),
+            "key": str(folder / "edge.key"),
+            "authority": str(folder / "ca.pem"),
+        },
+        "bus.tls": {"folder": str(folder / "bus")},
+    }
+    written = [str(path) for path in (*controllers.written, *bus.written)]
     if as_json:
-        print(json.dumps({"written": [str(path) for path in written], "edge.tls": table}))
+        print(json.dumps({"written": written, **tables}))
         return
     for path in written:
         print(f"wrote {path}")
-    print("\nin lab.toml:\n[edge.tls]")
-    for key, value in table.items():
-        print(f'{key} = "{value}"')
+    if not written:
+        print("all there, and good for long enough; --renew makes them anew")
+    print("\nin lab.toml:")
+    for table, values in tables.items():
+        print(f"[{table}]")
+        for key, value in values.items():
+            print(f'{key} = "{value}"')
+
+
+def _router_host(lab: "LabConfig") -> list[str]:
+    address = lab.bus.router.partition("/")[2].partition("?")[0]
+    return _reachable(address.rpartition(":")[0].strip("[]"))
+
+
+def _reachable(host: str) -> list[str]:
+    """The host as a name that others can use; none where it stands for every address."""
+    return [] if host in ("", "0.0.0.0", "::") else [host]
+
+
+def _distinct(names: list[str]) -> list[str]:
+    return list(dict.fromkeys(names))
 
 
 def _name_and_role(text: str) -> tuple[str, str]:

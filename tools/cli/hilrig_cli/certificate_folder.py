@@ -1,0 +1,78 @@
+"""A folder of certificates with their keys, signed by one authority: what is there, what is due, what was written."""
+
+import os
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from hilrig_modbus_edge.certificates import Identity, load, make_authority, names_of
+from hilrig_runtime.errors import InputError, OperationError
+
+AUTHORITY: Final = "ca"
+RENEWED_BEFORE: Final = timedelta(days=30)
+"""What ends so soon is made anew; of short-lived ones the last third."""
+
+
+class CertificateFolder:
+    """`<name>.pem` and `<name>.key` for each name, and `ca.pem` and `ca.key`; made where it is not there.
+
+    Raises:
+        OperationError: it can't be written.
+    """
+
+    def __init__(self, folder: Path, now: datetime, days: int, *, renew: bool = False) -> None:
+        self._folder = folder
+        self._now = now
+        self._days = days
+        self._renew = renew
+        self.written: list[Path] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OperationError(f"{folder}: can't be made: {error.strerror}") from error
+
+    def authority(self, name: str) -> Identity:
+        """The folder's authority; a new one, called `name`, where there is none.
+
+        Raises:
+            InputError: what is there is none.
+        """
+        authority = self._read(AUTHORITY)
+        if authority is None:
+            authority = make_authority(f"{name} {self._now:%Y-%m-%d}", self._now, 10 * self._days)
+            self.write(AUTHORITY, authority)
+        return authority
+
+    def is_due(self, name: str, hosts: Sequence[str] = ()) -> bool:
+        """Whether a certificate is missing, about to end, or does not name all of `hosts`."""
+        identity = None if self._renew else self._read(name)
+        if identity is None:
+            return True
+        left = identity.certificate.not_valid_after_utc - self._now
+        return left < min(RENEWED_BEFORE, timedelta(days=self._days) / 3) or not set(hosts) <= names_of(identity)
+
+    def write(self, name: str, identity: Identity) -> None:
+        """Write a certificate, and its key for its owner's eyes alone."""
+        for suffix, data, mode in ((".pem", identity.certificate_pem, 0o644), (".key", identity.key_pem, 0o600)):
+            path = self._folder / f"{name}{suffix}"
+            try:
+                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
+                    file.write(data)
+            except OSError as error:
+                raise OperationError(f"{path}: can't be written: {error.strerror}") from error
+            self.written.append(path)
+
+    def _read(self, name: str) -> Identity | None:
+        files = [self._folder / f"{name}{suffix}" for suffix in (".pem", ".key")]
+        if not all(path.exists() for path in files):
+            return None
+        try:
+            return load(*(path.read_bytes() for path in files))
+        except OSError as error:
+            raise OperationError(f"{error.filename}: can't be read: {error.strerror}") from error
+        except ValueError as error:
+            raise InputError(
+                f"{files[0]} and {files[1].name} are no certificate and key that can be used: {error}; "
+                "take them away, and they are made anew"
+            ) from error
