@@ -2,6 +2,7 @@
 
 import random
 import struct
+from collections.abc import Callable
 from typing import Any
 
 from hilrig_modbus_edge.client import Client
@@ -18,13 +19,15 @@ MS = 1_000_000
 class Bench:
     """A device on a bench: what it says is kept."""
 
-    def __init__(self, **settings: int) -> None:
+    def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock()
         self.commands: list[TorqueCommand] = []
         self.repeats: list[TorqueCommand] = []
         self.events: list[Event] = []
         self.session_changes = 0
         self.deadlines: list[int] = []
+        self.sends: list[int] = []
+        self.arrive: Callable[[Arrival], None] | None = None
         self.arrival: Arrival | None = None
         self.device = Device(
             "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
@@ -45,6 +48,12 @@ class Bench:
     def watch(self, deadline_ns: int) -> None:
         self.deadlines.append(deadline_ns)
 
+    def send_at(self, deadline_ns: int) -> None:
+        self.sends.append(deadline_ns)
+
+    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+        self.arrive = arrive
+
     def state(self, step: int, **fields: Any) -> None:
         message = JointState(
             rig="rig1",
@@ -56,6 +65,8 @@ class Bench:
             **fields,
         )
         self.arrival = Arrival(message.SerializeToString(), self.clock.monotonic_ns())
+        if self.arrive is not None:
+            self.arrive(self.arrival)
 
     def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
         return self.device.connect(host, port, **rights)

@@ -325,9 +325,14 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: no valid TOML: {error}") from error
     except ValidationError as error:
-        raise InputError("\n".join(f"{where}: {_sentence(mistake)}" for mistake in _causes(error))) from error
+        raise InputError("\n".join(f"{where}: {mistake}" for mistake in mistakes_in(error))) from error
     lab._source = text
     return lab
+
+
+def mistakes_in(error: ValidationError) -> list[str]:
+    """A sentence for each mistake that a person made, with its place."""
+    return [_sentence(mistake) for mistake in _causes(error)]
 
 
 def _causes(error: ValidationError) -> list[Any]:

@@ -30,6 +30,8 @@ class Arrival(NamedTuple):
     payload: bytes
     arrived_ns: int
     """Monotonic clock of this process, ns."""
+    injected_ns: int = 0
+    """For how long it was held up on purpose after that, ns."""
 
 
 class LatestValues:

@@ -12,16 +12,22 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
+from pydantic import ValidationError
+
+from hilrig_modbus_edge.alarm import Alarm
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Limits, RigServer, bind
 from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle
+from hilrig_runtime.config import mistakes_in
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.realtime import freeze_garbage
-from hilrig_runtime.service import Service
-from hilrig_schemas import Event, LeaseRequest, topics
+from hilrig_runtime.service import Arrival, Service
+from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest, topics
 
 TICK_NS: Final = 20_000_000
 TRAFFIC_PERIOD_NS: Final = 200_000_000
@@ -51,6 +57,9 @@ class _Wire:
         self.traffic = service.sender(topics.TRAFFIC, rig, on_bus=False)
         self._edge = edge
         self._timer: asyncio.TimerHandle | None = None
+        self._send_ns: int | None = None
+        self._states: Handle | None = None
+        self._key = topics.STATE.key(service.lab.name, rig)
         self.device: Device
 
     def emit(self, event: Event) -> None:
@@ -65,6 +74,25 @@ class _Wire:
             self._timer.cancel()
         delay_ns = deadline_ns - self._edge.service.clock.monotonic_ns()
         self._timer = loop.call_later(max(0, delay_ns) * 1e-9, self._on_deadline)
+
+    def send_at(self, deadline_ns: int) -> None:
+        if self._send_ns is None or deadline_ns < self._send_ns:
+            self._send_ns = deadline_ns
+            self._edge.alarm.call_at(deadline_ns, self._on_send)
+
+    def _on_send(self) -> None:
+        self._send_ns = None
+        self.device.send_due(self._edge.service.clock.monotonic_ns())
+
+    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+        if self._states is not None:
+            self._states.close()
+            self._states = None
+        if arrive is not None:
+            monotonic_ns = self._edge.service.clock.monotonic_ns
+            self._states = self._edge.service.bus.subscribe(
+                self._key, lambda _, payload: arrive(Arrival(payload, monotonic_ns()))
+            )
 
     def _on_deadline(self) -> None:
         self._timer = None
@@ -82,11 +110,11 @@ class Edge:
         self.service = service
         lab = service.lab
         states = service.latest(topics.STATE)
-        settings = DeviceSettings.of(lab.edge)
         self._wires: dict[str, _Wire] = {}
         self._servers: list[RigServer] = []
         for rig in lab.rigs:
             wire = _Wire(self, rig.name)
+            settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
             wire.device = Device(rig.name, settings, service.clock, wire, partial(states.get, rig.name))
             self._wires[rig.name] = wire
             limits = Limits(
@@ -98,18 +126,20 @@ class Edge:
             self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
         service.counters.rigs = len(lab.rigs)
         self._traffic_due_ns = 0
-        self._leases: list[Handle] = []
+        self._answers: list[Handle] = []
+        self.alarm: Alarm
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
         service = self.service
+        self.alarm = Alarm(asyncio.get_running_loop(), service.clock)
         # Sockets listen before the first state is there: whoever connects early is served as soon as it can be done.
         sockets = self._bind()
         self.state_sessions()
         for server in self._servers:
             server.device.begin()
         try:
-            self._answer_leases()
+            self._answer_people()
             await self._first_states()
             for server, listening, policy in sockets:
                 await server.listen(listening, policy)
@@ -144,12 +174,13 @@ class Edge:
         open_sessions = [wire.device.session for wire in self._wires.values() if wire.device.session is not None]
         self.service.log.set_sessions([session.as_message() for session in open_sessions])
 
-    def _answer_leases(self) -> None:
+    def _answer_people(self) -> None:
         loop, bus, lab = asyncio.get_running_loop(), self.service.bus, self.service.lab
         for rig, wire in self._wires.items():
-            # Asked on a thread of the bus, answered on the loop, which alone touches devices.
-            answer = partial(_on_loop, loop, partial(_answer_lease, wire.device))
-            self._leases.append(bus.serve(topics.LEASE.key(lab.name, rig), answer))
+            for topic, answer in ((topics.LEASE, _answer_lease), (topics.IMPAIRMENT, _answer_impairment)):
+                # Asked on a thread of the bus, answered on the loop, which alone touches devices.
+                on_loop = partial(_on_loop, loop, partial(answer, wire.device))
+                self._answers.append(bus.serve(topic.key(lab.name, rig), on_loop))
 
     async def _first_states(self) -> None:
         clock, stopping = self.service.clock, self.service.stopping
@@ -192,8 +223,9 @@ class Edge:
 
     def _close(self) -> None:
         now_ns = self.service.clock.monotonic_ns()
-        for lease in self._leases:
-            lease.close()
+        for answer in self._answers:
+            answer.close()
+        self.alarm.close()
         for server in self._servers:
             server.device.shut("the edge stops")
             server.close("the edge stops")
@@ -209,6 +241,18 @@ def _answer_lease(device: Device, payload: bytes) -> bytes:
     status = device.lease_status()
     status.released = released
     return status.SerializeToString()
+
+
+def _answer_impairment(device: Device, payload: bytes) -> bytes:
+    request = ImpairmentRequest.FromString(payload)
+    if request.set_json:
+        try:
+            device.impaired.set(ImpairmentConfig.model_validate_json(request.set_json))
+        except ValidationError as error:
+            raise InputError("; ".join(mistakes_in(error))) from error
+    elif request.as_lab:
+        device.impaired.set(None)
+    return device.impaired.status().SerializeToString()
 
 
 def _on_loop(loop: asyncio.AbstractEventLoop, answer: Callable[[bytes], bytes], payload: bytes) -> bytes:

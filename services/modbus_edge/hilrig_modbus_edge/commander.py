@@ -2,7 +2,8 @@
 
 Every accepted write goes out at once as one `TorqueCommand` with the next number. What stands is repeated with its
 number, so that the simulation can tell a held torque from a lost edge. One message is used again and again: a write
-sets what changed.
+sets what changed. On an impaired way each command is a copy that leaves in its time, and what stands is the last that
+did; the edge's own word, the watchdog's zero before all, is never held up, and makes void what is still on its way.
 """
 
 from typing import Final
@@ -10,6 +11,7 @@ from typing import Final
 from hilrig_modbus_edge import codec
 from hilrig_modbus_edge.client import NO_BASIS, Client, Served
 from hilrig_modbus_edge.settings import Outlet
+from hilrig_modbus_edge.ways import Fates, Line
 from hilrig_runtime.clock import Clock
 from hilrig_schemas import TorqueCommand
 
@@ -38,6 +40,11 @@ class Commander:
         self._repeat_ns = repeat_ns
         self._repeat_due_ns = clock.monotonic_ns()
         self._message = TorqueCommand(rig=rig, effort=(0.0, 0.0, 0.0, 0.0), safe=True)
+        self._standing = self._message
+        """What was last sent, to be repeated."""
+        self._way: Line[tuple[TorqueCommand, bytes]] | None = None
+        """Commands on an impaired way, each with its torque registers; None: every command leaves at once."""
+        self._standing_torque = bytes(8)
         self._session_told = ""
         # Whose word it is and what it was based on: most writes change neither.
         self._writer: Client | None = None
@@ -75,8 +82,11 @@ class Commander:
         self.zero()
         self._message.resets += 1
 
-    def write(self, client: Client, arrived_ns: int) -> None:
-        """Send what stands as the word of a controller whose write came at `arrived_ns`, monotonic clock."""
+    def write(self, client: Client, arrived_ns: int) -> bool:
+        """Send what stands as the word of a controller whose write came at `arrived_ns`, monotonic clock.
+
+        False: it is lost on an impaired way.
+        """
         message = self._message
         if client is not self._writer:
             self._writer = client
@@ -94,16 +104,23 @@ class Commander:
                 message.state_injected_ns,
             ) = basis or NO_BASIS
         message.write_arrived_ns = arrived_ns
+        if self._way is not None:
+            return self._set_out(self._way)
         self._send()
+        return True
 
     def say(self) -> None:
         """Send what stands as the edge's own word, which no controller's loop is measured by."""
         message = self._message
+        if self._way is not None:
+            self._recall(self._way)
         message.safe = not self.moves
         for field in _OF_A_WRITE:
             message.ClearField(field)
         self._writer = self._basis = None
         self._send()
+        if self._way is not None:
+            self._standing = _copy(message)
 
     def say_session(self) -> None:
         """Let the simulation know of a session that began with a write that moved nothing."""
@@ -114,15 +131,86 @@ class Commander:
         """Say again what stands, if nothing was said for the time between repetitions; ns, monotonic clock."""
         if now_ns >= self._repeat_due_ns:
             self._repeat_due_ns = now_ns + self._repeat_ns
-            self._outlet.repeat_command(self._message)
+            self._outlet.repeat_command(self._standing)
 
-    def _send(self) -> None:
+    # -- the impaired way
+
+    @property
+    def way(self) -> Line[tuple[TorqueCommand, bytes]] | None:
+        """The way that commands take; None: they leave at once."""
+        return self._way
+
+    def impair(self, fates: Fates | None) -> None:
+        """Have the fates decide when each command leaves; None: at once, as what is on its way does then."""
+        if fates is None:
+            if self._way is not None:
+                newest = self._way.take_newest(self._monotonic_ns())
+                self._way = None
+                if newest is not None:
+                    self._leave(*newest)
+        elif self._way is None:
+            self._way = Line(fates)
+            # The message goes on to hold what is asked for; what stands is what was sent.
+            self._standing = _copy(self._message)
+            self._standing_torque = bytes(self.torque)
+        else:
+            self._way.fates = fates
+
+    def send_due(self, now_ns: int) -> None:
+        """Send what has come to the end of its way; ns, monotonic clock."""
+        way = self._way
+        if way is None:
+            return
+        while (arrived := way.take(now_ns)) is not None:
+            self._leave(*arrived)
+        if way.next_ns is not None:
+            self._outlet.send_at(way.next_ns)
+
+    def _set_out(self, way: Line[tuple[TorqueCommand, bytes]]) -> bool:
         message = self._message
+        self._fill(message)
+        now_ns = self._monotonic_ns()
+        if not way.put((_copy(message), bytes(self.torque)), now_ns):
+            return False
+        self.send_due(now_ns)
+        return True
+
+    def _leave(self, sent: tuple[TorqueCommand, bytes], injected_ns: int) -> None:
+        command, self._standing_torque = sent
+        command.command_injected_ns = injected_ns
+        self._dispatch(command)
+
+    def _recall(self, way: Line[tuple[TorqueCommand, bytes]]) -> None:
+        """Make void what is on its way: what stands is what the simulation was told, or zero."""
+        if way.void():
+            standing, message = self._standing, self._message
+            if self.moves:
+                self.torque[:] = self._standing_torque
+            message.magnet = standing.magnet
+            message.resets = standing.resets
+        self._standing_torque = bytes(self.torque)
+
+    # -- sending
+
+    def _fill(self, message: TorqueCommand) -> None:
         message.effort[:] = codec.effort_of(self.torque)
         message.seq += 1
         self._session_told = message.session
+
+    def _send(self) -> None:
+        self._fill(self._message)
+        self._dispatch(self._message)
+
+    def _dispatch(self, command: TorqueCommand) -> None:
+        self._standing = command
         now_ns = self._monotonic_ns()
-        message.wall_ns = self._wall_ns()
-        message.sent_ns = now_ns
+        command.wall_ns = self._wall_ns()
+        command.sent_ns = now_ns
         self._repeat_due_ns = now_ns + self._repeat_ns
-        self._outlet.send_command(message)
+        self._outlet.send_command(command)
+
+
+def _copy(message: TorqueCommand) -> TorqueCommand:
+    copy = TorqueCommand()
+    copy.CopyFrom(message)
+    return copy

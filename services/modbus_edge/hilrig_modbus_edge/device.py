@@ -16,6 +16,7 @@ from hilrig_modbus_edge.client import Client, Host, address_of
 from hilrig_modbus_edge.commander import Commander
 from hilrig_modbus_edge.errors import ModbusError
 from hilrig_modbus_edge.image import StateImage
+from hilrig_modbus_edge.impaired_loop import ImpairedLoop
 from hilrig_modbus_edge.journal import Journal, times
 from hilrig_modbus_edge.registers import Status, Table
 from hilrig_modbus_edge.session import Session
@@ -46,11 +47,14 @@ class Device:
         self.clients: set[Client] = set()
         self._hosts: dict[str, Host] = {}
         self._monotonic_ns = clock.monotonic_ns
-        self._newest_state = newest_state
         self._state = StateImage()
         self._journal = Journal(rig, outlet)
         self._commander = Commander(rig, clock, outlet, settings.repeat_ns)
-        self._tenure = Tenure(rig, settings, clock, outlet, self._commander, self._journal, letters)
+        self.impaired = ImpairedLoop(
+            rig, settings.impairment, clock, outlet, self._commander, self._journal, newest_state
+        )
+        begin_session = self.impaired.begin_session
+        self._tenure = Tenure(rig, settings, clock, outlet, self._commander, self._journal, letters, begin_session)
         self.lease = self._tenure.lease
         self.watchdog = self._tenure.watchdog
 
@@ -162,9 +166,11 @@ class Device:
         """
         end = address + len(words) // 2
         if end <= registers.POSITION:
+            fed_ns = self.watchdog.fed_ns
             self._tenure.accept(client, arrived_ns)
             self._commander.torque[2 * address : 2 * end] = words
-            self._commander.write(client, arrived_ns)
+            if not self._commander.write(client, arrived_ns):
+                self._tenure.lost(fed_ns)
             return
         self.check_writable(address, len(words) // 2)
         timeout_ns = self.watchdog.timeout_ns
@@ -185,6 +191,7 @@ class Device:
         """
         if address not in (registers.MAGNET, registers.RESET):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
+        fed_ns = self.watchdog.fed_ns
         self._tenure.accept(client, arrived_ns)
         if address == registers.MAGNET:
             self._commander.magnet = on
@@ -193,7 +200,8 @@ class Device:
         else:
             self._commander.say_session()
             return
-        self._commander.write(client, arrived_ns)
+        if not self._commander.write(client, arrived_ns):
+            self._tenure.lost(fed_ns)
 
     # -- time
 
@@ -201,10 +209,16 @@ class Device:
         """Do what has become due: trip, lose the lease, end the session, repeat the command; ns, monotonic clock."""
         self._tenure.check(now_ns)
         self._commander.repeat_if_due(now_ns)
+        self.impaired.check(now_ns)
+
+    def send_due(self, now_ns: int) -> None:
+        """Send the commands that have come to the end of an impaired way; ns, monotonic clock."""
+        self._commander.send_due(now_ns)
 
     def begin(self) -> None:
-        """Say the first word: no torque."""
+        """Say the first word: no torque; and impair the loop, where the lab says so."""
         self._commander.say()
+        self.impaired.begin()
 
     def shut(self, reason: str) -> None:
         """The edge stops: no torque, no lease, no session."""
@@ -234,7 +248,7 @@ class Device:
     # -- inside
 
     def _look(self) -> StateImage:
-        arrival = self._newest_state()
+        arrival = self.impaired.newest_state()
         state = self._state
         if arrival is not state.arrival and arrival is not None:
             state.take(arrival)
@@ -246,7 +260,7 @@ class Device:
         if state.arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
         # Stamped after the look at the bus: a state is never shown before it came.
-        client.shown((state.incarnation, state.step, state.arrived_ns, self._monotonic_ns(), 0))
+        client.shown((state.incarnation, state.step, state.arrived_ns, self._monotonic_ns(), state.injected_ns))
         return state
 
     def _input_image(self, client: Client) -> bytes:

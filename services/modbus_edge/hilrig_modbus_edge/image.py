@@ -26,6 +26,8 @@ class StateImage:
         self.arrival: Arrival | None = None
         """What it was made from; None: no state has come yet, and all else is zero."""
         self.arrived_ns = 0
+        self.injected_ns = 0
+        """Delay added on purpose since it arrived, ns."""
         self.incarnation = 0
         self.step = 0
         self.position_words = bytes(8)
@@ -45,6 +47,7 @@ class StateImage:
         self.arrival = arrival
         self._message = message
         self.arrived_ns = arrival.arrived_ns
+        self.injected_ns = arrival.injected_ns
         self.incarnation = message.incarnation
         self.step = message.step
         self.position_words, self._saturated = codec.words_of_position(message.position)

@@ -1,9 +1,12 @@
 """What a lab says of its devices, and where a device's words go."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from hilrig_runtime.config import EdgeConfig
+from hilrig_runtime.impairment_config import ImpairmentConfig
+from hilrig_runtime.service import Arrival
 from hilrig_schemas import Event, TorqueCommand
 
 MS: Final = 1_000_000
@@ -28,6 +31,12 @@ class Outlet(Protocol):
     def watch(self, deadline_ns: int) -> None:
         """The watchdog began to watch: `check` must be called at the deadline."""
 
+    def send_at(self, deadline_ns: int) -> None:
+        """A command is on an impaired way: `send_due` must be called at the deadline, and not much later."""
+
+    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+        """Call `arrive` with every state that comes, on any thread; None: no more."""
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
@@ -39,9 +48,10 @@ class DeviceSettings:
     lease_ns: int = 5_000 * MS
     grace_ns: int = 5_000 * MS
     repeat_ns: int = 200 * MS
+    impairment: ImpairmentConfig = field(default_factory=ImpairmentConfig)
 
     @classmethod
-    def of(cls, edge: EdgeConfig) -> "DeviceSettings":
+    def of(cls, edge: EdgeConfig, impairment: ImpairmentConfig) -> "DeviceSettings":
         """As configured."""
         return cls(
             watchdog_ns=round(edge.watchdog_ms * MS),
@@ -50,4 +60,5 @@ class DeviceSettings:
             lease_ns=round(edge.lease_timeout_ms * MS),
             grace_ns=round(edge.session_grace_ms * MS),
             repeat_ns=round(edge.repeat_ms * MS),
+            impairment=impairment,
         )

@@ -5,6 +5,7 @@ A session begins with a lease and outlives it by a grace time. Pure: time is pas
 """
 
 import random
+from collections.abc import Callable
 from typing import Final
 
 from pymodbus.constants import ExcCodes
@@ -37,6 +38,7 @@ class Tenure:
         commander: Commander,
         journal: Journal,
         letters: random.Random | None = None,
+        begin_session: Callable[[], None] = lambda: None,
     ) -> None:
         self.lease: Lease[Client] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
@@ -52,6 +54,7 @@ class Tenure:
         self._throttle = Throttle(REFUSAL_PERIOD_NS)
         self._session_count = 0
         self._last_writer = ""
+        self._begin_session = begin_session
 
     def accept(self, client: Client, now_ns: int) -> None:
         """Accept a write that is right otherwise; ns, monotonic clock.
@@ -71,6 +74,14 @@ class Tenure:
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._journal.tell(event)
         self._watch()
+
+    def lost(self, fed_ns: int | None) -> None:
+        """The write that was just accepted is lost on an impaired way: it was no word to the watchdog.
+
+        `fed_ns` is when the watchdog was fed before; None: it did not watch, and watches from this write on.
+        """
+        if fed_ns is not None:
+            self.watchdog.fed_ns = fed_ns
 
     def check_timeout(self, timeout_ns: int) -> None:
         """Nothing, if a controller may set the watchdog's time-out so.
@@ -190,6 +201,7 @@ class Tenure:
         event.session_data.reason = "a controller took the rig"
         self._journal.tell(event)
         self._outlet.sessions_changed()
+        self._begin_session()
 
     def _end_session(self, reason: str) -> None:
         session, self.session = self.session, None
