@@ -49,6 +49,34 @@ port = 6007
 name = "teacher"
 allow = ["192.168.7.2/32"]
 ```
+
+A task, by which `hilrig report` grades the lab's runs ([review.md](review.md) says how): two poses, then a triangle,
+and two parts in the tray, all within a minute. Any one of the three kinds is a task too.
+
+```toml
+[task]
+title = "Poses, a path, two parts"
+time_limit_s = 60
+
+[[task.poses]]
+name = "left"
+position_mm = [350, 200, 25]
+tolerance_mm = 2
+hold_s = 0.5
+
+[[task.poses]]
+name = "right"
+position_mm = [350, -200, 25]
+yaw_deg = 90
+
+[task.path]
+points_mm = [[300, 100, 25], [400, 100, 25], [350, 0, 25], [300, 100, 25]]
+tolerance_mm = 5
+
+[task.place]
+parts = ["red", "blue"]
+tolerance_mm = 2
+```
 """
 
 

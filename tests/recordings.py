@@ -276,6 +276,7 @@ def write(
     configured: bool = True,
     missing: Mapping[str, Collection[int]] = MappingProxyType({}),
     arrival_lag_ns: int = 0,
+    lab_toml: str = "",
 ) -> Path:
     """Write messages as the recorder does.
 
@@ -310,6 +311,8 @@ def write(
         if configured:
             writer.add_metadata("hilrig.config", configuration)
             writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
+        if lab_toml:
+            writer.add_attachment(0, START_WALL_NS, "lab.toml", "application/toml", lab_toml.encode())
         sequences = dict.fromkeys(RECORDED, 0)
         for number, one in enumerate(made):
             sequences[one.topic] += 1

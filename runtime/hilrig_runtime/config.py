@@ -17,6 +17,7 @@ from hilrig_runtime.errors import InputError
 from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import Name, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
 MOST_RIGS = 10_000
@@ -210,6 +211,8 @@ class LabConfig(Section):
     recorder: RecorderConfig = RecorderConfig()
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
+    task: TaskConfig | None = None
+    """What its runs are graded by."""
     impairment: ImpairmentConfig = ImpairmentConfig()
     rigs: Annotated[tuple[RigSettings, ...], BeforeValidator(_listed), Field(min_length=1)] = (RigSettings(),)
     _source: str = PrivateAttr("")

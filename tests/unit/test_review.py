@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilrig_replay.compare import compare, save_comparison_plot
-from hilrig_replay.report import report_html
+from hilrig_replay.report import report
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import tips
 from hilrig_replay.summary import COURSE_POINTS, summarise
@@ -147,7 +147,7 @@ class _Page(HTMLParser):
 
 
 def test_a_report_is_one_page_that_needs_no_other(tmp_path: Path) -> None:
-    text = report_html([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0))])
+    text = report([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0)).path]).html
     page = _Page(text)
     assert page.open == []
     assert len(page.sources) == 2
@@ -168,13 +168,13 @@ def test_a_class_is_ranked_with_each_run_below(tmp_path: Path) -> None:
                 if part.name == "red":
                     part.x, part.y, part.z = spot[0] + 0.001, spot[1], spot[2] + PARAMETERS.scene.parts[0].size[2] / 2
     runs = [named(tmp_path, "nothing", script), named(tmp_path, "one-part", script, placed)]
-    page = _Page(report_html(runs))
+    page = _Page(report([run.path for run in runs]).html)
     assert page.text.index("one-part") < page.text.index("nothing")
     assert "1 of 4" in page.text
     assert "1.00" in page.text
 
 
 def test_what_a_recording_says_is_text_and_never_markup(tmp_path: Path) -> None:
-    text = report_html([named(tmp_path, "a<b>&c", Script(seconds=1.0))])
+    text = report([named(tmp_path, "a<b>&c", Script(seconds=1.0)).path]).html
     assert "a&lt;b&gt;&amp;c" in text
     assert "<b>&c" not in text

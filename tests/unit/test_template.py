@@ -35,7 +35,8 @@ def test_the_page_is_fresh_and_its_examples_are_labs() -> None:
     text = (DOCS / "configuration.md").read_text()
     assert text == runpy.run_path(str(DOCS / "make_configuration.py"))["page"](), "run `make gen` and commit the result"
     examples = [block.partition("```")[0] for block in text.split("```toml\n")[1:]]
-    assert len(examples) == 3
+    assert len(examples) == 4
     assert [rig.name for rig in parse_lab(examples[1]).rigs] == ["left", "right"]
     assert len(parse_lab(examples[2]).rigs) == 65
+    assert len(parse_lab(examples[3]).task.poses) == 2
     assert tomllib.loads(examples[0])

@@ -19,6 +19,7 @@ from hilrig_replay.timebase import Timebase
 from hilrig_runtime.bus import Bus
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, parse_rig_key
 
 VIEWER_PERIOD_S: Final = 0.04
@@ -45,6 +46,7 @@ class Follower:
         stream: rr.RecordingStream,
         clock: Clock,
         say: Callable[[str], None],
+        task: TaskConfig | None = None,
     ) -> None:
         self._bus = bus
         self._lab = lab
@@ -52,6 +54,7 @@ class Follower:
         self._stream = stream
         self._clock = clock
         self._say = say
+        self._task = task
         self._waiting: deque[tuple[str, bytes, int]] = deque(maxlen=_WAITING)
         self._names, self._timebase = Names(), Timebase()
         self._decoder = Decoder(self._names, self._timebase)
@@ -125,7 +128,7 @@ class Follower:
         for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_ASK_S):
             if answer.payload and not answer.error:
                 config = CONFIG.decode(answer.payload)
-                return Drawn.of(config.urdf, config.parameters_json, config.step_ns)
+                return Drawn.of(config.urdf, config.parameters_json, config.step_ns, self._task)
         return None
 
     def close(self) -> None:

@@ -11,14 +11,16 @@ from matplotlib.patches import Circle
 from hilrig_replay.palette import EFFORT_SYMBOLS, INK, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
 from hilrig_replay.scene import reach_outline
 from hilrig_replay.summary import Course, RunSummary
+from hilrig_runtime.task_config import TaskConfig
 from hilrig_sim.model import RigParameters
 
+TASK_COLOR: Final = "#2e9e57"
 SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
 """From rad and m to degrees and mm."""
 
 
-def motion_figure(course: Course, parameters: RigParameters) -> Figure:
-    """One run: positions, efforts, and the tool's way with trays and the reachable area."""
+def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
+    """One run: positions, efforts, and the tool's way with trays, targets and the reachable area."""
     figure = Figure(figsize=(11, 5), layout="constrained", dpi=110)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     position, effort = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
@@ -32,7 +34,7 @@ def motion_figure(course: Course, parameters: RigParameters) -> Figure:
         axes.legend(fontsize=7, ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False, borderaxespad=0.2)
         axes.margins(x=0.01)
     top = figure.add_subplot(grid[:, 1])
-    _from_above(top, parameters)
+    _from_above(top, parameters, task)
     top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
     label(top, "The tool's way from above, mm", "x", "y")
     return figure
@@ -66,12 +68,19 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
     return figure
 
 
-def _from_above(axes: Axes, parameters: RigParameters) -> None:
+def _from_above(axes: Axes, parameters: RigParameters, task: TaskConfig | None) -> None:
     for line in reach_outline(parameters.arm, 0.0):
         axes.plot(line[:, 0] * 1e3, line[:, 1] * 1e3, color="#c5ced8", linewidth=0.8)
     for tray in parameters.scene.trays:
         for x, y, _ in tray.places:
             axes.add_patch(Circle((x * 1e3, y * 1e3), 18.0, fill=False, edgecolor="#8a96a3", linewidth=0.8))
+    if task is not None and task.path is not None:
+        path = np.array(task.path.points_mm)
+        axes.plot(path[:, 0], path[:, 1], color=TASK_COLOR, linewidth=3.0, alpha=0.45)
+    for pose in () if task is None else task.poses:
+        x, y, _ = pose.position_mm
+        axes.plot([x], [y], marker="+", markersize=11, markeredgewidth=2, color=TASK_COLOR)
+        axes.annotate(pose.name, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, color=TASK_COLOR)
     axes.set_aspect("equal", adjustable="datalim")
 
 

@@ -26,6 +26,8 @@ EFFORT_SYMBOLS: Final = ("τ1", "τ2", "τ3", "τ4")
 RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#72b7b2", "#eeca3b")
 """Of runs that are compared, and of controllers."""
 SEVERITY_COLORS: Final = {"INFO": "#9aa5b1", "WARNING": "#f2b134", "ERROR": "#e45756"}
+EVENT_COLORS: Final = {"PART_PICKED": "#6fd08c", "PART_DROPPED": "#eeca3b", "LIMIT_HIT": "#b279a2"}
+"""Of events that are marked in plots; all others have the colour of their severity."""
 
 
 def rgb(color: str) -> tuple[int, int, int]:

@@ -1,22 +1,27 @@
 """A run, or a class of runs, as one HTML file that needs nothing else: no network, no script, no other file."""
 
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 
+from hilrig_replay.assignment import task_of
+from hilrig_replay.distribution_plot import distribution_figure
 from hilrig_replay.latency import Statistics
 from hilrig_replay.latency_plot import latency_figure
 from hilrig_replay.motion_plot import motion_figure
-from hilrig_replay.palette import EFFORT_SYMBOLS, RUN_COLORS, STAGE_NAMES
-from hilrig_replay.run import Run
+from hilrig_replay.palette import EFFORT_SYMBOLS, STAGE_NAMES
+from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import parameters_of
 from hilrig_replay.summary import RunSummary, summarise
 from hilrig_replay.verify import Verification, verify
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.task_config import TaskConfig
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 _GRAVE: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
@@ -34,7 +39,8 @@ section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8
 .facts span { color: #5d6771; font-size: .85rem; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } thead th { color: #5d6771; font-weight: 600; }
+th:first-child, td:first-child, td.text { text-align: left; }
+td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600; }
 img { max-width: 100%; height: auto; display: block; } li { margin: .25rem 0; }
 .good { color: #1a7f37; } .bad { color: #b35900; } summary { cursor: pointer; font-weight: 600; }
 @media print { body { max-width: none; } section, details { break-inside: avoid; } }
@@ -48,28 +54,57 @@ class _Page:
     verified: Verification | None
 
 
-def report_html(runs: Sequence[Run], *, verified: bool = False) -> str:
-    """The report of one run, or of several with an overview that ranks them.
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One page, and what stands in it."""
+
+    html: str
+    runs: tuple[dict[str, Any], ...]
+    """Each run as plain values for JSON, the best first."""
+    left_out: tuple[str, ...]
+    """Why a recording is not in it, one sentence each."""
+
+
+def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | None = None) -> Report:
+    """The report of one run, or of several with an overview that ranks them; those that can't be read are named in it.
 
     Args:
-        runs: what is reported.
+        paths: recordings.
         verified: re-simulate each run too, and say whether it came out the same.
+        task: what the runs are graded by; None: each by what its own lab said.
 
     Raises:
-        InputError: a run has no commands, is damaged, or is not understood.
+        InputError: there is one only, or none that can be read: it has no commands, is damaged, or is not understood.
     """
-    pages = [_page(run, verified) for run in runs]
-    if len(pages) == 1:
+    pages: list[_Page] = []
+    left_out: list[str] = []
+    for path in paths:
+        try:
+            pages.append(_page(open_run(path), verified, task))
+        except InputError as error:
+            if len(paths) == 1:
+                raise
+            left_out.append(str(error))
+    if not pages:
+        raise InputError("no run can be reported:\n" + "\n".join(left_out))
+    pages.sort(key=_rank)
+    verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
+    plain = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
+    return Report(_html(pages, left_out), plain, tuple(left_out))
+
+
+def _html(pages: Sequence[_Page], left_out: Sequence[str]) -> str:
+    if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
         body = f"<h1>{escape(title)}</h1>{_run(pages[0])}"
     else:
-        title = f"{len(pages)} runs"
-        ranked = sorted(pages, key=_rank)
+        title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
-            f"<details><summary>{escape(page.summary.session)}</summary>{_run(page)}</details>" for page in ranked
+            f"<details><summary>{number}. {escape(page.summary.session)}</summary>{_run(page)}</details>"
+            for number, page in enumerate(pages, start=1)
         )
-        body = f"<h1>{title}</h1>{_overview(ranked)}{details}"
+        body = f"<h1>{title}</h1>{_overview(pages)}{_left_out(left_out)}{details}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -77,10 +112,11 @@ def report_html(runs: Sequence[Run], *, verified: bool = False) -> str:
     )
 
 
-def _page(run: Run, verified: bool) -> _Page:
-    summary = summarise(run)
+def _page(run: Run, verified: bool, task: TaskConfig | None) -> _Page:
+    summary = summarise(run, task)
     parameters = parameters_of(run.parameters_json)
-    pictures = [_picture(motion_figure(summary.course, parameters), "positions, efforts and the tool's way")]
+    targets = task or task_of(run)
+    pictures = [_picture(motion_figure(summary.course, parameters, targets), "positions, efforts and the tool's way")]
     if summary.latency.loop_ms is not None:
         pictures.append(_picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
     return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
@@ -93,6 +129,7 @@ def _run(page: _Page) -> str:
     return (
         f'<p class="quiet">{escape(about)}</p>'
         f"<section>{_facts(page)}</section>"
+        f"{_task(summary)}"
         f"<section><h2>Motion</h2>{page.pictures[0]}{_efforts(summary)}</section>"
         f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.pictures[1:])}</section>"
         f"<section><h2>Events</h2>{_events(summary)}</section>"
@@ -102,6 +139,8 @@ def _run(page: _Page) -> str:
 def _facts(page: _Page) -> str:
     summary = page.summary
     facts = [(f"{summary.duration_s:.1f} s", f"length; it ended: {summary.ended or 'not said'}")]
+    if summary.grade is not None:
+        facts.append((f"{summary.grade.score:.0%}", f"task: {summary.grade.headline()}"))
     if summary.task is not None:
         error = summary.task.largest_error_mm
         within = "none placed" if error is None else f"within {error:.1f} mm"
@@ -117,6 +156,24 @@ def _facts(page: _Page) -> str:
         facts.append(("verified" if page.verified.same else "diverges", page.verified.sentence()))
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in facts)
     return f'<div class="facts">{cells}</div>'
+
+
+def _task(summary: RunSummary) -> str:
+    grade = summary.grade
+    if grade is None:
+        return ""
+    rows = "".join(
+        f'<tr><td>{escape(goal)}</td><td class="{"good" if reached else "bad"}">{"yes" if reached else "no"}</td>'
+        f'<td class="text">{escape(said)}</td></tr>'
+        for goal, reached, said in grade.lines()
+    )
+    head = "<thead><tr><th>goal</th><th>reached</th><th></th></tr></thead>"
+    title = f"Task: {escape(grade.title)}" if grade.title else "Task"
+    verdict = f'<p class="{"good" if grade.passed else "bad"}">{escape(grade.headline())}.</p>'
+    return (
+        f"<section><h2>{title}</h2>{verdict}"
+        f'<div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div></section>'
+    )
 
 
 def _efforts(summary: RunSummary) -> str:
@@ -151,63 +208,60 @@ def _events(summary: RunSummary) -> str:
 
 
 def _overview(pages: Sequence[_Page]) -> str:
-    header = [
-        "run",
-        "parts placed",
-        "placing error, mm",
-        "loop p50, ms",
-        "p99, ms",
-        "way, m",
-        "work, J",
-        "alarms",
-        "fit",
-    ]
+    graded = any(page.summary.grade is not None for page in pages)
+    header = ["run", *(("goals", "done, s", "error, mm") if graded else ("parts placed", "placing error, mm"))]
+    header += ["loop p50, ms", "p99, ms", "way, m", "work, J", "saturated", "alarms", "fit"]
     rows = []
-    for page in pages:
+    for number, page in enumerate(pages, start=1):
         summary, loop = page.summary, page.summary.latency.loop_ms
-        task = summary.task
-        error = None if task is None else task.largest_error_mm
         rows.append(
             [
-                summary.session,
-                "–" if task is None else f"{task.placed} of {len(task.parts)}",
-                "–" if error is None else f"{error:.2f}",
-                "–" if loop is None else f"{loop.p50:.2f}",
-                "–" if loop is None else f"{loop.p99:.2f}",
+                f"{number}. {summary.session}",
+                *(_graded(summary) if graded else _placed(summary)),
+                _or_dash(None if loop is None else loop.p50),
+                _or_dash(None if loop is None else loop.p99),
                 f"{summary.motion.tool_path_m:.2f}",
                 f"{summary.motion.work_j:.1f}",
+                f"{max(summary.motion.saturated_share):.1%}",
                 str(sum(summary.events.get(kind, 0) for kind in _GRAVE)),
                 "yes" if summary.latency.fit else "no",
             ]
         )
-    note = '<p class="quiet">Ranked by parts placed, then by placing error, then by the way of the tool.</p>'
-    return f"<section>{_table(header, rows)}{note}{_distributions(pages)}</section>"
+    by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
+    note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
+    distributions = _picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
+    return f"<section>{_table(header, rows)}{note}{distributions}</section>"
 
 
-def _distributions(pages: Sequence[_Page]) -> str:
-    """Loop latencies of all runs side by side."""
-    measured = [page.summary for page in pages if page.summary.latency.samples]
-    if not measured:
-        return ""
-    figure = Figure(figsize=(11, 1.2 + 0.28 * len(measured)), layout="constrained", dpi=110)
-    axes = figure.subplots()
-    values = [summary.latency.table["loop"] / 1e6 for summary in reversed(measured)]
-    names = [summary.session for summary in reversed(measured)]
-    boxes = axes.boxplot(values, orientation="horizontal", whis=(1, 99), showfliers=False, patch_artist=True)
-    for box in boxes["boxes"]:
-        box.set(facecolor=RUN_COLORS[0], alpha=0.6)
-    axes.set_yticks(range(1, len(names) + 1), names, fontsize=7)
-    axes.set_xlabel("loop latency, ms (box: quartiles, whiskers: p1 and p99)", fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    return _picture(figure, "loop latencies of all runs")
+def _left_out(reasons: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(reason)}</li>" for reason in reasons)
+    return f'<section><h2>Left out</h2><ul class="bad">{items}</ul></section>' if items else ""
 
 
-def _rank(page: _Page) -> tuple[float, float, float]:
-    task = page.summary.task
+def _graded(summary: RunSummary) -> list[str]:
+    grade = summary.grade
+    if grade is None:
+        return ["–"] * 3
+    return [f"{grade.score:.0%}", _or_dash(grade.done_s, 1), _or_dash(grade.error_mm)]
+
+
+def _placed(summary: RunSummary) -> list[str]:
+    task = summary.task
+    return ["–"] * 2 if task is None else [f"{task.placed} of {len(task.parts)}", _or_dash(task.largest_error_mm)]
+
+
+def _or_dash(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _rank(page: _Page) -> tuple[float, ...]:
+    task, grade, way = page.summary.task, page.summary.grade, page.summary.motion.tool_path_m
+    if grade is not None:
+        return (*grade.rank, way)
     if task is None:
-        return (0.0, 0.0, page.summary.motion.tool_path_m)
+        return (0.0, 0.0, 0.0, way)
     error = task.largest_error_mm
-    return (-task.placed, float("inf") if error is None else error, page.summary.motion.tool_path_m)
+    return (-task.placed, 0.0, float("inf") if error is None else error, way)
 
 
 def _figures(statistics: Statistics) -> list[str]:

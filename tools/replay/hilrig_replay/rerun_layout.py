@@ -42,7 +42,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         overrides={_path(root, "scene/trail"): [rrb.VisibleTimeRanges(trail)] for root in roots},
     )
 
-    def plot(name: str, path: str, *, legend: bool = True) -> rrb.TimeSeriesView:
+    def plot(name: str, *paths: str, legend: bool = True) -> rrb.TimeSeriesView:
         window = rrb.VisibleTimeRange(
             SIM_TIME,
             start=rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S),
@@ -51,7 +51,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         return rrb.TimeSeriesView(
             name=name,
             origin="/",
-            contents=[f"+ {_path(root, path)}/**" for root in roots],
+            contents=[f"+ {_path(root, path)}/**" for root in roots for path in paths],
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
             axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
             time_ranges=[window] if live else None,
@@ -75,10 +75,12 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
     )
     lateness = plot("Tick lateness, ms", "lateness", legend=False)
     curves = rrb.Vertical(
-        plot("Positions: θ in °, d3 in mm", "position"),
+        plot("Positions: θ in °, d3 in mm; events as marks", "position", "marks"),
         plot("Velocities: θ in °/s, d3 in mm/s", "velocity", legend=False),
         plot("Efforts: τ1 τ2 τ4 in N·m, τ3 in N (thin: commanded)", "effort", legend=False),
-        plot("Loop latency, made of its stages, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
+        plot("Loop latency, made of its stages, ms", "stages", "marks")
+        if len(roots) == 1
+        else plot("Loop latency, ms", "loop"),
         # What controllers ask is on the record alone, not on the bus.
         lateness if live else rrb.Tabs(lateness, plot("Modbus requests per second", "modbus")),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import rerun as rr
 
+from hilrig_replay.assignment import task_of
 from hilrig_replay.palette import RUN_COLORS
 from hilrig_replay.rerun_layout import layout
 from hilrig_replay.rig_view import Drawn, RigView
@@ -20,7 +21,7 @@ def drawn(run: Run) -> Drawn:
         InputError: it says something that is not understood.
     """
     try:
-        return Drawn.of(run.urdf, run.parameters_json, run.step_ns)
+        return Drawn.of(run.urdf, run.parameters_json, run.step_ns, task_of(run))
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
 

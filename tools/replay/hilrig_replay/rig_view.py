@@ -22,6 +22,7 @@ from hilrig_replay.fitness import behind_ns
 from hilrig_replay.latency import STAGES, Matcher, join_commands
 from hilrig_replay.palette import (
     EFFORT_SYMBOLS,
+    EVENT_COLORS,
     JOINT_COLORS,
     JOINT_SYMBOLS,
     PALE_JOINT_COLORS,
@@ -35,6 +36,7 @@ from hilrig_replay.records import Records
 from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL, arm_path
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_replay.timebase import Timebase
+from hilrig_runtime.task_config import TaskConfig
 from hilrig_sim.model import PartParameters, RigParameters
 from hilrig_sim.urdf import urdf
 
@@ -48,8 +50,13 @@ _BASELINE_COLOR: Final = "#5b6570"
 _SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
 """From rad and m to degrees and mm."""
 _REACH_COLOR: Final = "#3f6f8f"
+_TASK_COLOR: Final = "#6fd08c"
+_SMALLEST_TARGET: Final = 0.004
+"""A pose's target is drawn as large as its tolerance, but no smaller than this, m."""
+_YAW_ARROW: Final = 0.04
 _PART_COLOR: Final = "#c8ccd0"
 _PART_SIZE: Final = (0.03, 0.03, 0.03)
+_OTHER_EVENT: Final = "#9aa5b1"
 _KIND_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
 
 
@@ -60,16 +67,17 @@ class Drawn:
     arm: ArmPicture
     parameters: RigParameters
     step_ns: int
+    task: TaskConfig | None = None
 
     @classmethod
-    def of(cls, urdf_text: str, parameters_json: str, step_ns: int) -> "Drawn":
+    def of(cls, urdf_text: str, parameters_json: str, step_ns: int, task: TaskConfig | None = None) -> "Drawn":
         """What a recording or a running simulation says of its rig; what it does not say is as by default.
 
         Raises:
             InputError: it says something that is not understood.
         """
         parameters = parameters_of(parameters_json)
-        return cls(read_arm(urdf_text or urdf(parameters)), parameters, step_ns)
+        return cls(read_arm(urdf_text or urdf(parameters)), parameters, step_ns, task)
 
 
 class RigView:
@@ -98,13 +106,14 @@ class RigView:
         self._clients: set[str] = set()
         self._last_tip: NDArray[np.float64] | None = None
         self._placed: set[str] = set()
+        self._marked: set[str] = set()
         self._write_scene()
         self._write_legends()
 
     def draw(self, drawn: Drawn) -> None:
         """Draw the rig anew where it has become another one."""
         before, self._drawn = self._drawn, drawn
-        if (drawn.arm.urdf, drawn.parameters) != (before.arm.urdf, before.parameters):
+        if (drawn.arm.urdf, drawn.parameters, drawn.task) != (before.arm.urdf, before.parameters, before.task):
             self._write_scene()
 
     # -- what does not change ---------------------------------------------------------------------------------------
@@ -119,6 +128,22 @@ class RigView:
         trail = rgb(self._color or _TRAIL_COLOR)
         self._static("scene/trail", rr.LineStrips3D.from_fields(colors=[trail], radii=[0.002]))
         self._static("scene/reach", rr.LineStrips3D(outline, colors=[rgb(_REACH_COLOR)], radii=[0.0012]))
+        if self._drawn.task is not None:
+            self._write_task(self._drawn.task)
+
+    def _write_task(self, task: TaskConfig) -> None:
+        for pose in task.poses:
+            at = [length / 1000 for length in pose.position_mm]
+            path, color = f"scene/task/{pose.name}", rgb(_TASK_COLOR)
+            radius = max(pose.tolerance_mm / 1000, _SMALLEST_TARGET)
+            self._static(path, rr.Points3D([at], radii=[radius], colors=[color], labels=[pose.name]))
+            if pose.yaw_deg is not None:
+                yaw = np.radians(pose.yaw_deg)
+                arrow = [_YAW_ARROW * np.cos(yaw), _YAW_ARROW * np.sin(yaw), 0.0]
+                self._static(f"{path}/yaw", rr.Arrows3D(origins=[at], vectors=[arrow], radii=[0.001], colors=[color]))
+        if task.path is not None:
+            points = np.array(task.path.points_mm) / 1000
+            self._static("scene/task/path", rr.LineStrips3D([points], radii=[0.0015], colors=[rgb(_TASK_COLOR)]))
 
     def _write_arm(self, arm: ArmPicture) -> None:
         path = arm_path(self._root)
@@ -290,8 +315,19 @@ class RigView:
             for kind, text in zip(events["kind"], events["text"], strict=True)
         ]
         levels = ["WARN" if severity == "WARNING" else severity for severity in events["severity"]]
-        colors = [rgb(SEVERITY_COLORS.get(severity, "#9aa5b1")) for severity in events["severity"]]
+        colors = [rgb(SEVERITY_COLORS.get(severity, _OTHER_EVENT)) for severity in events["severity"]]
         self._send("events", self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
+        for kind in np.unique(events["kind"]):
+            mine = events[events["kind"] == kind]
+            if kind not in self._marked:
+                self._marked.add(kind)
+                color = rgb(EVENT_COLORS.get(kind, SEVERITY_COLORS.get(mine["severity"][0], _OTHER_EVENT)))
+                marks = rr.SeriesPoints(
+                    names=[kind.replace("_", " ").lower()], colors=[color], markers=["diamond"], marker_sizes=[6.0]
+                )
+                self._static(f"marks/{kind.lower()}", marks)
+            # On the axis: what an event says stands in the log below.
+            self._scalars(f"marks/{kind.lower()}", self._times(mine), np.zeros((len(mine), 1)))
 
     def _torque_source(self, states: Rows, commands: Rows) -> NDArray[np.object_]:
         """Whose torque acts, for each state: the address of who wrote the command in force."""

@@ -8,12 +8,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hilrig_replay.assignment import task_of
 from hilrig_replay.columns import Rows
+from hilrig_replay.grade import Grade, Grader
 from hilrig_replay.latency import LatencyReport, measure
 from hilrig_replay.records import Records
 from hilrig_replay.run import Run
-from hilrig_replay.scene import parameters_of, tips
+from hilrig_replay.scene import parameters_of
 from hilrig_replay.task import TaskResult, placed_parts
+from hilrig_runtime.task_config import TaskConfig
+from hilrig_sim.kinematics import forward
 from hilrig_sim.model import LARGEST_REGISTER_FORCE, RigParameters
 
 COURSE_POINTS: Final = 4000
@@ -72,6 +76,8 @@ class RunSummary:
     """How often each kind of event happened."""
     task: TaskResult | None
     """Which parts stand in their places at the end; None: there are no places."""
+    grade: Grade | None
+    """None: there was no task."""
     course: Course = field(repr=False, compare=False)
 
     def as_dict(self) -> dict[str, Any]:
@@ -89,16 +95,21 @@ class RunSummary:
             "events": self.events,
             "parts_placed": None if self.task is None else self.task.placed,
             "largest_placing_error_mm": None if self.task is None else self.task.largest_error_mm,
+            "grade": None if self.grade is None else self.grade.as_dict(),
         }
 
 
-def summarise(run: Run) -> RunSummary:
+def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
     """Go through a run once.
 
+    Args:
+        run: the recording.
+        task: what it is graded by; None: what its own lab said.
+
     Raises:
-        InputError: nothing was commanded in it, it is damaged, or its parameters are not understood.
+        InputError: nothing was commanded in it, it is damaged, or its parameters or its task are not understood.
     """
-    collector = _Collector(run, parameters_of(run.parameters_json))
+    collector = _Collector(run, parameters_of(run.parameters_json), task or task_of(run))
     latency = measure(run, collector.add)
     return RunSummary(
         session=run.session,
@@ -112,14 +123,16 @@ def summarise(run: Run) -> RunSummary:
         motion=collector.motion(),
         events=dict(sorted(collector.events.items())),
         task=collector.task(),
+        grade=collector.grade(),
         course=collector.course(),
     )
 
 
 class _Collector:
-    def __init__(self, run: Run, parameters: RigParameters) -> None:
+    def __init__(self, run: Run, parameters: RigParameters, task: TaskConfig | None) -> None:
         self._run = run
         self._parameters = parameters
+        self._grader = None if task is None else Grader(task, parameters)
         self._every = max(1, run.file.counts["state"] // COURSE_POINTS)
         self._pieces: list[tuple[Floats, Rows, Floats]] = []
         self._seen = 0
@@ -133,6 +146,10 @@ class _Collector:
     def add(self, block: Records) -> None:
         self.events.update(block.events["kind"].tolist())
         names = self._run.names
+        if self._grader is not None:
+            dropped = block.events[block.events["kind"] == "PART_DROPPED"]
+            for event, time_s in zip(dropped, self._run.time_s(dropped), strict=True):
+                self._grader.add_drop(event["message"].part_data.part, float(time_s))
         for row in _last_of_each_part(block.parts):
             name = names[int(row["part"])]
             self._poses[name] = SimpleNamespace(name=name, x=float(row["x"]), y=float(row["y"]), z=float(row["z"]))
@@ -141,7 +158,11 @@ class _Collector:
 
     def _add_states(self, states: Rows) -> None:
         self._held = self._run.names[int(states["held_part"][-1])]
-        tip = tips(self._parameters.arm, np.ascontiguousarray(states["position"]))
+        time_s = self._run.time_s(states)
+        pose = np.ascontiguousarray(forward(self._parameters.arm, states["position"].T).T)
+        tip = pose[:, :3]
+        if self._grader is not None:
+            self._grader.add_states(time_s, pose, self._commanded(states))
         way = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
         lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
         step_s = self._run.step_ns / 1e9
@@ -154,13 +175,23 @@ class _Collector:
         first = -self._seen % self._every
         self._pieces.append(
             (
-                self._run.time_s(states)[first :: self._every],
+                time_s[first :: self._every],
                 states[first :: self._every].copy(),
                 tip[first :: self._every],
             )
         )
         self._seen += len(states)
         self._last_tip = tip[-1:]
+
+    def _commanded(self, states: Rows) -> NDArray[np.bool_]:
+        """Where a command of the session acts: what is from before it may belong to the one before."""
+        commanded = states["command_seq"] > 0
+        if self._run.controller:
+            commanded &= states["session"] == self._run.names.code(self._run.session)
+        return np.asarray(commanded)
+
+    def grade(self) -> Grade | None:
+        return None if self._grader is None else self._grader.grade(self.task())
 
     def motion(self) -> Motion:
         return Motion(

@@ -22,6 +22,7 @@ def check(
     from rich.console import Console
     from rich.table import Table
 
+    from hilrig_replay.assignment import check_task
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.template import lab_template
     from hilrig_sim.configured import rig_parameters
@@ -31,7 +32,9 @@ def check(
         return
     lab = load_lab(file)
     for rig in lab.rigs:
-        rig_parameters(lab, rig)
+        parameters = rig_parameters(lab, rig)
+        if lab.task is not None:
+            check_task(lab.task, parameters)
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return

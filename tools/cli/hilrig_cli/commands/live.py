@@ -62,4 +62,4 @@ def live(
         closing.callback(stream.disconnect)
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S
-        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say), over, stopping, period_s)
+        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say, lab.task), over, stopping, period_s)

@@ -1,9 +1,13 @@
-"""`hilrig report`: runs as one page to read, print or hand in."""
+"""`hilrig report`: runs as one page to read, print or hand in, and their grades."""
 
+import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from hilrig_cli.options import AsJson
 
 
 def report(
@@ -15,18 +19,38 @@ def report(
     verify: Annotated[
         bool, typer.Option("--verify", help="Re-simulate each run, and say whether it is the same.")
     ] = False,
+    task: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LAB.TOML",
+            help="Grade by the [task] of this lab's file; without: by the one that was recorded.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Write one HTML page of a run, or of a class of runs, ranked: motion, task, latency, events; no network needed."""
-    from hilrig_replay.report import report_html
-    from hilrig_replay.run import open_run
+    """Write one HTML page of a run, or of a class of runs, ranked: motion, task, latency, events; no network needed.
+
+    Exit code 1: a recording of several could not be read; the page says which, and why.
+    """
+    from hilrig_replay.assignment import read_task
+    from hilrig_replay.report import report as make_report
     from hilrig_replay.selection import recordings
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}")
-    page = report_html([open_run(path) for path in recordings(runs)], verified=verify)
+    graded_by = None if task is None else read_task(task)
+    found = make_report(recordings(runs), verified=verify, task=graded_by)
     try:
-        out.write_text(page, encoding="utf-8")
+        out.write_text(found.html, encoding="utf-8")
     except OSError as error:
         raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
-    print(out)
+    if as_json:
+        print(json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out}))
+    else:
+        print(out)
+        for reason in found.left_out:
+            print(f"left out: {reason}", file=sys.stderr)
+    if found.left_out:
+        raise typer.Exit(1)

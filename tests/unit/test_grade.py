@@ -1,0 +1,266 @@
+"""Grades of motions that are known: a step response, a path with a known distance, parts placed in and out of time."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilrig_replay.assignment import check_task, read_task, task_of
+from hilrig_replay.grade import Grade, Grader
+from hilrig_replay.report import report
+from hilrig_replay.run import open_run
+from hilrig_replay.summary import summarise
+from hilrig_replay.task import PlacedPart, TaskResult
+from hilrig_runtime.config import parse_lab
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.task_config import TaskConfig
+from hilrig_schemas import JointState
+from hilrig_sim.kinematics import inverse
+from recordings import PARAMETERS, Script, make, write
+
+STEP_S = 0.02
+STEP_RESPONSE = {"poses": [{"name": "a", "position_mm": [400, 0, 0], "tolerance_mm": 4, "hold_s": 0.3}]}
+
+
+def graded(
+    task: dict, tip: np.ndarray, *, pieces: int = 1, quiet: int = 0, drops: dict[str, float] | None = None
+) -> Grade:
+    """Grade a way of the tool, m, (n, 3), one state a step; the first `quiet` states are before any command."""
+    grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
+    time_s = STEP_S * np.arange(len(tip))
+    pose = np.column_stack((tip, np.zeros(len(tip))))
+    commanded = np.arange(len(tip)) >= quiet
+    for rows in np.array_split(np.arange(len(tip)), pieces):
+        grader.add_states(time_s[rows], pose[rows], commanded[rows])
+    for part, at_s in (drops or {}).items():
+        grader.add_drop(part, at_s)
+    stood = TaskResult((PlacedPart("red", 0, 0.5), PlacedPart("blue", 1, 3.0), PlacedPart("green", None, None)))
+    return grader.grade(stood)
+
+
+def second_order(damping: float, rate: float, seconds: float, goal: float = 0.4, start: float = 0.2) -> np.ndarray:
+    """Step response along x from `start` to `goal`, m: the textbook's."""
+    t = np.arange(0, seconds, STEP_S)
+    damped = rate * math.sqrt(1 - damping**2)
+    wave = np.cos(damped * t) + damping / math.sqrt(1 - damping**2) * np.sin(damped * t)
+    x = goal + (start - goal) * np.exp(-damping * rate * t) * wave
+    return np.column_stack((x, np.zeros_like(x), np.zeros_like(x)))
+
+
+@pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
+def test_overshoot_and_settling_time_are_the_textbooks(damping: float) -> None:
+    rate = 5.0
+    (pose,) = graded(STEP_RESPONSE, second_order(damping, rate, 8.0)).poses
+    overshoot = math.exp(-math.pi * damping / math.sqrt(1 - damping**2))
+    assert pose.overshoot_share == pytest.approx(overshoot, abs=0.01)
+    assert pose.overshoot_mm == pytest.approx(200 * overshoot, abs=2)
+    assert pose.settling_s is not None
+    assert pose.reached_s == pytest.approx(pose.settling_s + 0.3, abs=STEP_S + 1e-9)
+    # From then on the response stays within 2 % (4 mm of 200 mm); one step before it did not.
+    apart = np.abs(second_order(damping, rate, 8.0)[:, 0] - 0.4)
+    settled = round(pose.settling_s / STEP_S)
+    assert (apart[settled:] <= 0.004).all()
+    assert apart[settled - 1] > 0.004
+
+
+def test_time_counts_from_the_first_command() -> None:
+    way = np.concatenate((np.tile([0.2, 0, 0], (100, 1)), second_order(0.7, 5.0, 6.0)))
+    late, prompt = graded(STEP_RESPONSE, way, quiet=100), graded(STEP_RESPONSE, second_order(0.7, 5.0, 6.0))
+    assert late.done_s == pytest.approx(prompt.done_s)
+    assert graded(STEP_RESPONSE, way, quiet=len(way)).poses[0].turn_s is None
+
+
+def test_poses_have_their_turns_one_after_the_other() -> None:
+    poses = [
+        {"name": name, "position_mm": [x, 0, 0], "hold_s": 0.2} for name, x in (("a", 300), ("b", 200), ("c", 250))
+    ]
+    way = np.zeros((150, 3))
+    way[:, 0] = np.repeat([0.2, 0.3, 0.2], 50)
+    grade = graded({"poses": poses}, way)
+    assert [pose.reached_s for pose in grade.poses] == [pytest.approx(1.2), pytest.approx(2.2), None]
+    assert grade.score == pytest.approx(2 / 3)
+    assert grade.poses[2].closest_mm == pytest.approx(50)
+    assert not grade.passed
+    assert grade.done_s is None
+
+
+def test_a_yaw_that_is_asked_for_counts_and_turns_are_the_same() -> None:
+    task = {"poses": [{"name": "a", "position_mm": [200, 0, 0], "yaw_deg": 370, "hold_s": 0.1}]}
+    grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
+    pose = np.tile([0.2, 0, 0, math.radians(-180.0)], (50, 1))
+    pose[20:, 3] = math.radians(11.0)
+    grader.add_states(STEP_S * np.arange(50), pose, np.ones(50, np.bool_))
+    (found,) = grader.grade(None).poses
+    assert found.settling_s == pytest.approx(0.4)
+
+
+SQUARE = [[200, 0, 0], [300, 0, 0], [300, 100, 0], [200, 100, 0], [200, 0, 0]]
+
+
+def along(points_mm: list[list[float]], speed: float, aside_mm: float = 0.0) -> np.ndarray:
+    """A way of the tool along a polyline, `aside_mm` above it."""
+    points = np.array(points_mm) / 1000
+    from_start = np.concatenate(([0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    at = np.append(np.arange(0, from_start[-1], speed * STEP_S), from_start[-1])
+    way = np.column_stack([np.interp(at, from_start, column) for column in points.T])
+    return np.asarray(way + np.array([0, 0, aside_mm / 1000]))
+
+
+def test_the_tracking_error_of_a_path_is_the_distance_from_it() -> None:
+    grade = graded({"path": {"points_mm": SQUARE}}, along(SQUARE, 0.1, aside_mm=2.0))
+    assert grade.path is not None
+    assert grade.path.length_m == pytest.approx(0.4)
+    assert (grade.path.covered, grade.passed) == (1.0, True)
+    assert grade.path.rms_mm == grade.path.largest_mm == pytest.approx(2.0)
+    assert grade.path.done_s == pytest.approx(4.0, abs=0.1)
+
+
+def test_a_path_that_is_left_or_cut_short_is_not_followed() -> None:
+    half = along(SQUARE[:3], 0.1)
+    grade = graded({"path": {"points_mm": SQUARE}}, half)
+    assert grade.path is not None
+    assert grade.path.covered == pytest.approx(0.5, abs=0.02)
+    assert (grade.path.done_s, grade.score) == (None, grade.path.covered)
+    # Back to the beginning across the middle: at its last point, but half of it was never passed.
+    across = np.concatenate((half, np.linspace(half[-1], half[0], 20)))
+    assert graded({"path": {"points_mm": SQUARE}}, across).path.done_s is None
+    never = graded({"path": {"points_mm": SQUARE}}, half + np.array([0, 0, 0.05])).path
+    assert (never.began_s, never.rms_mm) == (None, None)
+
+
+def test_a_grade_does_not_depend_on_the_pieces_in_which_a_run_is_read() -> None:
+    task = {
+        "poses": [
+            {"name": "a", "position_mm": [300, 0, 0]},
+            {"name": "b", "position_mm": [200, 0, 0], "tolerance_mm": 5},
+        ],
+        "path": {"points_mm": SQUARE},
+    }
+    noise = np.random.default_rng(5).normal(size=(400, 3)) * 0.001
+    way = np.concatenate((along(SQUARE, 0.05), second_order(0.5, 6.0, 4.0, 0.3), second_order(0.5, 6.0, 4.0, 0.2, 0.3)))
+    way[:400] += noise[:400] * 0.3
+    whole = graded(task, way)
+    assert whole.passed
+    for pieces in (2, 7, 61, len(way)):
+        parts = graded(task, way, pieces=pieces)
+        assert parts.lines() == whole.lines()
+        assert parts.rank == pytest.approx(whole.rank)
+
+
+def test_parts_count_when_they_were_let_go_in_time_and_stand_right() -> None:
+    way, task = np.zeros((10, 3)), {"place": {"parts": ["red", "blue", "green"]}, "time_limit_s": 10}
+    in_time = graded(task, way, drops={"red": 4.0, "blue": 5.0, "green": 6.0})
+    assert [part.placed for part in in_time.parts] == [True, False, False]
+    assert in_time.score == pytest.approx(1 / 3)
+    assert [part.placed for part in graded(task, way, drops={"red": 14.0}).parts] == [False, False, False]
+    only = graded({"place": {"parts": ["red"]}, "time_limit_s": 10}, way, drops={"red": 4.0})
+    assert (only.passed, only.done_s, only.error_mm) == (True, 4.0, 0.5)
+    assert only.headline() == "passed in 4.0 s of 10 s"
+
+
+def test_what_comes_after_the_time_limit_does_not_count() -> None:
+    task = STEP_RESPONSE | {"time_limit_s": 0.5}
+    grade = graded(task, second_order(0.7, 5.0, 6.0))
+    assert (grade.score, grade.headline()) == (0.0, "0% of the goals within 0.5 s")
+
+
+TASK = """
+[task]
+title = "Two corners"
+[[task.poses]]
+name = "a"
+position_mm = [{x}, {y}, {z}]
+tolerance_mm = 300
+[task.place]
+parts = ["red"]
+"""
+
+
+def test_a_recording_is_graded_by_the_task_that_it_carries(tmp_path: Path) -> None:
+    script = Script(seconds=6.0)
+    made = make(script)
+    text = TASK.format(x=400, y=100, z=50)
+    path = write(tmp_path / "run.mcap", made, script=script, lab_toml=text)
+    summary = summarise(open_run(path))
+    assert summary.grade is not None
+    assert summary.grade.poses[0].reached_s is not None
+    assert summary.grade.score == 0.5
+    plain = summary.as_dict()["grade"]
+    assert (plain["title"], plain["parts"][0]["placed"]) == ("Two corners", False)
+    page = report([path]).html
+    assert "Two corners" in page
+    assert "50% of the goals" in page
+    # A teacher's other task, given afterwards.
+    lab = tmp_path / "other.toml"
+    lab.write_text("[[task.poses]]\nname = 'far'\nposition_mm = [-300, 0, 0]\n")
+    other = summarise(open_run(path), read_task(lab)).grade
+    assert other is not None
+    assert other.score == 0.0
+
+
+def test_runs_of_a_class_are_ranked_by_their_grades(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    paths = []
+    for name, x in (("never", -400), ("first", 400)):
+        made = make(script, session=name)
+        for one in made:
+            if isinstance(one.message, JointState) and one.message.command_seq:
+                one.message.position[:] = inverse(PARAMETERS.arm, (x / 1000, 0.1, 0.0, 0.0))[0]
+        text = TASK.format(x=400, y=100, z=0).replace("300", "2")
+        paths.append(write(tmp_path / f"{name}.mcap", made, script=script, session=name, lab_toml=text))
+    found = report(paths)
+    assert [run["session"] for run in found.runs] == ["first", "never"]
+    assert [run["grade"]["score"] for run in found.runs] == [0.5, 0.0]
+    assert found.html.index("1. first") < found.html.index("2. never")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[task]\ntitle = 'x'", "task: a task needs poses, a path or parts to place"),
+        ("[[task.poses]]\nname = 'a'", "task.poses[0].position_mm: expected"),
+        ("[[task.poses]]\nname = 'a'\nposition_mm = [1, 2, 3]\n" * 2, "two poses are called 'a'"),
+        ("[task.path]\npoints_mm = [[1, 2, 3]]", "task.path.points_mm"),
+        ("[task.path]\npoints_mm = [[1, 2, 3], [1, 2, 3]]", "points 1 and 2 of the path are the same"),
+        ("[task.place]\ntolerance_mm = 0", "task.place.tolerance_mm: expected greater than 0, found 0"),
+        ("[task]\nlimit = 3\n[task.place]", "task.limit: unknown key"),
+        ("[[task.poses]]\nname = 'a'\nposition_mm = [900, 0, 0]", "task: pose 'a' can't be reached: "),
+        ("[task.path]\npoints_mm = [[300, 0, 0], [700, 0, 0]]", "point 2 of the path, (700, 0, 0) mm, is out of reach"),
+        ("[task.path]\npoints_mm = [[300, 0, 0], [300, 0, 400]]", "point 2 of the path, (300, 0, 400) mm, is out of"),
+        ("[task.place]\nparts = ['pink']", "no part 'pink' that the magnet holds is in the scene; it has red, blue"),
+    ],
+)
+def test_a_task_that_can_not_be_done_is_named_with_its_place(text: str, says: str) -> None:
+    def check() -> None:
+        task = parse_lab(text).task
+        assert task is not None
+        check_task(task, PARAMETERS)
+
+    with pytest.raises(InputError) as refused:
+        check()
+    assert says in str(refused.value)
+
+
+def test_a_recorded_task_that_is_not_understood_is_said(tmp_path: Path) -> None:
+    script = Script(seconds=1.0)
+    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml="[task]\ncolour = 'red'\n[task.place]\n")
+    with pytest.raises(InputError, match=r"the task in its lab.toml is not understood: colour: unknown key"):
+        task_of(open_run(path))
+
+
+def test_a_run_that_can_not_be_read_does_not_hide_the_others(tmp_path: Path) -> None:
+    script, silent = Script(seconds=1.0), Script(seconds=1.0, controllers=False)
+    good = write(tmp_path / "good.mcap", make(script), script=script)
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(good.read_bytes()[:5000])
+    alone = write(tmp_path / "alone.mcap", make(silent), script=silent)
+    found = report([torn, good, alone])
+    assert len(found.runs) == 1
+    assert [("torn" in reason, "without commands" in reason) for reason in found.left_out] == [
+        (True, False),
+        (False, True),
+    ]
+    assert "Left out" in found.html
+    with pytest.raises(InputError, match="no run can be reported"):
+        report([torn, alone])

@@ -1,0 +1,75 @@
+"""How a class of runs is distributed: a row a run, the best above, and a panel for each thing that is compared."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hilrig_replay.motion_plot import label
+from hilrig_replay.palette import INK, RUN_COLORS
+from hilrig_replay.summary import RunSummary
+
+_NAMED: Final = 60
+"""With more runs than this their names would run into each other."""
+_MEDIAN: Final = "#d62728"
+
+
+def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
+    """Runs in their order: goals or parts, time, work of the drives, loop latency; a dashed line at each median."""
+    rows = np.arange(len(runs))
+    height = 1.3 + max(0.09, min(0.28, 12 / len(runs))) * len(runs)
+    figure = Figure(figsize=(11, height), layout="constrained", dpi=110)
+    goals, times, work, loop = figure.subplots(1, 4, sharey=True, width_ratios=(1, 1, 1, 1.6))
+    if any(run.grade is not None for run in runs):
+        _bars(goals, rows, [None if run.grade is None else 100 * run.grade.score for run in runs])
+        label(goals, "Goals reached, %", "", "")
+        goals.set_xlim(0, 100)
+        _bars(times, rows, [None if run.grade is None else run.grade.done_s for run in runs])
+        label(times, "Done after, s", "", "")
+    else:
+        _bars(goals, rows, [None if run.task is None else float(run.task.placed) for run in runs])
+        label(goals, "Parts placed", "", "")
+        _bars(times, rows, [None if run.task is None else run.task.largest_error_mm for run in runs])
+        label(times, "Placing error, mm", "", "")
+    _bars(work, rows, [run.motion.work_j for run in runs])
+    label(work, "Work of the drives, J", "", "")
+    _boxes(loop, runs)
+    label(loop, "Loop latency, ms (box: quartiles, whiskers: p1, p99)", "", "")
+    names = [run.session for run in runs] if len(runs) <= _NAMED else [str(row + 1) for row in rows]
+    goals.set_yticks(rows, names, fontsize=7, color=INK)
+    goals.set_ylim(len(runs) - 0.4, -0.6)
+    return figure
+
+
+def _bars(axes: Axes, rows: np.ndarray, values: Sequence[float | None]) -> None:
+    known = [value for value in values if value is not None]
+    axes.barh(rows, [0.0 if value is None else value for value in values], height=0.6, color=RUN_COLORS[0], alpha=0.75)
+    if known:
+        axes.axvline(float(np.median(known)), color=_MEDIAN, linewidth=0.8, linestyle=(0, (4, 2)))
+
+
+def _boxes(axes: Axes, runs: Sequence[RunSummary]) -> None:
+    measured = [(row, run.latency.table["loop"] / 1e6) for row, run in enumerate(runs) if run.latency.samples]
+    if not measured:
+        return
+    boxes = axes.boxplot(
+        [values for _, values in measured],
+        positions=[row for row, _ in measured],
+        orientation="horizontal",
+        widths=0.6,
+        whis=(1, 99),
+        showfliers=False,
+        patch_artist=True,
+        manage_ticks=False,
+    )
+    for box in boxes["boxes"]:
+        box.set(facecolor=RUN_COLORS[0], alpha=0.6)
+    axes.set_xlim(left=0)
+    axes.axvline(
+        float(np.median([np.median(values) for _, values in measured])),
+        color=_MEDIAN,
+        linewidth=0.8,
+        linestyle=(0, (4, 2)),
+    )
