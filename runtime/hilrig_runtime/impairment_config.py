@@ -31,8 +31,11 @@ class _Kind(Section):
         return " ".join((self.kind, ", ".join(said))).strip()
 
     def _said(self) -> list[tuple[str, str]]:
-        named = [(name, getattr(self, name)) for name in type(self).model_fields if name != "kind"]
-        return [(name, f"{value:g} ms" if name.endswith("_ms") else f"{value:g}") for name, value in named]
+        fields = type(self).model_fields
+        named = [(name, getattr(self, name)) for name, field in fields.items() if name != "kind"]
+        # What is as usual is not said.
+        said = [(name, value) for name, value in named if value != fields[name].default]
+        return [(name, f"{value:g} ms" if name.endswith("_ms") else f"{value:g}") for name, value in said]
 
 
 class ConstantDelay(_Kind):

@@ -50,8 +50,7 @@ def test_text_and_table_say_the_same() -> None:
     assert as_text.impairment == as_table.impairment
     assert as_text.impairment.ways.command.loss == GilbertElliottLoss(to_bad=0.01, to_good=0.2)
     assert as_text.impairment.ways.describe() == (
-        "state way none; command way gamma mean 20 ms, std 8 ms, offset 0 ms, "
-        "loss gilbert to bad 0.01, to good 0.2, rate bad 1, rate good 0"
+        "state way none; command way gamma mean 20 ms, std 8 ms, loss gilbert to bad 0.01, to good 0.2"
     )
 
 

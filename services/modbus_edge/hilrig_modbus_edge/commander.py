@@ -154,7 +154,7 @@ class Commander:
             self._standing = _copy(self._message)
             self._standing_torque = bytes(self.torque)
         else:
-            self._way.fates = fates
+            self._way.follow(fates)
 
     def send_due(self, now_ns: int) -> None:
         """Send what has come to the end of its way; ns, monotonic clock."""

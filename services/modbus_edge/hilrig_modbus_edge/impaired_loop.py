@@ -108,7 +108,7 @@ class ImpairedLoop:
 
     def _impair_states(self, impairment: Impairment) -> None:
         if self._state_way is not None:
-            self._state_way.line.fates = impairment.each()
+            self._state_way.line.follow(impairment.each())
             return
         # What was shown last stays until the first state has come to the end of its way.
         way = self._state_way = StateWay(impairment.each(), self._newest_of_all())

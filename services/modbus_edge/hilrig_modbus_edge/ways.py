@@ -27,14 +27,18 @@ class Line(Generic[T]):
     """One way. Times are ns of the monotonic clock."""
 
     def __init__(self, fates: Fates) -> None:
-        self.fates = fates
+        self._waiting: deque[tuple[int, int, T]] = deque()
+        self.follow(fates)
+
+    def follow(self, fates: Fates) -> None:
+        """Have other fates from now on, and count anew; what is on its way stays so."""
+        self._fates = fates
         self.count = 0
         """Messages that set out."""
         self.lost = 0
         """Of them, lost on purpose."""
         self.overtaken = 0
-        """Of them, overtaken: by a newer one, or by what made all of them void."""
-        self._waiting: deque[tuple[int, int, T]] = deque()
+        """Overtaken: by a newer one, or by what made all of them void."""
 
     @property
     def next_ns(self) -> int | None:
@@ -43,7 +47,7 @@ class Line(Generic[T]):
 
     def put(self, item: T, now_ns: int) -> bool:
         """Let a message set out; False: it is lost."""
-        delay_ns, lost = next(self.fates)
+        delay_ns, lost = next(self._fates)
         self.count += 1
         if lost:
             self.lost += 1

@@ -15,6 +15,7 @@ from hilrig_cli.commands import (
     demo,
     export,
     figures,
+    impair,
     latency,
     lease,
     live,
@@ -49,6 +50,7 @@ app.command(rich_help_panel=RUN)(demo.demo)
 app.command(rich_help_panel=RUN)(live.live)
 app.command(rich_help_panel=RUN)(check.check)
 app.command(rich_help_panel=RUN)(lease.lease)
+app.command(rich_help_panel=RUN)(impair.impair)
 app.command(rich_help_panel=RUN)(registers.registers)
 app.command(rich_help_panel=RUN)(certs.certs)
 app.add_typer(record.app, name="record", rich_help_panel=RUN)

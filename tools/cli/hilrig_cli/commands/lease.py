@@ -1,7 +1,6 @@
 """`hilrig lease`: who holds a rig, and taking it back."""
 
 import json
-import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -9,11 +8,7 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from hilrig_runtime.bus import Answer, Bus
     from hilrig_schemas import LeaseStatus
-
-ANSWER_WITHIN_S = 3.0
-"""How long an edge has to answer; a link to it may have to be made first."""
 
 
 def lease(
@@ -26,25 +21,15 @@ def lease(
 
     Exit code 1 with --release when nobody held it.
     """
+    from hilrig_cli.asking import ask_edges
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.errors import InputError, OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
-    from hilrig_schemas import LeaseRequest, LeaseStatus, topics
+    from hilrig_runtime.errors import InputError
+    from hilrig_schemas import LeaseRequest, topics
 
-    lab = load_lab(config)
-    if rig:
-        lab.rig(rig)
-    elif release:
+    if release and not rig:
         raise InputError("--release takes a rig: hilrig lease RIG --release")
-    with ZenohBus(lab.bus, "lease") as bus:
-        key = topics.LEASE.key(lab.name, rig or "*")
-        answers = _ask(bus, key, LeaseRequest(release=release).SerializeToString())
-    for answer in answers:
-        if answer.error:
-            raise OperationError(f"rig {rig!r}: the edge refused: {answer.error}")
-    if not answers:
-        raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
-    statuses = sorted((LeaseStatus.FromString(answer.payload) for answer in answers), key=lambda status: status.rig)
+    answers = ask_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
+    statuses = sorted(answers, key=lambda status: status.rig)
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if rig else rows))
@@ -52,15 +37,6 @@ def lease(
         _print_table(statuses, release)
     if release and not statuses[0].released:
         raise typer.Exit(1)
-
-
-def _ask(bus: "Bus", key: str, payload: bytes) -> "list[Answer]":
-    deadline = time.monotonic() + ANSWER_WITHIN_S
-    while True:
-        answers = bus.ask(key, payload)
-        if answers or time.monotonic() > deadline:
-            return answers
-        time.sleep(0.05)
 
 
 def _row(status: "LeaseStatus") -> dict[str, object]:

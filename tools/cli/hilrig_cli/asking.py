@@ -1,0 +1,38 @@
+"""Asking the edges of a running lab about its rigs."""
+
+import time
+from typing import Final, TypeVar
+
+from google.protobuf.message import Message
+
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas.topics import RigTopic
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+ANSWER_WITHIN_S: Final = 3.0
+"""How long an edge has to answer; a link to it may have to be made first."""
+
+
+def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Message) -> list[MessageT]:
+    """Ask on a rig's topic, or on every rig's where `rig` is empty; the answers, at least one.
+
+    Raises:
+        InputError: the lab has no such rig.
+        OperationError: nobody answers, or the edge refuses.
+    """
+    if rig:
+        lab.rig(rig)
+    payload = question.SerializeToString()
+    deadline_s = time.monotonic() + ANSWER_WITHIN_S
+    with ZenohBus(lab.bus, "tool") as bus:
+        while not (answers := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+    for answer in answers:
+        if answer.error:
+            raise OperationError(f"rig {rig!r}: the edge refused: {answer.error}")
+    if not answers:
+        raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
+    return [topic.decode(answer.payload) for answer in answers]
