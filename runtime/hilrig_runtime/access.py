@@ -35,9 +35,10 @@ RULES: Final[dict[str, Rule]] = {
     topics.LEASE.name: Rule(("edge",), ("operator",)),
     topics.IMPAIRMENT.name: Rule(("edge",), ("operator",)),
     topics.LOG.name: Rule(SERVICES, ("recorder",)),
-    topics.HEALTH.name: Rule(SERVICES, TOOLS),
+    topics.HEALTH.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
+    # A service asks whether another one does its work already.
     topics.ROSTER.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
-    topics.STATES.name: Rule(("sim",), ("edge",)),
+    topics.STATES.name: Rule(("sim",), ("edge", *TOOLS)),
     # A recorder asks whether another one records the lab already.
     topics.CONTROL.name: Rule(("recorder",), ("recorder", "operator")),
 }
