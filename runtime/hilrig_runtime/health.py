@@ -1,15 +1,19 @@
 """How a service is: counters that it keeps, and a report of them once a second."""
 
 import os
+import platform
 import sys
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Final
 
 from hilrig_runtime.bus import Publisher
 from hilrig_runtime.clock import Clock
+from hilrig_runtime.presence import ClockOffset
 from hilrig_runtime.rate import Tick
-from hilrig_schemas import Health
+from hilrig_schemas import Health, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
 
@@ -52,8 +56,17 @@ class HealthReporter:
 
     def __init__(self, publisher: Publisher, service: str, instance: str, incarnation: int, clock: Clock) -> None:
         self.counters = Counters()
+        self.rig_reports: Callable[[], Iterable[RigReport]] = tuple
+        """Asked at each report for what the service knows of its rigs."""
+        self.clock_offset: Callable[[], ClockOffset] = ClockOffset
         self._publisher = publisher
-        self._identity = {"service": service, "instance": instance, "incarnation": incarnation}
+        self._identity = {
+            "service": service,
+            "instance": instance,
+            "incarnation": incarnation,
+            "host": platform.node(),
+            "software_version": version("hilrig"),
+        }
         self._clock = clock
         self._start_ns = clock.monotonic_ns()
         self._last_ns = self._start_ns
@@ -70,6 +83,7 @@ class HealthReporter:
         seconds = max(1, now_ns - self._last_ns) * 1e-9
         received, published = self._last
         latenesses, counters.latenesses_ns = sorted(counters.latenesses_ns), []
+        clock = self.clock_offset()
         health = Health(
             **self._identity,  # type: ignore[arg-type]
             wall_ns=self._clock.wall_ns(),
@@ -81,6 +95,10 @@ class HealthReporter:
             lateness_p50_ns=_percentile(latenesses, 0.50),
             lateness_p99_ns=_percentile(latenesses, 0.99),
             lateness_max_ns=latenesses[-1] if latenesses else 0,
+            clock_peer=clock.peer,
+            clock_offset_ns=clock.offset_ns,
+            clock_uncertainty_ns=clock.uncertainty_ns,
+            rig_reports=self.rig_reports(),
         )
         for name in _COPIED:
             setattr(health, name, getattr(counters, name))

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Final
 
@@ -35,6 +35,7 @@ def run_service(
     lab: LabConfig,
     *,
     instance: str = "1",
+    rigs: Sequence[str] | None = None,
     stop_with_parent: bool = False,
     close_timeout_s: float = CLOSE_TIMEOUT_S,
 ) -> None:
@@ -54,20 +55,21 @@ def run_service(
     if stop_with_parent:
         stop_with_stdin(stopping)
     end_when_closing_hangs(stopping, close_timeout_s)
-    bus = _open_bus(lab, name, stopping)
+    bus = _open_bus(lab, name, instance, stopping)
     if bus is None:
         return
-    with Service(name, lab, bus, instance=instance, stopping=stopping) as service:
+    with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
         logger.debug("running as %s", service.source)
         run(service)
+        service.check()
 
 
-def _open_bus(lab: LabConfig, name: str, stopping: threading.Event) -> Bus | None:
+def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:
     """Join the bus; a service waits for its router, for the two may start in any order. None: told to stop first."""
     waiting = False
     while not stopping.is_set():
         try:
-            return ZenohBus(lab.bus, name)
+            return ZenohBus(lab.bus, name, instance)
         except OperationError as error:
             if lab.bus.topology != "router":
                 raise

@@ -7,6 +7,7 @@ gives the same bytes to the bus and to the log stream; `latest` keeps the newest
 """
 
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Generic, NamedTuple, Self, TypeVar
@@ -15,10 +16,12 @@ from google.protobuf.message import Message
 
 from hilrig_runtime.bus import Bus, Handle, Publisher
 from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
-from hilrig_runtime.config import LabConfig
+from hilrig_runtime.config import LabConfig, RigSettings
+from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters, HealthReporter
 from hilrig_runtime.logstream import LogStream
-from hilrig_schemas import Event
+from hilrig_runtime.presence import Presence
+from hilrig_schemas import Event, Roster
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, alive_key, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -98,6 +101,7 @@ class Service:
         bus: Bus,
         *,
         instance: str = "1",
+        rigs: Sequence[str] | None = None,
         clock: Clock = SYSTEM_CLOCK,
         stopping: threading.Event | None = None,
     ) -> None:
@@ -105,6 +109,8 @@ class Service:
         self.instance = instance
         self.source = f"{name}/{instance}"
         self.lab = lab
+        self.rigs: tuple[RigSettings, ...] = lab.rigs if rigs is None else tuple(lab.rig(rig) for rig in rigs)
+        """Those that this instance serves."""
         self.bus = bus
         self.clock = clock
         self.incarnation = clock.wall_ns()
@@ -120,10 +126,20 @@ class Service:
         self.health = HealthReporter(health_publisher, name, instance, self.incarnation, clock)
         self.counters = self.health.counters
         self._token: Handle | None = None
+        self._failure = ""
+        roster = Roster(service=name, instance=instance, incarnation=self.incarnation)
+        self._presence = Presence(bus, lab.name, roster, self._rig_names, clock, self.fail)
+        self._closing.callback(self._presence.close)
+        self.health.clock_offset = lambda: self._presence.clock_offset
 
     def ready(self) -> None:
-        """Say that the service does its work now: its liveliness token appears; a second call does nothing."""
+        """Say that the service does its work now: its liveliness token appears; a second call does nothing.
+
+        Raises:
+            OperationError: another service of its kind has one of its rigs, or its name.
+        """
         if self._token is None:
+            self._presence.claim()
             token = self.bus.announce(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 
@@ -137,7 +153,7 @@ class Service:
         """The newest messages on a topic, of every rig or of one."""
         values = LatestValues(self.clock, self.counters)
         # Room for one message of each rig: what waits is never older than a step.
-        waiting = len(self.lab.rigs) if rig == "*" else 1
+        waiting = len(self.rigs) if rig == "*" else 1
         self._closing.enter_context(
             self.bus.subscribe_newest(topic.key(self.lab.name, rig), values.on_message, waiting)
         )
@@ -162,6 +178,23 @@ class Service:
     def stop(self) -> None:
         """Wish the service to end; safe from any thread and from a signal handler."""
         self.stopping.set()
+
+    def fail(self, reason: str) -> None:
+        """Wish the service to end because it can't go on; safe from any thread. See `check`."""
+        self._failure = reason
+        self.stopping.set()
+
+    def check(self) -> None:
+        """Nothing, if the service ended because it was told to.
+
+        Raises:
+            OperationError: it could not go on; says why.
+        """
+        if self._failure:
+            raise OperationError(self._failure)
+
+    def _rig_names(self) -> list[str]:
+        return [rig.name for rig in self.rigs]
 
     def __enter__(self) -> Self:
         return self

@@ -11,7 +11,7 @@ import zenoh.ext
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.zenoh_config import MESH_ORDER, mesh_endpoint, zenoh_config
+from hilrig_runtime.zenoh_config import FIRST_INSTANCE, MESH_ORDER, mesh_endpoint, zenoh_config
 from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
 from hilrig_schemas.topics import Traffic
 
@@ -87,10 +87,10 @@ class _ZenohPublisher(Publisher):
 class ZenohBus(Bus):
     """See `hilrig_runtime.bus.Bus`. Raises `OperationError` where the session can't be opened."""
 
-    def __init__(self, bus: BusConfig, service: str) -> None:
+    def __init__(self, bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> None:
         self._express = bus.express
         try:
-            self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service))
+            self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
         except zenoh.ZError as error:
             raise OperationError(_why_not_open(bus, service, error)) from error
 

@@ -1,9 +1,10 @@
 """zenoh's configuration out of a lab's: who listens, who connects, with which certificate.
 
-Scouting and gossip are off and endpoints explicit, so that who talks to whom is what the configuration says. In the
-mesh each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of them:
-every reader is linked to every writer, with no hop between and no other program needed. With a router everyone is
-its client.
+Scouting is off and endpoints explicit, so that who talks to whom is what the configuration says. In the mesh the first
+instance of each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of
+them. Further instances listen where the system lets them and connect to those three, through whose gossip the others
+find them: every reader is linked to every writer, with no hop between and no other program needed. With a router
+everyone is its client, and there is no gossip, for it would lead past the router's access control.
 """
 
 import json
@@ -17,16 +18,17 @@ from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError
 
 MESH_ORDER: Final = ("sim", "edge", "recorder")
+FIRST_INSTANCE: Final = "1"
+"""The instance that has a port of its own in the mesh."""
 
 
 def mesh_endpoint(bus: BusConfig, service: str) -> str:
     """Where a service listens for the others in the mesh."""
-    kind = "tcp" if bus.tls is None else "tls"
-    return f"{kind}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
+    return f"{_protocol(bus)}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
 
 
-def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
-    """The zenoh configuration of `service`: one of `MESH_ORDER`, or any other name for a tool.
+def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> zenoh.Config:
+    """The zenoh configuration of an instance of `service`: one of `MESH_ORDER`, or any other name for a tool.
 
     Raises:
         InputError: a certificate that the service needs is not there.
@@ -36,14 +38,16 @@ def zenoh_config(bus: BusConfig, service: str) -> zenoh.Config:
         mode, connect = "client", [bus.router]
     else:
         mode = "peer"
-        earlier = MESH_ORDER.index(service) if service in MESH_ORDER else len(MESH_ORDER)
+        has_port = service in MESH_ORDER and instance == FIRST_INSTANCE
+        earlier = MESH_ORDER.index(service) if has_port else len(MESH_ORDER)
         connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
         if service in MESH_ORDER:
-            listen = [mesh_endpoint(bus, service)]
+            listen = [mesh_endpoint(bus, service) if has_port else f"{_protocol(bus)}/{bus.host}:0"]
     settings: dict[str, Any] = _common() | {
         "mode": mode,
         "listen/endpoints": listen,
         "connect/endpoints": connect,
+        "scouting/gossip/enabled": mode == "peer",
         # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
         # between tries; a peer opens at once and connects whenever the others come up, also for the second time.
         "connect/timeout_ms": 500 if mode == "client" else -1,
@@ -83,6 +87,10 @@ def own_identity(tls: BusTlsConfig, service: str) -> str:
             return name
     wanted = " or ".join(f"{name}.key" for name in names)
     raise InputError(f"bus.tls.folder: {tls.folder} holds no {wanted}; hilrig certs makes certificates")
+
+
+def _protocol(bus: BusConfig) -> str:
+    return "tcp" if bus.tls is None else "tls"
 
 
 def _common() -> dict[str, Any]:
