@@ -61,10 +61,11 @@ def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:
 class RunningLab:
     """`hilrig up` on a lab's file; a context manager that leaves no process behind."""
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, *options: str) -> None:
         from hilrig_runtime.config import load_lab
 
         self.config = config
+        self.options = options
         self.lab = load_lab(config)
         self.log = config.parent / "up.log"
 
@@ -106,7 +107,7 @@ class RunningLab:
 
     def __enter__(self) -> Self:
         with self.log.open("w") as log:
-            command = [*HILRIG, "up", "--config", str(self.config)]
+            command = [*HILRIG, "up", "--config", str(self.config), *self.options]
             self.process = subprocess.Popen(
                 command, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
             )

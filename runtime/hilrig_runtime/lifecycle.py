@@ -44,7 +44,6 @@ def run_service(
     Raises:
         HilrigError: the service can't start or can't go on; what it opened is closed.
     """
-    logging.basicConfig(level=logging.INFO, format=f"{name}: %(levelname)s: %(message)s", stream=sys.stderr)
     if name in CLOSES_THE_LOOP:
         # Before the bus is opened: its threads inherit it.
         prefer_latency()

@@ -56,6 +56,10 @@ class LogStream:
         """Add one message as it stood on the bus; cheap, and safe from any thread."""
         self._entries.append((key, sequence, publish_wall_ns, payload))
 
+    def extend(self, entries: Iterable[Entry]) -> None:
+        """Add many messages at once, as `append` does."""
+        self._entries.extend(entries)
+
     def set_sessions(self, sessions: Sequence[OpenSession]) -> None:
         """State the sessions that this service keeps; said at once, and again twice a second."""
         self._sessions = tuple(sessions)

@@ -10,9 +10,9 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Generic, NamedTuple, Self, TypeVar
+from typing import Final, Generic, NamedTuple, Self, TypeVar
 
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from hilrig_runtime.bus import Bus, Handle, Publisher
 from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
@@ -21,10 +21,13 @@ from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters, HealthReporter
 from hilrig_runtime.logstream import LogStream
 from hilrig_runtime.presence import Presence
-from hilrig_schemas import Event, Roster
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, alive_key, parse_rig_key
+from hilrig_runtime.rig_batch import BatchSender
+from hilrig_schemas import Event, RigBatch, Roster
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
+BATCHES_WAITING: Final = 8
+"""Batches that may wait: one of each of several senders."""
 
 
 class Arrival(NamedTuple):
@@ -62,6 +65,35 @@ class LatestValues:
             rig = self._rig_of_key[key] = parse_rig_key(key).rig
         self._by_rig[rig] = Arrival(payload, arrived_ns)
         self._counters.received += 1
+
+
+class LatestOfBatches:
+    """The newest message of each rig, out of batches."""
+
+    def __init__(self, clock: Clock, counters: Counters) -> None:
+        self._by_rig: dict[str, Arrival] = {}
+        self._monotonic_ns = clock.monotonic_ns
+        self._counters = counters
+
+    def get(self, rig: str) -> Arrival | None:
+        """The newest message of `rig`; None: none has come. The same object is returned until the next comes."""
+        return self._by_rig.get(rig)
+
+    def on_message(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+        """Keep what a batch holds; called by the bus."""
+        arrived_ns = self._monotonic_ns()
+        try:
+            batch = RigBatch.FromString(payload)
+        except DecodeError:
+            self._counters.malformed += 1
+            return
+        if len(batch.rigs) != len(batch.messages):
+            self._counters.malformed += 1
+            return
+        self._by_rig.update(
+            (rig, Arrival(message, arrived_ns)) for rig, message in zip(batch.rigs, batch.messages, strict=True)
+        )
+        self._counters.received += len(batch.messages)
 
 
 class Sender(Generic[MessageT]):
@@ -158,6 +190,19 @@ class Service:
             self.bus.subscribe_newest(topic.key(self.lab.name, rig), values.on_message, waiting)
         )
         return values
+
+    def latest_of_batches(self, topic: ServiceTopic[RigBatch]) -> LatestOfBatches:
+        """The newest messages of each rig, out of the batches of everyone who sends them."""
+        values = LatestOfBatches(self.clock, self.counters)
+        key = topic.key(self.lab.name, "*", "*")
+        self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, BATCHES_WAITING))
+        return values
+
+    def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
+        """An end that sends messages of many rigs together; give it the rigs with `BatchSender.add`."""
+        key = topic.key(self.lab.name, self.name, self.instance)
+        together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
+        return BatchSender(self.source, together, self.log, self.clock, self.counters)
 
     def emit(self, event: Event) -> None:
         """Send and record an event; source and time are filled in."""

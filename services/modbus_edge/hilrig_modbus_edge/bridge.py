@@ -20,6 +20,7 @@ from hilrig_modbus_edge.server import Limits, RigServer, bind
 from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
+from hilrig_modbus_edge.transport import DirectLoop
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.config import mistakes_in
 from hilrig_runtime.errors import InputError
@@ -43,7 +44,8 @@ def run(service: Service) -> None:
     Raises:
         OperationError: a rig's address can't be had.
     """
-    asyncio.run(Edge(service).run())
+    with asyncio.Runner(loop_factory=DirectLoop) as runner:
+        runner.run(Edge(service).run())
 
 
 class _Wire:
@@ -104,7 +106,7 @@ class _Wire:
 
 
 class Edge:
-    """All rigs of a lab."""
+    """The rigs of one edge."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -112,7 +114,7 @@ class Edge:
         states = service.latest(topics.STATE)
         self._wires: dict[str, _Wire] = {}
         self._servers: list[RigServer] = []
-        for rig in lab.rigs:
+        for rig in service.rigs:
             wire = _Wire(self, rig.name)
             settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
             wire.device = Device(rig.name, settings, service.clock, wire, partial(states.get, rig.name))
@@ -124,7 +126,7 @@ class Edge:
                 rig.allow,
             )
             self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
-        service.counters.rigs = len(lab.rigs)
+        service.counters.rigs = len(service.rigs)
         self._traffic_due_ns = 0
         self._answers: list[Handle] = []
         self.alarm: Alarm
@@ -132,7 +134,9 @@ class Edge:
     async def run(self) -> None:
         """Listen, serve, and close in order."""
         service = self.service
-        self.alarm = Alarm(asyncio.get_running_loop(), service.clock)
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, DirectLoop)
+        self.alarm = Alarm(loop, service.clock)
         # Sockets listen before the first state is there: whoever connects early is served as soon as it can be done.
         sockets = self._bind()
         self.state_sessions()
@@ -142,7 +146,7 @@ class Edge:
             self._answer_people()
             await self._first_states()
             for server, listening, policy in sockets:
-                await server.listen(listening, policy)
+                await server.listen(loop, listening, policy)
             freeze_garbage()
             service.ready()
             await self._tick()

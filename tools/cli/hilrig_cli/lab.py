@@ -4,12 +4,12 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from hilrig_cli.supervisor import START_ORDER, Supervisor
+from hilrig_cli.supervisor import WHOLE_LAB, Part, Supervisor
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.zenoh_bus import ZenohBus
@@ -23,19 +23,25 @@ READY_TIMEOUT_S: Final = 60.0
 
 @contextmanager
 def running_lab(
-    lab: LabConfig, config: Path | None, say: Callable[[str], None], stopping: threading.Event
+    lab: LabConfig,
+    config: Path | None,
+    say: Callable[[str], None],
+    stopping: threading.Event,
+    parts: Sequence[Part] = WHOLE_LAB,
+    options: Sequence[str] = (),
 ) -> Iterator[Supervisor]:
     """Start the services of `lab` (read from `config`) and give their supervisor once controllers can connect.
 
-    Setting `stopping` cuts the waiting short. Leaving the context ends every service, in order.
+    Each service gets `options` too. Setting `stopping` cuts the waiting short. Leaving the context ends every service,
+    in order.
 
     Raises:
         HilrigError: a service could not start; it said why on standard error.
     """
     _check_ports(lab)
-    with Supervisor(config, say) as supervisor:
+    with Supervisor(config, say, parts, options) as supervisor:
         supervisor.start()
-        _wait_until_ready(lab, supervisor, stopping)
+        _wait_until_ready(lab, parts, supervisor, stopping)
         supervisor.settled()
         yield supervisor
 
@@ -72,8 +78,8 @@ def why_not_free(host: str, port: int) -> str | None:
     return None
 
 
-def _wait_until_ready(lab: LabConfig, supervisor: Supervisor, stopping: threading.Event) -> None:
-    missing = {alive_key(lab.name, service, "1") for service in START_ORDER}
+def _wait_until_ready(lab: LabConfig, parts: Sequence[Part], supervisor: Supervisor, stopping: threading.Event) -> None:
+    missing = {alive_key(lab.name, part.service, part.instance) for part in parts}
     deadline_s = time.monotonic() + READY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
         bus.watch(alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None)

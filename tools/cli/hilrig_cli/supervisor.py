@@ -10,7 +10,7 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -28,9 +28,49 @@ SETTLED_S: Final = 10.0
 """A child that lived so long is restarted at once when it dies; before, the pause doubles each time."""
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One process of a lab."""
+
+    service: str
+    instance: str = "1"
+    rigs: tuple[str, ...] = ()
+    """Those that it serves; none named: all of the lab."""
+
+    @property
+    def name(self) -> str:
+        """What it is called to people."""
+        return self.service if self.instance == "1" else f"{self.service} {self.instance}"
+
+    @property
+    def options(self) -> list[str]:
+        """How the command line of its service says it."""
+        rigs = ["--rigs", ",".join(self.rigs)] if self.rigs else []
+        return [self.service, "--instance", self.instance, *rigs]
+
+
+WHOLE_LAB: Final = tuple(Part(service) for service in START_ORDER)
+
+
+def shared(rigs: Sequence[str], *, edges: int = 1, recorders: int = 1) -> tuple[Part, ...]:
+    """The processes of a lab whose rigs are shared out among several edges and recorders, each a run of neighbours.
+
+    Raises:
+        InputError: there are more processes than rigs.
+    """
+    parts = [Part("sim")]
+    for service, count in (("edge", edges), ("recorder", recorders)):
+        if not 1 <= count <= len(rigs):
+            raise InputError(f"--{service}s {count}: expected 1 to {len(rigs)}, the number of rigs")
+        for number in range(count):
+            mine = rigs[number * len(rigs) // count : (number + 1) * len(rigs) // count]
+            parts.append(Part(service, str(number + 1), tuple(mine) if count > 1 else ()))
+    return tuple(parts)
+
+
 @dataclass
 class _Child:
-    name: str
+    part: Part
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     backoff_s: float = FIRST_BACKOFF_S
@@ -44,15 +84,22 @@ class Supervisor:
     Use it as a context manager: leaving it ends every child.
     """
 
-    def __init__(self, config: Path | None, say: Callable[[str], None], names: tuple[str, ...] = START_ORDER) -> None:
+    def __init__(
+        self,
+        config: Path | None,
+        say: Callable[[str], None],
+        parts: Sequence[Part] = WHOLE_LAB,
+        options: Sequence[str] = (),
+    ) -> None:
         self._config = config
         self._say = say
-        self._children = {name: _Child(name) for name in names}
+        self._options = tuple(options)
+        self._children = {part.name: _Child(part) for part in parts}
         self._ready = False
 
     @property
     def pids(self) -> Mapping[str, int]:
-        """Process id of each child that runs."""
+        """Process id of each child that runs, by its part's name."""
         return {name: child.process.pid for name, child in self._children.items() if child.process is not None}
 
     def start(self) -> None:
@@ -77,23 +124,26 @@ class Supervisor:
             elif child.process is None and child.restart_at_s is not None and now_s >= child.restart_at_s:
                 self._spawn(child)
                 child.restarts += 1
-                self._say(f"{child.name} is started again")
+                self._say(f"{child.part.name} is started again")
 
     def close(self) -> None:
         """End the children in order; those that don't end in time are killed."""
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
-        for name in STOP_ORDER:
-            process = self._children[name].process if name in self._children else None
-            if process is None:
-                continue
-            _close_stdin(process)
-            try:
-                process.wait(timeout=max(0.1, deadline_s - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                self._say(f"{name} did not end in time and is killed")
-                process.kill()
-                process.wait()
-            self._children[name].process = None
+        for service in STOP_ORDER:
+            ending = [child for child in self._children.values() if child.part.service == service and child.process]
+            # Those of a kind end side by side.
+            for child in ending:
+                assert child.process is not None
+                _close_stdin(child.process)
+            for child in ending:
+                assert child.process is not None
+                try:
+                    child.process.wait(timeout=max(0.1, deadline_s - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    self._say(f"{child.part.name} did not end in time and is killed")
+                    child.process.kill()
+                    child.process.wait()
+                child.process = None
 
     def __enter__(self) -> Self:
         return self
@@ -104,7 +154,7 @@ class Supervisor:
         self.close()
 
     def _spawn(self, child: _Child) -> None:
-        command = [sys.executable, "-m", "hilrig_cli", child.name, "--stop-with-parent"]
+        command = [sys.executable, "-m", "hilrig_cli", *child.part.options, *self._options, "--stop-with-parent"]
         if self._config is not None:
             command += ["--config", str(self._config)]
         child.process = subprocess.Popen(command, stdin=subprocess.PIPE, **own_process_group())
@@ -117,12 +167,12 @@ class Supervisor:
         child.process = None
         if not self._ready:
             failure: type[HilrigError] = InputError if code == InputError.exit_code else OperationError
-            raise failure(f"the {child.name} service {_how_it_ended(code)} before the lab was up")
+            raise failure(f"the {child.part.name} service {_how_it_ended(code)} before the lab was up")
         if now_s - child.started_s > SETTLED_S:
             child.backoff_s = FIRST_BACKOFF_S
         child.restart_at_s = now_s + child.backoff_s
         child.backoff_s = min(LONGEST_BACKOFF_S, 2 * child.backoff_s)
-        self._say(f"{child.name} {_how_it_ended(code)}; restarting it")
+        self._say(f"{child.part.name} {_how_it_ended(code)}; restarting it")
 
 
 def own_process_group() -> dict[str, Any]:

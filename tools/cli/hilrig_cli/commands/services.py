@@ -15,29 +15,81 @@ StopWithParent = Annotated[
 ]
 
 
-def sim(config: Config = None, stop_with_parent: StopWithParent = False) -> None:
+Rigs = Annotated[
+    str,
+    typer.Option(
+        metavar="RIG,RIG…",
+        help="Those that this process serves; the others have one of their own. Without: all of the lab.",
+        show_default=False,
+    ),
+]
+Instance = Annotated[
+    str, typer.Option(metavar="NAME", help="What this process is called, where there are several of its kind.")
+]
+LogFormat = Annotated[
+    str, typer.Option("--log-format", metavar="text|json", help="Lines for people, or one JSON object a line.")
+]
+
+
+def sim(
+    config: Config = None,
+    rigs: Rigs = "",
+    instance: Instance = "1",
+    log_format: LogFormat = "text",
+    stop_with_parent: StopWithParent = False,
+) -> None:
     """Run the simulation: command in, plant stepped in real time, state out."""
     from hilrig_sim.loop import run
 
-    _run("sim", run, config, stop_with_parent)
+    _run("sim", run, config, rigs, instance, log_format, stop_with_parent)
 
 
-def edge(config: Config = None, stop_with_parent: StopWithParent = False) -> None:
+def edge(
+    config: Config = None,
+    rigs: Rigs = "",
+    instance: Instance = "1",
+    log_format: LogFormat = "text",
+    stop_with_parent: StopWithParent = False,
+) -> None:
     """Run the Modbus edge: one TCP port a rig, torques in, positions out."""
     from hilrig_modbus_edge.bridge import run
 
-    _run("edge", run, config, stop_with_parent)
+    _run("edge", run, config, rigs, instance, log_format, stop_with_parent)
 
 
-def recorder(config: Config = None, stop_with_parent: StopWithParent = False) -> None:
+def recorder(
+    config: Config = None,
+    rigs: Rigs = "",
+    instance: Instance = "1",
+    log_format: LogFormat = "text",
+    stop_with_parent: StopWithParent = False,
+) -> None:
     """Run the recorder: each session of each rig becomes an MCAP file."""
     from hilrig_recorder.service import run
 
-    _run("recorder", run, config, stop_with_parent)
+    _run("recorder", run, config, rigs, instance, log_format, stop_with_parent)
 
 
-def _run(name: str, run: "Callable[[Service], None]", config: Config, stop_with_parent: bool) -> None:
+def _run(
+    name: str,
+    run: "Callable[[Service], None]",
+    config: Config,
+    rigs: str,
+    instance: str,
+    log_format: str,
+    stop_with_parent: bool,
+) -> None:
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
     from hilrig_runtime.lifecycle import run_service
+    from hilrig_runtime.logs import start_logging
+    from hilrig_schemas.topics import is_name
 
-    run_service(name, run, load_lab(config), stop_with_parent=stop_with_parent)
+    if not is_name(instance):
+        raise InputError(f"--instance {instance!r}: expected letters, digits, - and _, beginning with no sign")
+    lab = load_lab(config)
+    names = [rig.strip() for rig in rigs.split(",")] if rigs else None
+    for rig in names or ():
+        lab.rig(rig)
+    start_logging(name, instance, log_format)
+    run_service(name, run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)

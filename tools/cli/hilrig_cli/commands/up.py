@@ -7,11 +7,15 @@ from typing import Annotated
 
 import typer
 
+from hilrig_cli.commands.services import LogFormat
 from hilrig_cli.options import Config
 
 
 def up(
     config: Config = None,
+    edges: Annotated[int, typer.Option(help="Modbus edges that share the rigs: on several cores, for many rigs.")] = 1,
+    recorders: Annotated[int, typer.Option(help="Recorders that share the rigs.")] = 1,
+    log_format: LogFormat = "text",
     view: Annotated[bool, typer.Option("--view", help="Open the live view of the first rig in rerun.")] = False,
 ) -> None:
     """Start simulation, Modbus edge and recorder here, print each rig's Modbus address, and run until Ctrl-C.
@@ -19,7 +23,7 @@ def up(
     A service that dies is restarted. Ctrl-C or SIGTERM ends everything in order: torques to zero, recordings finished.
     """
     from hilrig_cli.lab import POLL_S, running_lab
-    from hilrig_cli.supervisor import own_process_group
+    from hilrig_cli.supervisor import own_process_group, shared
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.lifecycle import stop_on_signals
 
@@ -30,7 +34,8 @@ def up(
     def say(line: str) -> None:
         print(f"hilrig: {line}", file=sys.stderr, flush=True)
 
-    with running_lab(lab, config, say, stopping) as supervisor:
+    parts = shared([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
+    with running_lab(lab, config, say, stopping, parts, ["--log-format", log_format]) as supervisor:
         if not stopping.is_set():
             for rig in lab.rigs:
                 addresses = ", ".join(f"{kind} at {address}" for kind, address in lab.addresses(rig.name).items())

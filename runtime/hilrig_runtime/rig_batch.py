@@ -1,0 +1,53 @@
+"""The messages of many rigs, together: one message on the bus instead of one a rig.
+
+At 50 steps a second of 128 rigs, what a small message costs to send, to receive and to wake a thread for it is more
+than what is in it. So a simulation sends the states of a tick as one batch, for the edges, and only then each state
+on its rig's own key, which costs little while nobody listens there. Recorded is each message under its own key.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import repeat
+
+from hilrig_runtime.bus import Publisher
+from hilrig_runtime.clock import Clock
+from hilrig_runtime.health import Counters
+from hilrig_runtime.logstream import LogStream
+from hilrig_schemas import RigBatch
+
+
+class BatchSender:
+    """Sends one message of each of some rigs at a time."""
+
+    def __init__(self, source: str, together: Publisher, log: LogStream, clock: Clock, counters: Counters) -> None:
+        self._put_together = together.put
+        self._log = log
+        self._wall_ns = clock.wall_ns
+        self._counters = counters
+        self._batch = RigBatch(source=source)
+        self._keys: list[str] = []
+        self._puts: list[Callable[[bytes], None]] = []
+        self._sequences: list[int] = []
+
+    def add(self, rig: str, key: str, publisher: Publisher) -> None:
+        """Send for one more rig, behind the others; its own messages go on `key` too, through `publisher`."""
+        self._batch.rigs.append(rig)
+        self._keys.append(key)
+        self._puts.append(publisher.put)
+        self._sequences.append(0)
+
+    def remove(self, index: int) -> None:
+        """Send no more for a rig; those behind it move up."""
+        del self._batch.rigs[index], self._keys[index], self._puts[index], self._sequences[index]
+
+    def send(self, payloads: Sequence[bytes]) -> None:
+        """Publish and record the encoded messages of all rigs, in the order in which the rigs were added."""
+        batch = self._batch
+        del batch.messages[:]
+        batch.messages.extend(payloads)
+        wall_ns = self._wall_ns()
+        self._put_together(batch.SerializeToString())
+        for put, payload in zip(self._puts, payloads, strict=True):
+            put(payload)
+        self._sequences = [sequence + 1 for sequence in self._sequences]
+        self._log.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
+        self._counters.published += len(payloads)
