@@ -1,0 +1,164 @@
+"""What a loop costs on average when its latency varies: exact second moments instead of many simulated runs.
+
+The age of what acts at each tick follows a Markov chain, and for each age the loop is a linear system of its own: a
+jump linear system, whose second moments obey a linear recursion (O. L. V. Costa, M. D. Fragoso, R. P. Marques,
+"Discrete-Time Markov Jump Linear Systems", 2005, ch. 3; Jitterbug, Lincoln and Cervin 2002, does so for its timing
+models). Its spectral radius tells mean-square stability, its sum the expected cost, as `virtual_loop` defines cost. The
+latency is taken on the command's way, with one poll a step: each state is served, and its command acts when it has
+aged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, eigs
+
+from hilrig_runtime.errors import InputError
+from hilrig_study.controllers import LawController, Measured
+from hilrig_study.linear import LinearPlant
+from hilrig_study.margins import LinearLaw
+from hilrig_study.timing import NO_POLL, Timeline
+from hilrig_study.virtual_loop import EFFORT_COST, ERROR_SCALE
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class AgeChain:
+    """Ages of what acts, steps, as a Markov chain; its first states are the ticks before anything acts (age 0)."""
+
+    ages: Ints
+    """Age that each state stands for, (S,)."""
+    transition: Floats
+    """p[i, j]: probability that state j follows state i at the next tick, (S, S)."""
+    start: Floats
+    """Of each state at the first tick, (S,)."""
+
+    @property
+    def most(self) -> int:
+        """Largest age."""
+        return int(self.ages.max())
+
+
+def ages_of(line: Timeline) -> Ints:
+    """Age of what acts at every tick, steps, (T,); 0: nothing does."""
+    acts = line.in_force != NO_POLL
+    ages = np.arange(len(line.in_force)) - line.basis[np.maximum(line.in_force, 0)]
+    return np.where(acts, ages, 0)
+
+
+def age_chain(sequences: Sequence[Ints]) -> AgeChain:
+    """The chain that sequences of ages, one a run, (T,) each, tell of.
+
+    Raises:
+        InputError: there is no command in any of them.
+    """
+    # Before anything acts the ticks are counted down, so that the wait is as long as it was.
+    labels = [np.where(ages > 0, ages, -1 - np.arange(len(ages))) for ages in sequences]
+    known = np.unique(np.concatenate(labels)) if labels else np.empty(0, dtype=np.int64)
+    if not (known > 0).any():
+        raise InputError("nothing acts in any of the runs, so there is no latency to take")
+    counts, start = np.zeros((len(known), len(known))), np.zeros(len(known))
+    for label in labels:
+        rows = np.searchsorted(known, label)
+        np.add.at(counts, (rows[:-1], rows[1:]), 1.0)
+        start[rows[0]] += 1.0
+    total = counts.sum(axis=1, keepdims=True)
+    # A state that is only the last of a run stays: no probability may get lost.
+    transition = np.where(total > 0, counts / np.maximum(total, 1.0), np.eye(len(known)))
+    return AgeChain(np.maximum(known, 0), transition, start / start.sum())
+
+
+def turns(phi: Floats, gamma: Floats, law: LinearLaw, most: int) -> list[Floats]:
+    """The loop's matrices over a step in which what acts is of age 0 (nothing) to `most`, (n, n) each.
+
+    The state is (x, ξ, the last `most` commands), newest first.
+    """
+    memory = len(law.a)
+    held = 8 + memory
+    size = held + 4 * most
+    common = np.zeros((size, size))
+    common[:8, :8] = phi
+    common[8:held, :4], common[8:held, 8:held] = law.b, law.a
+    common[held : held + 4, :4], common[held : held + 4, 8:held] = law.d, law.c
+    common[held + 4 :, held:-4] = np.eye(4 * (most - 1))
+    matrices = [common]
+    for age in range(1, most + 1):
+        matrix = common.copy()
+        place = held + 4 * (age - 1)
+        matrix[:8, place : place + 4] = gamma
+        matrices.append(matrix)
+    return matrices
+
+
+def mean_square_radius(chain: AgeChain, matrices: Sequence[Floats]) -> float:
+    """Growth of the second moment a step, in the long run; below 1 the loop is mean-square stable."""
+    lasting = np.flatnonzero(chain.ages > 0)
+    p = chain.transition[np.ix_(lasting, lasting)].T
+    some = [matrices[age] for age in chain.ages[lasting].tolist()]
+    size = len(some[0])
+
+    def move(flat: Floats) -> Floats:
+        moments = flat.reshape(len(some), size, size)
+        moved = np.stack([matrix @ moment @ matrix.T for matrix, moment in zip(some, moments, strict=True)])
+        return np.asarray(np.tensordot(p, moved, axes=1).ravel(), dtype=np.float64)
+
+    count = len(some) * size * size
+    first = np.stack([np.eye(size)] * len(some)).ravel()
+    values = eigs(LinearOperator((count, count), matvec=move, dtype=np.float64), k=1, v0=first, tol=1e-8)[0]
+    return float(np.abs(values[0]))
+
+
+def expected_cost(
+    plant: LinearPlant,
+    phi: Floats,
+    gamma: Floats,
+    controller: LawController,
+    law: LinearLaw,
+    chain: AgeChain,
+    offset: Sequence[float],
+    ticks: int,
+) -> float:
+    """Expected cost of going from `offset` to the pose in `ticks` steps, defined as `virtual_loop.Outcome.cost`.
+
+    Args:
+        plant: the arm near the pose.
+        phi: of the arm over a step, (8, 8).
+        gamma: the same, (8, 4).
+        controller: whose first poll tells how its memory starts; one run.
+        law: the controller, linear.
+        chain: ages of what acts.
+        offset: of the start from the pose; rad, rad, m, rad, (4,).
+        ticks: T.
+    """
+    matrices = turns(phi, gamma, law, chain.most)
+    size, held = len(matrices[0]), 8 + len(law.a)
+    pose, start = np.array(plant.pose)[:, np.newaxis], np.array(offset)[:, np.newaxis]
+    still = Measured(np.zeros(1), pose + start, pose, np.zeros(1))
+    effort, memory = controller.law(controller.start(1), still)
+    # The first tick by hand: the memory starts without a past.
+    state = np.zeros(size)
+    state[:8] = phi @ np.concatenate([start[:, 0], np.zeros(4)])
+    rest = memory
+    for _ in range(200):
+        _, rest = controller.law(rest, Measured(np.zeros(1), pose, pose, np.zeros(1)))
+    state[8:held] = memory[law.rows, 0] - rest[law.rows, 0]
+    state[held : held + 4] = effort[:, 0] - np.array(plant.holding)
+    weight = np.zeros(size)
+    weight[:4] = ERROR_SCALE[:, 0] ** -2.0
+    total = float((start[:, 0] ** 2) @ weight[:4])
+    ages = chain.ages.tolist()
+    moments = (chain.start @ chain.transition)[:, np.newaxis, np.newaxis] * np.outer(state, state)
+    for _ in range(1, ticks):
+        total += float(np.einsum("kii,i->", moments, weight))
+        for age, moment in zip(ages, moments, strict=True):
+            place = slice(held + 4 * (age - 1), held + 4 * age)
+            total += EFFORT_COST * float(np.trace(moment[place, place])) if age else 0.0
+        moved = np.stack([matrices[age] @ moment @ matrices[age].T for age, moment in zip(ages, moments, strict=True)])
+        moments = np.tensordot(chain.transition.T, moved, axes=1)
+        if not np.isfinite(total):
+            return float("inf")
+    return total / ticks
