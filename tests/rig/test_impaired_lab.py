@@ -1,0 +1,281 @@
+"""A lab that is impaired on purpose, with real processes: what is measured is what was asked for.
+
+One lab with a rig a distribution; a controller of each writes every 30 ms, further apart than its delays are spread, so
+that none is overtaken. The recordings are judged as `hilrig latency` judges them.
+"""
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from edge_rig import RawClient
+from hilrig_modbus_edge.impairment import Impairment, way_seed
+from hilrig_replay.latency import STAGES, LatencyReport, measure
+from hilrig_replay.run import Run, open_run
+from hilrig_runtime.impairment_config import WayImpairment
+from labs import RunningLab, free_ports, hilrig
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+SECONDS = 9.0
+STEP_MS = 10.0
+SEED = 2
+TRACE_MS = [4.0, 19.0, 7.5, 0.25, 12.0, 25.0, 3.0]
+DISTRIBUTIONS: dict[str, Any] = {
+    "constant:35": None,
+    "uniform:5,25": stats.uniform(5, 20),
+    "normal:20,3": stats.truncnorm(-20 / 3, np.inf, 20, 3),
+    "gamma:12,3,5": stats.gamma(16, loc=5, scale=9 / 12),
+    "exponential:3,10": stats.expon(10, 3),
+}
+COMMAND_RIGS = {f"{text.partition(':')[0]}-way": text for text in DISTRIBUTIONS}
+RIGS = ("free", *COMMAND_RIGS, "trace", "state-way", "lossy", "scheduled")
+
+
+@dataclass
+class Session:
+    """One rig's recording, judged."""
+
+    run: Run
+    report: LatencyReport
+
+    @property
+    def injected_ms(self) -> np.ndarray:
+        return np.asarray(self.report.table["injected"] / 1e6)
+
+    @property
+    def loop_ms(self) -> np.ndarray:
+        return np.asarray(self.report.table["loop"] / 1e6)
+
+
+def write_impaired_lab(folder: Path) -> Path:
+    trace = folder / "trace.txt"
+    trace.write_text("".join(f"{delay}\n" for delay in TRACE_MS))
+    ways = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
+    ways["trace"] = f"command = 'trace:{trace}'"
+    ways["state-way"] = "state = 'uniform:1,6'"
+    ways["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
+    ways["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
+    text = f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {free_ports(len(RIGS))}\nsession_grace_ms = 0\n"
+    text += f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n"
+    for rig in RIGS:
+        text += f"[[rigs]]\nname = '{rig}'\n"
+        if rig in ways:
+            text += f"[rigs.impairment]\nseed = {SEED}\n{ways[rig]}\n"
+    path = folder / "lab.toml"
+    path.write_text(text)
+    return path
+
+
+def every(period_s: float, cycle: Callable[[RawClient], object]) -> Callable[[int], None]:
+    """A controller that does its cycle at a period."""
+
+    def control(port: int) -> None:
+        with RawClient("127.0.0.1", port) as client:
+            end = time.monotonic() + SECONDS
+            while (now := time.monotonic()) < end:
+                cycle(client)
+                time.sleep(max(0.0, now + period_s - time.monotonic()))
+
+    return control
+
+
+def answer(client: RawClient) -> None:
+    positions = client.read(4, 4)
+    client.write(0, positions[0] & 0xFF, 0, 0, 0)
+
+
+def answer_each_state(port: int) -> None:
+    """Look for the next state again and again, and answer each one that comes."""
+    with RawClient("127.0.0.1", port) as client:
+        end = time.monotonic() + SECONDS
+        last = None
+        while time.monotonic() < end:
+            step = client.read(2, 2, function=4)
+            if step != last:
+                last = step
+                client.write(0, step[1] & 0xFF, 0, 0, 0)
+            time.sleep(0.001)
+
+
+@pytest.fixture(scope="module")
+def lab_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("impaired")
+
+
+@pytest.fixture(scope="module")
+def shown(lab_folder: Path) -> dict[str, Any]:
+    """What `hilrig impair --json` said while the lab ran; running it made the recordings."""
+    config = write_impaired_lab(lab_folder)
+    with RunningLab(config) as lab:
+        ports = lab.lab.ports
+        controllers = {rig: every(0.03, answer) for rig in RIGS} | {"state-way": answer_each_state}
+        threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        said = hilrig("impair", "--json", "--config", config)
+        assert said.returncode == 0, said.stderr
+        eventually(lambda: len(lab.recordings) == len(RIGS))
+    return {row["rig"]: row for row in json.loads(said.stdout)}
+
+
+@pytest.fixture(scope="module")
+def sessions(shown: dict[str, Any], lab_folder: Path) -> dict[str, Session]:
+    runs = [open_run(path) for path in (lab_folder / "recordings").rglob("*.mcap")]
+    return {run.rig: Session(run, measure(run)) for run in runs}
+
+
+def assert_stages_add_up(session: Session) -> None:
+    table = session.report.table
+    assert (sum(table[stage] for stage in STAGES) == table["loop"]).all()
+    for stage in STAGES:
+        assert (table[stage] >= 0).all(), stage
+
+
+@pytest.mark.parametrize("rig", COMMAND_RIGS)
+def test_injected_is_what_was_asked_for(sessions: dict[str, Session], rig: str) -> None:
+    session, distribution = sessions[rig], DISTRIBUTIONS[COMMAND_RIGS[rig]]
+    assert_stages_add_up(session)
+    assert session.report.samples > 200
+    if distribution is None:
+        assert set(session.injected_ms) == {35.0}
+    else:
+        found = stats.kstest(session.injected_ms, distribution.cdf)
+        assert found.pvalue > 0.01, found
+
+
+@pytest.mark.parametrize("rig", COMMAND_RIGS)
+def test_each_command_has_the_delay_that_its_seed_gives_it(sessions: dict[str, Session], rig: str) -> None:
+    commands = sessions[rig].run.commands
+    commands = commands[commands["write_arrived_ns"] > 0]
+    way = WayImpairment.model_validate(COMMAND_RIGS[rig])
+    drawn, _ = Impairment(way, way_seed(SEED, rig, "command")).draw(2000)
+    expected = drawn[(commands["seq"] - commands["seq"][0]).astype(int)]
+    assert commands["command_injected_ns"].tolist() == expected.tolist()
+
+
+def test_a_trace_is_injected_in_its_order(sessions: dict[str, Session]) -> None:
+    """The one at the very end of the session may still have been on its way."""
+    assert_stages_add_up(sessions["trace"])
+    commands = sessions["trace"].run.commands
+    commands = commands[commands["write_arrived_ns"] > 0]
+    start = TRACE_MS.index(commands["command_injected_ns"][0] / 1e6)
+    first = commands["seq"][0]
+    expected = [TRACE_MS[int(start + seq - first) % len(TRACE_MS)] for seq in commands["seq"]]
+    assert (commands["command_injected_ns"] / 1e6).tolist() == expected
+
+
+def test_injected_on_the_states_way_is_what_was_asked_for(sessions: dict[str, Session]) -> None:
+    """Each state is answered when it shows, and before the next tick: so each is a sample, once."""
+    session = sessions["state-way"]
+    assert_stages_add_up(session)
+    assert session.report.samples > 500
+    found = stats.kstest(session.injected_ms, stats.uniform(1, 5).cdf)
+    assert found.pvalue > 0.01, found
+
+
+@pytest.mark.parametrize("rig", [*COMMAND_RIGS, "trace"])
+def test_the_loop_is_longer_by_what_was_injected(sessions: dict[str, Session], rig: str) -> None:
+    """To the tick's quantisation: what is added to a loop appears in it as whole steps, on average as it is."""
+    # Where the machine stalls, it stalls all of them; the longest are left out.
+    loop_ms, free_ms, injected_ms = (
+        stats.trim_mean(values, 0.05)
+        for values in (sessions[rig].loop_ms, sessions["free"].loop_ms, sessions[rig].injected_ms)
+    )
+    assert loop_ms - free_ms == pytest.approx(injected_ms, abs=0.5 * STEP_MS)
+    table = sessions[rig].report.table
+    rest = (table["loop"] - table["injected"] - table["tick_wait"]) / 1e6
+    # What is left but the wait for the tick is what it was, whatever was injected.
+    free = sessions["free"].report.table
+    free_rest = (free["loop"] - free["tick_wait"]) / 1e6
+    assert np.median(rest) == pytest.approx(np.median(free_rest), abs=0.5 * STEP_MS)
+
+
+def test_what_is_lost_leaves_a_gap_in_the_numbers(sessions: dict[str, Session], shown: dict[str, Any]) -> None:
+    counts = shown["lossy"]["commands"]
+    commands = sessions["lossy"].run.commands
+    written = commands[commands["write_arrived_ns"] > 0]
+    assert counts["lost"] > 0.04 * counts["count"]
+    assert len(written) == counts["count"] - counts["lost"] - counts["overtaken"]
+    assert int(np.diff(written["seq"].astype(int)).max()) > 2, "losses come in bursts"
+    assert sessions["lossy"].report.lost.transport == 0, "what is lost on purpose is no gap of the recording"
+
+
+def test_a_schedule_is_followed_and_on_the_record(sessions: dict[str, Session]) -> None:
+    run = sessions["scheduled"].run
+    commands = run.commands[run.commands["write_arrived_ns"] > 0]
+    begun_ns = commands["write_arrived_ns"][0]
+    late = (commands["write_arrived_ns"] - begun_ns) / 1e9
+    for low, high, injected_ns in ((0.0, 1.95, 0), (2.1, 3.95, 20_000_000), (4.1, SECONDS, 0)):
+        part = commands[(late > low) & (late < high)]
+        assert len(part) > 20
+        assert set(part["command_injected_ns"].tolist()) == {injected_ns}
+    assert run.events["text"][run.events["kind"] == "IMPAIRMENT_CHANGED"].tolist() == [
+        f"impairment of scheduled: state way none; command way constant delay 20 ms, seed {SEED} (by schedule)",
+        "impairment of scheduled: none (by schedule)",
+    ]
+
+
+def test_a_recording_can_be_the_trace_of_another_loop(sessions: dict[str, Session], lab_folder: Path) -> None:
+    from hilrig_replay.delay_trace import delay_trace
+
+    session = sessions["normal-way"]
+    trace = delay_trace(session.run)
+    table = session.report.table
+    assert trace.delays_ms == tuple(((table["controller"] + table["injected"]) / 1e6).tolist())
+    assert np.mean(trace.delays_ms) > 20
+
+
+def test_a_lab_is_impaired_by_command_while_it_runs(tmp_path: Path, sessions: dict[str, Session]) -> None:
+    recording = sessions["gamma-way"].run.path
+    config = write_impaired_lab(tmp_path)
+    with RunningLab(config) as lab, RawClient("127.0.0.1", lab.lab.ports["free"]) as client:
+        client.write(0, 1)
+
+        def row(*options: str | Path) -> dict[str, Any]:
+            said = hilrig("impair", "free", *options, "--json", "--config", config)
+            assert said.returncode == 0, said.stderr
+            decoded: dict[str, Any] = json.loads(said.stdout)
+            return decoded
+
+        assert row()["impairment"] == "none"
+        told = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
+        assert told["ways"]["state"]["delay"]["offset_ms"] == 15
+        assert told["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
+        assert (told["seed"], told["set_by"]) == (7, "hand")
+        assert row() | {"states": 0, "commands": 0} == told | {"states": 0, "commands": 0}
+        assert row("--trace", recording)["ways"]["command"]["delay"]["kind"] == "trace"
+        assert row("--off")["impairment"] == "none"
+        assert row("--lab")["set_by"] == "lab.toml"
+        shown = hilrig("impair", "--config", config)
+        for word in ("gamma mean 12 ms", "gilbert", "trace of 7", "(lab.toml, seed 2)"):
+            assert word in shown.stdout
+        for options, complaint in (
+            (("free", "--command", "constant:-3"), "delay_ms: expected greater than or equal to 0, found '-3'"),
+            (("free", "--preset", "wlan"), "no preset is called 'wlan': expected one of none, wired"),
+            (("free", "--trace", tmp_path / "none.mcap"), "none.mcap"),
+            (("free", "--trace", recording, "--command", "constant:1"), "leave out --command"),
+            (("free", "--off", "--preset", "vpn"), "--off and --lab stand alone"),
+            (("rig9", "--off"), "no rig is called 'rig9'"),
+            (("--off",), "setting an impairment takes a rig"),
+        ):
+            said = hilrig("impair", *options, "--config", config)
+            assert (said.returncode, len(said.stderr.splitlines())) == (2, 1), said.stderr
+            assert complaint in said.stderr
+
+
+def test_where_no_edge_runs_it_says_so(tmp_path: Path) -> None:
+    said = hilrig("impair", "--config", write_impaired_lab(tmp_path))
+    assert said.returncode == 3
+    assert "no edge answers for lab 'lab'" in said.stderr
