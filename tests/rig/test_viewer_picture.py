@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from browser import share_of
 from hilrig_replay.rerun_view import save_rrd
 from hilrig_replay.run import open_run
 from hilrig_replay.viewer import environment, executable, free_port, running_viewer
@@ -30,16 +31,6 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewer")
     save_rrd(open_run(record(folder / "run.mcap", Script(seconds=6.0))), folder / "run.rrd")
     return folder / "run.rrd"
-
-
-def share_of(
-    picture: np.ndarray, red: tuple[float, float], green: tuple[float, float], blue: tuple[float, float]
-) -> float:
-    """Share of pixels whose channels, 0 to 1, lie in the ranges."""
-    inside = np.ones(picture.shape[:2], dtype=bool)
-    for channel, (low, high) in enumerate((red, green, blue)):
-        inside &= (picture[..., channel] >= low) & (picture[..., channel] <= high)
-    return float(inside.mean())
 
 
 @pytest.mark.skipif(shutil.which("xvfb-run") is None or not DRIVER.exists(), reason="needs xvfb, mesa-vulkan-drivers")

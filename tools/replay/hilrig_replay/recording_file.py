@@ -29,6 +29,8 @@ PART_SUFFIX: Final = ".part"
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+_MESSAGE: Final = Opcode.MESSAGE.value
+"""Looked up once: an enumeration's value costs as much as reading a message."""
 
 
 class RawMessage(NamedTuple):
@@ -79,9 +81,11 @@ class RecordingFile:
                             continue
                         if index.message_index_offsets and wanted.keys().isdisjoint(index.message_index_offsets):
                             continue
-                        for message in _in_chunk(_read_chunk(stream, index), wanted):
-                            if low <= message.log_ns < high:
-                                yield message
+                        messages = _in_chunk(_read_chunk(stream, index), wanted)
+                        if low <= index.message_start_time and index.message_end_time < high:
+                            yield from messages
+                        else:
+                            yield from (message for message in messages if low <= message.log_ns < high)
                 else:
                     for record in StreamReader(stream, validate_crcs=True).records:
                         if (
@@ -230,7 +234,7 @@ def _in_chunk(data: bytes, wanted: dict[int, str]) -> Iterator[RawMessage]:
     while at < end:
         opcode, length = head(data, at)
         following = at + 9 + length
-        if opcode == Opcode.MESSAGE.value:
+        if opcode == _MESSAGE:
             _, _, channel, sequence, log_ns, publish_ns = message_head(data, at)
             topic = wanted.get(channel)
             if topic is not None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilrig_replay.viewer import LOOPBACK
+from hilrig_replay.fence import LOOPBACK
 from hilrig_runtime.errors import InputError, OperationError
 
 APPLICATION = "hilrig"

@@ -7,15 +7,15 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
 import rerun_cli
 
+from hilrig_replay.fence import LOOPBACK, fenced
 from hilrig_runtime.errors import OperationError
 
-LOOPBACK: Final = "127.0.0.1"
 MEMORY_LIMIT: Final = "1GB"
 """When the viewer holds more than this it drops what is oldest."""
 START_TIMEOUT_S: Final = 30.0
@@ -65,15 +65,19 @@ def open_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) ->
 
 @contextmanager
 def running_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
-    """`open_viewer`, ready to take data, and ended on leaving.
+    """`open_viewer`, ready to take data, and ended on leaving; a browser gets its page from behind a fence.
 
     Raises:
         OperationError: it does not start; the display may be missing.
     """
-    process = open_viewer(*arguments, grpc_port=grpc_port, web_port=web_port)
+    page_port = None if web_port is None else free_port()
+    process = open_viewer(*arguments, grpc_port=grpc_port, web_port=page_port)
     try:
-        wait_until_served(process, [grpc_port, *([] if web_port is None else [web_port])])
-        yield process
+        wait_until_served(process, [grpc_port, *([] if page_port is None else [page_port])])
+        with ExitStack() as fence:
+            if page_port is not None and web_port is not None:
+                fence.enter_context(fenced(page_port, grpc_port, web_port))
+            yield process
     finally:
         if process.poll() is None:
             process.terminate()

@@ -1,0 +1,105 @@
+"""The report and the web viewer in a browser, as a teacher opens them."""
+
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from browser import CHROMIUM, Browser, share_of
+from hilrig_replay.palette import JOINT_COLORS, rgb
+from labs import HILRIG, hilrig
+from recordings import Script, make, record, write
+
+pytestmark = [pytest.mark.rig, pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")]
+
+TASK = "[task]\ntitle = 'There'\n[[task.poses]]\nname = 'a'\nposition_mm = [400, 100, 50]\ntolerance_mm = 300\n"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for name, script in (("quick", Script(seconds=12.0)), ("slow", Script(seconds=12.0, delay_ms=40.0))):
+        made = make(script, session=name)
+        write(folder / f"{name}.mcap", made, script=script, session=name, lab_toml=TASK)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("width", [1200, 420])
+def test_a_report_is_whole_wide_and_narrow_and_asks_the_network_for_nothing(
+    runs: Path, browser: Browser, width: int, tmp_path: Path
+) -> None:
+    page = tmp_path / "report.html"
+    result = hilrig("report", runs / "quick.mcap", "--out", page)
+    assert (result.returncode, result.stdout.strip()) == (0, str(page)), result.stderr
+    browser.open(page.as_uri(), width=width, height=2400)
+    assert browser.errors == []
+    assert all(address.startswith(("file:", "data:")) for address in browser.requests)
+    assert browser.run("[...document.images].every(image => image.complete && image.naturalWidth > 500)")
+    assert browser.run("document.images.length") == 2
+    # Nothing sticks out: wide tables scroll within their sections.
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    words = browser.run("document.body.innerText")
+    for said in ("Task: There", "passed", "register wait", "controlled by 192.0.2.7:40001"):
+        assert said in words, said
+    picture = browser.picture()
+    # White sections on a grey page, with curves in the joints' colours in them.
+    assert (picture > 0.99).all(axis=-1).mean() > 0.3
+    for color in JOINT_COLORS:
+        near = np.abs(picture - np.array(rgb(color)) / 255).max(axis=-1) < 0.12
+        assert near.sum() > 20, color
+
+
+def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, browser: Browser, tmp_path: Path) -> None:
+    page = tmp_path / "class.html"
+    assert hilrig("report", runs, "--out", page).returncode == 0
+    browser.open(page.as_uri())
+    assert browser.errors == []
+    assert browser.run("document.querySelectorAll('details').length") == 2
+    assert browser.run("document.querySelectorAll('section table tbody tr').length") >= 2
+    before = browser.run("document.body.scrollHeight")
+    browser.run("document.querySelector('summary').click()")
+    assert browser.run("document.querySelector('details').open")
+    assert browser.run("document.body.scrollHeight") > before + 500
+
+
+def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path) -> None:
+    run = record(tmp_path / "run.mcap", Script(seconds=6.0))
+    process = subprocess.Popen(
+        [*HILRIG, "replay", str(run), "--web"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stderr is not None
+        told = re.match(r"open (http://127\.0\.0\.1:\S+) ", process.stderr.readline())
+        assert told is not None
+        with Browser(tmp_path / "browser", graphics=True) as browser:
+            browser.open(told[1], width=1000, height=600)
+
+            def arm_on_its_table(picture: np.ndarray) -> bool:
+                scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
+                table = share_of(scene, (0.75, 1), (0.7, 1), (0.6, 0.9))
+                return table > 0.05 and share_of(scene, (0.6, 1), (0.35, 0.75), (0, 0.45)) > 0.003
+
+            picture = browser.until(arm_on_its_table)
+            curves = picture[:, int(0.6 * picture.shape[1]) :]
+            assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10
+            elsewhere = [one for one in browser.requests if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", one)]
+            assert elsewhere == [], elsewhere
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        if process.stderr is not None:
+            process.stderr.close()
