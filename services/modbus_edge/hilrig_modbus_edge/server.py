@@ -23,6 +23,7 @@ from hilrig_modbus_edge.registers import UNIT_IDS
 from hilrig_modbus_edge.throttle import Throttle
 from hilrig_modbus_edge.tls import TlsGate, TlsPolicy
 from hilrig_modbus_edge.traffic import TrafficRecord
+from hilrig_modbus_edge.transport import DirectLoop, DirectTransport, accept_connections
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters
@@ -63,19 +64,25 @@ class RigServer:
         """Connections whose TLS handshake is going on."""
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._throttle = Throttle(REFUSAL_PERIOD_NS)
-        self._servers: list[asyncio.Server] = []
+        self._doors: list[asyncio.Task[None]] = []
+        self._tls_servers: list[asyncio.Server] = []
 
-    async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
+    async def listen(self, loop: DirectLoop, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
         """Take connections from a socket that listens, with TLS where there is a policy for it.
 
         What has connected already is served now.
         """
+        if policy is None:
+            self._doors.append(loop.create_task(accept_connections(loop, listening, self._welcome)))
+        else:
+            # asyncio's own transports know TLS.
+            server = await loop.create_server(lambda: TlsGate(self, policy), sock=listening, backlog=BACKLOG)
+            self._tls_servers.append(server)
 
-        def accept() -> asyncio.BaseProtocol:
-            return Doorstep(self) if policy is None else TlsGate(self, policy)
-
-        loop = asyncio.get_running_loop()
-        self._servers.append(await loop.create_server(accept, sock=listening, backlog=BACKLOG))
+    def _welcome(self, transport: DirectTransport) -> None:
+        peer = self.admit(transport)
+        if peer is not None:
+            self.take(transport, *peer)
 
     def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
         """Who connected, if he may; else None, and the connection is closed."""
@@ -139,26 +146,14 @@ class RigServer:
 
     def close(self, reason: str) -> None:
         """Stop listening and close every connection."""
-        for server in self._servers:
+        for door in self._doors:
+            door.cancel()
+        for server in self._tls_servers:
             server.close()
         for gate in list(self.gates):
             gate.close()
         for connection in list(self.connections):
             connection.close(reason)
-
-
-class Doorstep(asyncio.Protocol):
-    """A connection that has just been made without TLS."""
-
-    def __init__(self, server: RigServer) -> None:
-        self._server = server
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.BaseProtocol`."""
-        assert isinstance(transport, asyncio.Transport)
-        peer = self._server.admit(transport)
-        if peer is not None:
-            self._server.take(transport, *peer)
 
 
 class Connection(asyncio.BufferedProtocol):

@@ -1,0 +1,225 @@
+"""TCP connections that the loop's selector serves itself, without asyncio's way around each event.
+
+asyncio puts a handle into a queue for every socket that is ready, then runs it in a context, then asks the transport,
+then the protocol: as much time as a Modbus request takes. Here a socket that is ready is read, answered and looked at
+again where the selector finds it; only what is asyncio's own goes back to asyncio.
+"""
+
+import asyncio
+import logging
+import selectors
+import socket
+from collections.abc import Callable
+from selectors import EVENT_READ, EVENT_WRITE
+from typing import Any, Final
+
+TURN: Final = 16
+"""Events served in a row before asyncio's own have their turn."""
+HIGH_WATER: Final = 65_536
+LOW_WATER: Final = 16_384
+"""Bytes that wait to be sent: above the one the protocol is told to pause, below the other to go on."""
+
+_Events = list[tuple[selectors.SelectorKey, int]]
+
+logger = logging.getLogger(__name__)
+
+
+class DirectSelector(selectors.DefaultSelector):
+    """A selector for an asyncio loop that calls what was registered with a function, and tells asyncio of the rest."""
+
+    def select(self, timeout: float | None = None) -> _Events:
+        """See `selectors.BaseSelector.select`."""
+        ready: _Events = super().select(timeout)
+        served = 0
+        while True:
+            others: _Events = []
+            for event in ready:
+                # asyncio's own data is a pair of handles.
+                data = event[0].data
+                if type(data) is tuple:
+                    others.append(event)
+                else:
+                    data(event[1])
+            served += len(ready)
+            if others or not ready or served >= TURN:
+                return others
+            ready = super().select(0)
+
+
+class DirectLoop(asyncio.SelectorEventLoop):
+    """An asyncio loop on a `DirectSelector`."""
+
+    def __init__(self) -> None:
+        self.direct = DirectSelector()
+        super().__init__(self.direct)
+
+
+class DirectTransport(asyncio.Transport):
+    """One TCP connection on a `DirectLoop`, for an `asyncio.BufferedProtocol` that `set_protocol` names."""
+
+    def __init__(self, loop: DirectLoop, connected: socket.socket, peer: Any) -> None:
+        super().__init__({"socket": connected, "peername": peer})
+        connected.setblocking(False)
+        self._loop = loop
+        self._selector = loop.direct
+        self._socket = connected
+        self._receive_into = connected.recv_into
+        self._send = connected.send
+        self._protocol: asyncio.BufferedProtocol | None = None
+        self._waiting = bytearray()
+        self._wanted = 0
+        self._reading = True
+        self._protocol_paused = False
+        self._closing = False
+        self._lost = False
+
+    # -- what asyncio's transports do
+
+    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
+        """Name the protocol; reading begins with the first."""
+        assert isinstance(protocol, asyncio.BufferedProtocol)
+        self._protocol = protocol
+        self._get_buffer, self._buffer_updated = protocol.get_buffer, protocol.buffer_updated
+        self._want()
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Send what goes at once; what does not waits."""
+        if not self._waiting:
+            if self._lost:
+                return
+            try:
+                sent = self._send(data)
+            except (BlockingIOError, InterruptedError):
+                sent = 0
+            except OSError as error:
+                self._lose(error)
+                return
+            if sent == len(data):
+                return
+            data = memoryview(data)[sent:]
+        self._waiting += data
+        self._want()
+        if len(self._waiting) > HIGH_WATER and not self._protocol_paused and self._protocol is not None:
+            self._protocol_paused = True
+            self._protocol.pause_writing()
+
+    def pause_reading(self) -> None:
+        """Leave what comes in to the system."""
+        self._reading = False
+        self._want()
+
+    def resume_reading(self) -> None:
+        """Read again."""
+        self._reading = True
+        self._want()
+
+    def is_closing(self) -> bool:
+        """Whether it is closed, or will be when everything is sent."""
+        return self._closing
+
+    def close(self) -> None:
+        """Read no more, send what waits, then close."""
+        if not self._closing:
+            self._closing = True
+            self._want()
+            if not self._waiting:
+                self._lose(None)
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._lose(None)
+
+    # -- inside
+
+    def _want(self) -> None:
+        """Tell the selector what is waited for."""
+        wanted = 0
+        if not self._lost:
+            if self._reading and not self._closing and self._protocol is not None:
+                wanted = EVENT_READ
+            if self._waiting:
+                wanted |= EVENT_WRITE
+        if wanted == self._wanted:
+            return
+        if not self._wanted:
+            self._selector.register(self._socket, wanted, self._on_event)
+        elif not wanted:
+            self._selector.unregister(self._socket)
+        else:
+            self._selector.modify(self._socket, wanted, self._on_event)
+        self._wanted = wanted
+
+    def _on_event(self, events: int) -> None:
+        # Whoever was served before in the same turn may have closed this one.
+        events &= self._wanted
+        try:
+            if events & EVENT_READ:
+                self._read()
+            if events & EVENT_WRITE:
+                self._flush()
+        except Exception as error:
+            logger.exception("serving %s failed; its connection is closed", self.get_extra_info("peername"))
+            self._lose(error)
+
+    def _read(self) -> None:
+        try:
+            count = self._receive_into(self._get_buffer(-1))
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        if count:
+            self._buffer_updated(count)
+        else:
+            self.close()
+
+    def _flush(self) -> None:
+        try:
+            sent = self._send(self._waiting)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        del self._waiting[:sent]
+        if self._protocol_paused and len(self._waiting) <= LOW_WATER and self._protocol is not None:
+            self._protocol_paused = False
+            self._protocol.resume_writing()
+        self._want()
+        if self._closing and not self._waiting:
+            self._lose(None)
+
+    def _lose(self, error: Exception | None) -> None:
+        if self._lost:
+            return
+        self._lost = self._closing = True
+        self._waiting.clear()
+        self._want()
+        # Later, as asyncio does it: whoever closes a connection does not expect to hear of it meanwhile.
+        self._loop.call_soon(self._say_lost, error)
+
+    def _say_lost(self, error: Exception | None) -> None:
+        try:
+            if self._protocol is not None:
+                self._protocol.connection_lost(error)
+        finally:
+            self._socket.close()
+
+
+async def accept_connections(
+    loop: DirectLoop, listening: socket.socket, take: Callable[[DirectTransport], None]
+) -> None:
+    """Give every connection that comes to `take`, until cancelled."""
+    listening.setblocking(False)
+    while True:
+        try:
+            connected, peer = await loop.sock_accept(listening)
+        except OSError as error:
+            # Out of handles or memory: who has connected waits in the backlog.
+            logger.warning("can't take a connection on %s: %s", listening.getsockname(), error)
+            await asyncio.sleep(1.0)
+            continue
+        take(DirectTransport(loop, connected, peer))
+        # A flood of connections must not keep the others from their turn.
+        await asyncio.sleep(0)
