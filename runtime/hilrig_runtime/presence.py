@@ -101,19 +101,23 @@ class Presence:
         self._rigs = rigs
         self._clock = clock
         self._on_conflict = on_conflict
+        self._claimed = False
         self._closing = False
         self._wake = threading.Event()
         self._declared: list[Handle] = [bus.serve(ROSTER.key(lab, own.service, own.instance), self._answer)]
 
     def claim(self) -> None:
-        """Make sure that nobody has these rigs, and keep an eye on it from now on.
+        """Make sure that nobody has these rigs, and keep an eye on it from now on; a second call does nothing.
 
         Raises:
             OperationError: an elder has one of them.
         """
+        if self._claimed:
+            return
         reason = self._look()
         if reason:
             raise OperationError(reason)
+        self._claimed = True
         watched = alive_key(self._lab, self._own.service, "*")
         self._declared.append(self._bus.watch(watched, lambda _, alive: self._wake.set() if alive else None))
         threading.Thread(target=self._watch, name="presence", daemon=True).start()

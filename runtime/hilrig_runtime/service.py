@@ -164,14 +164,22 @@ class Service:
         self._closing.callback(self._presence.close)
         self.health.clock_offset = lambda: self._presence.clock_offset
 
+    def claim(self) -> None:
+        """Make sure that no other service of its kind has one of its rigs, or its name; before a word is sent.
+
+        Raises:
+            OperationError: one has.
+        """
+        self._presence.claim()
+
     def ready(self) -> None:
         """Say that the service does its work now: its liveliness token appears; a second call does nothing.
 
         Raises:
-            OperationError: another service of its kind has one of its rigs, or its name.
+            OperationError: as `claim`, if that was not called before.
         """
         if self._token is None:
-            self._presence.claim()
+            self.claim()
             token = self.bus.announce(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 

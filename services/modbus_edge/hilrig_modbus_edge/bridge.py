@@ -28,7 +28,7 @@ from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Arrival, Service
-from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest, topics
+from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest, RigReport, topics
 
 TICK_NS: Final = 20_000_000
 TRAFFIC_PERIOD_NS: Final = 200_000_000
@@ -56,7 +56,7 @@ class _Wire:
         commands = service.sender(topics.COMMAND, rig)
         self.send_command = commands.send
         self.repeat_command = commands.repeat
-        self.traffic = service.sender(topics.TRAFFIC, rig, on_bus=False)
+        self.traffic = service.sender(topics.TRAFFIC, rig)
         self._edge = edge
         self._timer: asyncio.TimerHandle | None = None
         self._send_ns: int | None = None
@@ -127,6 +127,7 @@ class Edge:
             )
             self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
         service.counters.rigs = len(service.rigs)
+        service.health.rig_reports = self._rig_reports
         self._traffic_due_ns = 0
         self._answers: list[Handle] = []
         self.alarm: Alarm
@@ -220,6 +221,19 @@ class Edge:
             if server.traffic.count and (traffic_due or server.traffic.count >= MOST):
                 self._send_traffic(server, now_ns)
         self.service.beat(now_ns)
+
+    def _rig_reports(self) -> list[RigReport]:
+        statuses = [wire.device.lease_status() for wire in self._wires.values()]
+        return [
+            RigReport(
+                rig=status.rig,
+                controller=status.holder,
+                session=status.session,
+                watchdog_tripped=status.watchdog_tripped,
+                connections=status.connections,
+            )
+            for status in statuses
+        ]
 
     def _send_traffic(self, server: RigServer, now_ns: int) -> None:
         message = server.traffic.take(now_ns, self.service.clock.wall_ns())

@@ -1,0 +1,49 @@
+"""`hilrig metrics`: the lab for Prometheus."""
+
+import threading
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import Config
+
+
+def metrics(
+    config: Config = None,
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to answer; :9464 alone is every address of this host.")
+    ] = "127.0.0.1:9464",
+) -> None:
+    """Serve the lab's figures at http://HOST:PORT/metrics for Prometheus, until Ctrl-C.
+
+    One process for the whole lab; the services only send the reports that they send anyway.
+    """
+    from hilrig_cli.lab_watch import LabWatch
+    from hilrig_cli.prometheus import metrics_server, text_of
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_runtime.lifecycle import stop_on_signals
+
+    lab = load_lab(config)
+    host, colon, port = listen.rpartition(":")
+    if not colon or not port.isdigit() or int(port) > 65535:
+        raise InputError(f"--listen {listen!r}: expected HOST:PORT, for example 127.0.0.1:9464")
+    stopping = threading.Event()
+    stop_on_signals(stopping)
+    with LabWatch(lab) as watch:
+
+        def text() -> str:
+            with watch.lock:
+                return text_of(watch.view, lab.name)
+
+        try:
+            server = metrics_server((host.strip("[]"), int(port)), text)
+        except OSError as error:
+            raise OperationError(
+                f"can't listen on {listen}: {error.strerror}; choose another address with --listen"
+            ) from error
+        with server:
+            threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
+            print(f"metrics of lab {lab.name}: http://{host or '0.0.0.0'}:{server.server_port}/metrics", flush=True)
+            stopping.wait()
+            server.shutdown()
