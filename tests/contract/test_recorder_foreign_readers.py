@@ -60,7 +60,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         run.file.messages(frozenset(CHANNEL_OF_TOPIC))
     ):
         channel = CHANNEL_OF_TOPIC[topic]
-        writer.add(channel, log_ns, encode_message(channel, sequence, log_ns, publish_ns, payload))
+        writer.add(encode_message(channel, sequence, log_ns, publish_ns, payload))
         if number % 300 == 299:
             writer.close_chunk()
     for name, data in run.file.attachments.items():

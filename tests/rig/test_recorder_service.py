@@ -242,7 +242,7 @@ def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
 def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hilrig_recorder.files._MIB", 12 * 1024)
+    monkeypatch.setattr("hilrig_recorder.files.MIB", 12 * 1024)
     lab = Lab(tmp_path, rotate_mib=1, min_free_mib=0)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
     with lab.recorder():

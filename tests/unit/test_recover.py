@@ -11,9 +11,10 @@ from mcap.writer import CompressionType, Writer
 
 import recordings
 from hilrig_recorder.channels import encode_message
+from hilrig_recorder.durable import lock_file
 from hilrig_recorder.recover import recover, recovered_path, session_of
 from hilrig_recorder.scan import Chunk, Message, is_whole, open_chunk, scan
-from hilrig_recorder.writer import RunWriter, lock_file
+from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.errors import InputError, OperationError
 from labs import hilrig
 
@@ -36,7 +37,7 @@ def good_file(path: Path, chunks: int = 40) -> list[list[Found]]:
             number += 1
             channel, log_time = rng.choice((1, 2, 3)), START + number * 1_000_000
             data = bytes(rng.randrange(4) for _ in range(rng.randrange(200)))
-            writer.add(channel, log_time, encode_message(channel, number, log_time, log_time, data))
+            writer.add(encode_message(channel, number, log_time, log_time, data))
             content.append((channel, number, log_time, data))
         writer.close_chunk()
         made.append(content)

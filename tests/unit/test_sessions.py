@@ -1,11 +1,14 @@
 """Sessions and files, decided without clock, bus or disk."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import pytest
 
+from hilrig_recorder.channels import message_head
 from hilrig_recorder.intake import Arrival
-from hilrig_recorder.sessions import KEEPER_SILENCE_NS, LINGER_MAX_NS, Recording, SessionBook
+from hilrig_recorder.recording import Recording
+from hilrig_recorder.sessions import KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
 from hilrig_runtime.logstream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
@@ -21,20 +24,31 @@ class FakeFile:
     """What one recording got."""
 
     recording: Recording
-    payloads: list[bytes] = field(default_factory=list)
-    log_times: list[int] = field(default_factory=list)
+    flush: Callable[[], None]
+    records: list[bytes] = field(default_factory=list)
     end: str = ""
     reason: str = ""
 
-    def add(self, _channel_id: int, log_time: int, record: bytes) -> None:
-        self.payloads.append(record[MESSAGE_HEAD_BYTES:])
-        self.log_times.append(log_time)
+    def write(self, records: Sequence[bytes]) -> None:
+        self.records += records
+
+    @property
+    def payloads(self) -> list[bytes]:
+        """What it got, and what waits for it."""
+        self.flush()
+        return [record[MESSAGE_HEAD_BYTES:] for record in self.records]
+
+    @property
+    def log_times(self) -> list[int]:
+        self.flush()
+        return [message_head(record).log_time for record in self.records]
 
 
 @dataclass
 class FakeShelf:
     """Keeps recordings in memory."""
 
+    flush: Callable[[], None] = lambda: None
     files: list[FakeFile] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     losses: list[tuple[str, int, int]] = field(default_factory=list)
@@ -47,7 +61,7 @@ class FakeShelf:
         if not self.accepts:
             return None
         recording.seen, recording.last = self.seen, dict(self.last)
-        self.files.append(FakeFile(recording))
+        self.files.append(FakeFile(recording, self.flush))
         return self.files[-1]
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
@@ -70,6 +84,7 @@ class Desk:
     def __init__(self, preroll_s: float = 2.0) -> None:
         self.shelf = FakeShelf()
         self.book = SessionBook(LAB, preroll_s, self.shelf)
+        self.shelf.flush = self.book.flush
         self.now = 100 * SECOND
         self.offset = WALL
         self.sim, self.edge = FakeSource("sim/1"), FakeSource("edge/1")

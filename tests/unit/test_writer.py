@@ -14,8 +14,10 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_recorder.channels import CHANNEL_OF_TOPIC, CHANNELS, encode_message
+from hilrig_recorder.chunk import CHUNK_BYTES
+from hilrig_recorder.durable import part_path
 from hilrig_recorder.scan import scan
-from hilrig_recorder.writer import CHUNK_BYTES, RunWriter, part_path
+from hilrig_recorder.writer import RunWriter
 from hilrig_schemas import JointState
 
 START = 1_767_225_600_000_000_000
@@ -30,7 +32,7 @@ def fill(writer: RunWriter, count: int, seed: int = 1, size: int = 150) -> list[
         channel = (STATE, COMMAND)[number % 2]
         data = rng.randbytes(size)
         log_time = START + number * 1_000_000
-        writer.add(channel, log_time, encode_message(channel, number, log_time, log_time - 1000, data))
+        writer.add(encode_message(channel, number, log_time, log_time - 1000, data))
         added.append((channel, number, log_time, data))
     return added
 
@@ -114,7 +116,7 @@ def test_a_recorded_state_decodes_with_the_schema_in_the_file(tmp_path: Path) ->
     with_parts.parts.add(name="bolt", x=0.5)
     writer = RunWriter(path)
     for message in (state, with_parts):
-        writer.add(STATE, START, encode_message(STATE, message.step, START, START, message.SerializeToString()))
+        writer.add(encode_message(STATE, message.step, START, START, message.SerializeToString()))
     writer.finish()
     writer.publish()
     with path.open("rb") as stream:
@@ -178,16 +180,15 @@ class SmallDisk:
 def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
     path = tmp_path / "run.mcap"
     failures: list[OSError] = []
-    writer = RunWriter(path, on_failure=failures.append)
+    writer = RunWriter(path)
     writer._file = SmallDisk(writer._file, room)  # type: ignore[assignment]
     added = []
     number = 0
     while not failures:
         number += 1
-        added += fill(writer, 20, seed=number)
         try:
-            if not failures:
-                writer.close_chunk()
+            added += fill(writer, 20, seed=number)
+            writer.close_chunk()
         except OSError as error:
             failures.append(error)
     writer.finish(lambda: {"hilrig.summary": {"lost_recorder": str(writer.given_up)}})

@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.writer import lock_file
+from hilrig_recorder.durable import lock_file
 from hilrig_runtime.bus import Answer
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Event

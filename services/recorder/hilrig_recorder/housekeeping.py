@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from hilrig_recorder.durable import PART_SUFFIX
 from hilrig_recorder.keep import finished_recordings, to_delete
 from hilrig_recorder.recover import RECOVERING_SUFFIX, recover, recovered_path
-from hilrig_recorder.writer import PART_SUFFIX
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import RecorderConfig
 from hilrig_runtime.errors import HilrigError

@@ -13,8 +13,9 @@ from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
+from hilrig_recorder.durable import PART_SUFFIX, lock_file
 from hilrig_recorder.scan import Chunk, Damage, DamagedError, Message, is_whole, message_keys, open_chunk, scan
-from hilrig_recorder.writer import LIBRARY, PART_SUFFIX, RunWriter, lock_file
+from hilrig_recorder.writer import LIBRARY, RunWriter
 from hilrig_runtime.errors import InputError, OperationError
 
 RECOVERING_SUFFIX: Final = ".recovering"
@@ -232,7 +233,7 @@ class _Copy:
         if message.channel_id not in self._declared:
             self._recovery.orphans += 1
             return
-        writer.add(message.channel_id, message.log_time, message.record)
+        writer.add(message.record)
         self._recovery.messages += 1
         self._last_ns = max(self._last_ns, message.log_time)
 

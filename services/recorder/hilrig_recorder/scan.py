@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from hilrig_recorder.writer import encoded
+from hilrig_recorder.summary import encoded
 
 CHUNK_LIMIT: Final = 1 << 30
 """A chunk that claims to be larger, bytes uncompressed, is taken for damage."""

@@ -19,12 +19,13 @@ from hilrig_recorder.files import Files
 from hilrig_recorder.guard import FolderLock, elder, introduction
 from hilrig_recorder.housekeeping import Housekeeping, unfinished
 from hilrig_recorder.intake import Intake
+from hilrig_recorder.recording import SECOND_NS, Recording
 from hilrig_recorder.recover import session_of
-from hilrig_recorder.sessions import SECOND_NS, Recording, SessionBook
+from hilrig_recorder.sessions import SessionBook
 from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, OpenSession, RigConfig
+from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
 TICK_NS: Final = SECOND_NS // 10
@@ -103,7 +104,7 @@ class Recorder:
             config,
             service.clock,
             self._disk,
-            source=service.source,
+            instance=service.instance,
             tell=self._tell,
             ask_config=self._ask_config,
             give_up=self._give_up,
@@ -114,6 +115,7 @@ class Recorder:
         self._restore(parts)
         self._stream = service.bus.subscribe_recording(LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss)
         self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
+        service.health.rig_reports = self._rig_reports
         self._housekeeping = Housekeeping(self._files.folder, parts, config, service.clock, self._troubles.put)
 
     def _restore(self, parts: list[Path]) -> None:
@@ -177,7 +179,7 @@ class Recorder:
             while True:
                 trouble = self._troubles.get_nowait()
                 if isinstance(trouble, str):
-                    self._tell(Event(severity=Event.ERROR, text=trouble))
+                    self._tell(Event(kind=Event.RECORDING, severity=Event.ERROR, text=trouble))
                 else:
                     self._files.fail(*trouble)
         with contextlib.suppress(Empty):
@@ -201,6 +203,9 @@ class Recorder:
         counters.bytes_written = self._files.bytes_written
         counters.trouble = self._files.trouble
         self._service.beat(now_ns)
+
+    def _rig_reports(self) -> list[RigReport]:
+        return [RigReport(rig=rig, recording=True) for rig in {recording.rig for recording in self._book.recordings}]
 
     def _tell(self, event: Event) -> None:
         logger.warning("%s", event.text)

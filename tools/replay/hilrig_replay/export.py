@@ -138,7 +138,7 @@ def _copy(run: Run, writer: RunWriter, drawing: "_Drawing", channel_ids: dict[st
     topics = frozenset({"state", "command", "event", "traffic"})
     for topic, sequence, log_ns, publish_ns, payload in run.file.messages(topics):
         channel_id = channel_ids[f"/{topic}"]
-        writer.add(channel_id, log_ns, encode_message(channel_id, sequence, log_ns, publish_ns, payload))
+        writer.add(encode_message(channel_id, sequence, log_ns, publish_ns, payload))
         if topic == "state":
             drawing.state(log_ns)
         elif topic == "event":
@@ -222,7 +222,7 @@ class _Drawing:
         self._sequences[topic] += 1
         channel_id = self._ids[topic]
         payload = message.SerializeToString()
-        self._writer.add(channel_id, log_ns, encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
+        self._writer.add(encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
 
 
 def _scene(solids: list[Solid]) -> Any:

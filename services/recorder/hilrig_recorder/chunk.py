@@ -1,0 +1,160 @@
+"""A chunk of a recording: messages compressed together, with the index that leads a reader to each of them. Pure."""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+
+CHUNK_BYTES: Final = 64 * 1024
+"""No chunk is larger, uncompressed, unless a single message is."""
+
+Compress = Callable[[bytes], bytes]
+
+_COMPRESSION: Final = b"zstd"
+# Tables of the size that a second of one rig needs: the same size on the disk as by default, for half the time.
+_COMPRESSOR: Final = zstandard.ZstdCompressionParameters.from_level(1, source_size=16 * 1024)
+
+_CHUNK: Final = struct.Struct("<BQQQQII4sQ")
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+_CHUNK_INDEX_HEAD: Final = struct.Struct("<BQQQQQI")
+_CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
+_CHANNEL_OFFSET: Final = struct.Struct("<HQ")
+_CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
+"""Of a message's record."""
+
+_NOTE: Final = struct.Struct("<QQQIIB")
+_COUNT: Final = struct.Struct("<HI")
+
+
+class ChunkNote(NamedTuple):
+    """What the index at a file's end needs of a chunk; times are wall clock, ns."""
+
+    start: int
+    """Offset in the file."""
+    first_ns: int
+    last_ns: int
+    data_size: int
+    """Bytes, compressed."""
+    raw_size: int
+    counts: tuple[tuple[int, int], ...]
+    """Channel and number of its messages; their indexes follow the chunk in this order."""
+
+    @property
+    def messages(self) -> int:
+        """How many there are."""
+        return sum(count for _, count in self.counts)
+
+    def index_record(self) -> bytes:
+        """The record that leads a reader to it."""
+        chunk_size = _CHUNK.size + self.data_size
+        offset = self.start + chunk_size
+        channel_offsets = b""
+        for channel_id, count in self.counts:
+            channel_offsets += _CHANNEL_OFFSET.pack(channel_id, offset)
+            offset += _INDEX_HEAD.size + 16 * count
+        head = _CHUNK_INDEX_HEAD.pack(
+            Opcode.CHUNK_INDEX.value,
+            _CHUNK_INDEX_HEAD.size + len(channel_offsets) + _CHUNK_INDEX_TAIL.size - 9,
+            self.first_ns,
+            self.last_ns,
+            self.start,
+            chunk_size,
+            len(channel_offsets),
+        )
+        tail = _CHUNK_INDEX_TAIL.pack(
+            offset - self.start - chunk_size, len(_COMPRESSION), _COMPRESSION, self.data_size, self.raw_size
+        )
+        return head + channel_offsets + tail
+
+
+class ChunkNotes:
+    """The notes of all chunks of a file, packed: a day of them is four megabytes."""
+
+    def __init__(self) -> None:
+        self._packed = bytearray()
+
+    def add(self, note: ChunkNote) -> None:
+        """Add the next one."""
+        for count in note.counts:
+            self._packed += _COUNT.pack(*count)
+        self._packed += _NOTE.pack(*note[:-1], len(note.counts))
+
+    def newest_first(self) -> Iterator[ChunkNote]:
+        """All of them."""
+        end = len(self._packed)
+        while end:
+            start, first_ns, last_ns, data_size, raw_size, channels = _NOTE.unpack_from(self._packed, end - _NOTE.size)
+            end -= _NOTE.size + channels * _COUNT.size
+            counts = tuple(_COUNT.iter_unpack(self._packed[end : end + channels * _COUNT.size]))
+            yield ChunkNote(start, first_ns, last_ns, data_size, raw_size, counts)
+
+    def take_back(self) -> ChunkNote:
+        """Remove the newest, and give it back."""
+        note = next(self.newest_first())
+        del self._packed[len(self._packed) - _NOTE.size - len(note.counts) * _COUNT.size :]
+        return note
+
+    def __bool__(self) -> bool:
+        return bool(self._packed)
+
+
+def compressor() -> Compress:
+    """What compresses chunks; for one thread, and best shared by all files of it: its tables then stay in the cache."""
+    return zstandard.ZstdCompressor(compression_params=_COMPRESSOR).compress
+
+
+def cut(records: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
+    """Messages in runs that make a chunk each."""
+    begin = size = 0
+    for at, record in enumerate(records):
+        length = len(record)
+        if size + length > CHUNK_BYTES and at > begin:
+            yield records[begin:at]
+            begin, size = at, 0
+        size += length
+    if begin < len(records):
+        yield records[begin:]
+
+
+def encode_chunk(records: Sequence[bytes], start: int, compress: Compress) -> tuple[bytes, ChunkNote]:
+    """A chunk and the message indexes that follow it, as they stand in a file at the offset `start`.
+
+    Args:
+        records: one message or more, each a whole MCAP record (`channels.encode_message`).
+        start: where the chunk will stand, bytes.
+        compress: see `compressor`.
+    """
+    indexes: dict[int, list[int]] = {}
+    offset = 0
+    for record in records:
+        channel_id, log_time = _CHANNEL_AND_LOG_TIME(record)
+        index = indexes.get(channel_id)
+        if index is None:
+            index = indexes[channel_id] = []
+        index += (log_time, offset)
+        offset += len(record)
+    first_ns = min(min(index[::2]) for index in indexes.values())
+    last_ns = max(max(index[::2]) for index in indexes.values())
+    raw = b"".join(records)
+    data = compress(raw)
+    head = _CHUNK.pack(
+        Opcode.CHUNK.value,
+        _CHUNK.size + len(data) - 9,
+        first_ns,
+        last_ns,
+        offset,
+        zlib.crc32(raw),
+        len(_COMPRESSION),
+        _COMPRESSION,
+        len(data),
+    )
+    pieces = [head, data]
+    for channel_id, index in indexes.items():
+        size = 8 * len(index)
+        pieces.append(_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX.value, 6 + size, channel_id, size))
+        pieces.append(struct.pack(f"<{len(index)}Q", *index))
+    counts = tuple((channel_id, len(index) // 2) for channel_id, index in indexes.items())
+    return b"".join(pieces), ChunkNote(start, first_ns, last_ns, len(data), offset, counts)

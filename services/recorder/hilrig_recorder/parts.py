@@ -1,0 +1,60 @@
+"""The files of one session: how they are called, and what the next must know of those before.
+
+`<session>.mcap`; when a session needs another file (the recorder was restarted, the file grew too large, the disk was
+full for a while) the next is `<session>.2.mcap`, and its metadata names the one before.
+"""
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilrig_recorder.durable import part_path
+from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
+from hilrig_runtime.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class NextPart:
+    """Where a session goes on."""
+
+    path: Path
+    number: int
+    """Which file of the session it is, from 1."""
+    previous: Path | None
+    """The one before; None: this is the first."""
+
+
+def next_part(folder: Path, session: str) -> NextPart:
+    """The first file of a session that is not there yet, whole or unfinished."""
+    number, previous = 1, None
+    while True:
+        path = folder / file_name(session, number)
+        if not path.exists() and not part_path(path).exists():
+            return NextPart(path, number, previous)
+        number, previous = number + 1, path
+
+
+def tail_of_session(folder: Path, session: str, number: int) -> Tail:
+    """The last seconds of a session's files up to a number: a recorder may have been restarted often."""
+    tail = _tail(folder / file_name(session, number))
+    last_ns = tail.last_ns
+    while number > 1 and (not last_ns or last_ns - tail.last_ns < TAIL_NS):
+        number -= 1
+        before = _tail(folder / file_name(session, number))
+        last_ns = last_ns or before.last_ns
+        reached_ns = before.last_ns or tail.last_ns
+        tail = Tail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
+    return tail
+
+
+def file_name(session: str, number: int) -> str:
+    """Name of a session's file; `number` counts from 1."""
+    return f"{session}.mcap" if number == 1 else f"{session}.{number}.mcap"
+
+
+def _tail(path: Path) -> Tail:
+    # It may get its name just now, from the disk's thread or because it is recovered.
+    for candidate in (path, part_path(path), path):
+        with contextlib.suppress(InputError):
+            return read_tail(candidate)
+    return Tail("", set(), {}, 0)
