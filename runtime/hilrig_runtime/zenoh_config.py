@@ -55,7 +55,7 @@ def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
     }
     if bus.tls is not None:
-        settings |= _secured(bus.tls, own_identity(bus.tls, service))
+        settings |= _secured(bus.tls, own_identity(bus.tls, service, instance))
         if mode == "peer":
             settings["access_control"] = access_control(bus.tls)
     return _made(settings)
@@ -74,15 +74,17 @@ def router_config(bus: BusConfig, lab: str, listen: str) -> zenoh.Config:
     return _made(settings)
 
 
-def own_identity(tls: BusTlsConfig, service: str) -> str:
-    """Whose certificate `service` takes: of the names that its role has, the first one whose key is on this host.
+def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE) -> str:
+    """Whose certificate an instance of `service` takes.
+
+    Of the names that its role has: the one that the instance is called, else the first whose key is on this host.
 
     Raises:
         InputError: there is none.
     """
     roles = (service,) if service in MESH_ORDER else TOOLS
     names = [identity.name for role in roles for identity in identities(tls) if identity.role == role]
-    for name in names:
+    for name in sorted(names, key=lambda name: name != instance):
         if (tls.folder / f"{name}.key").exists():
             return name
     wanted = " or ".join(f"{name}.key" for name in names)

@@ -81,10 +81,10 @@ def issue_client(authority: Identity, name: str, role: str, now: datetime, days:
     return _issue(authority, name, [ExtendedKeyUsageOID.CLIENT_AUTH], extension, now, days)
 
 
-def names_of(identity: Identity) -> set[str]:
+def names_in(certificate: x509.Certificate) -> set[str]:
     """The names and addresses that a certificate is good for; none: it is no server's."""
     try:
-        names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         return set()
     return {str(name.value) for name in names}

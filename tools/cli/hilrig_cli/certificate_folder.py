@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from hilrig_modbus_edge.certificates import Identity, load, make_authority, names_of
+from hilrig_modbus_edge.certificates import Identity, load, make_authority, names_in
 from hilrig_runtime.errors import InputError, OperationError
 
 AUTHORITY: Final = "ca"
@@ -49,8 +49,9 @@ class CertificateFolder:
         identity = None if self._renew else self._read(name)
         if identity is None:
             return True
-        left = identity.certificate.not_valid_after_utc - self._now
-        return left < min(RENEWED_BEFORE, timedelta(days=self._days) / 3) or not set(hosts) <= names_of(identity)
+        certificate = identity.certificate
+        left = certificate.not_valid_after_utc - self._now
+        return left < min(RENEWED_BEFORE, timedelta(days=self._days) / 3) or not set(hosts) <= names_in(certificate)
 
     def write(self, name: str, identity: Identity) -> None:
         """Write a certificate, and its key for its owner's eyes alone."""

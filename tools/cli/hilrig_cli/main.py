@@ -13,20 +13,25 @@ from hilrig_cli.commands import (
     check,
     compare,
     demo,
+    doctor,
     export,
     figures,
     impair,
+    jitter,
     latency,
     lease,
     live,
+    metrics,
     play,
     record,
     recover,
     registers,
     replay,
     report,
+    router,
     runs,
     services,
+    top,
     up,
     verify,
 )
@@ -48,15 +53,20 @@ REVIEW = "Review what was recorded"
 app.command(rich_help_panel=RUN)(up.up)
 app.command(rich_help_panel=RUN)(demo.demo)
 app.command(rich_help_panel=RUN)(live.live)
+app.command(rich_help_panel=RUN)(top.top)
+app.command(rich_help_panel=RUN)(metrics.metrics)
 app.command(rich_help_panel=RUN)(check.check)
+app.command(rich_help_panel=RUN)(doctor.doctor)
 app.command(rich_help_panel=RUN)(lease.lease)
 app.command(rich_help_panel=RUN)(impair.impair)
+app.command(rich_help_panel=RUN)(jitter.jitter)
 app.command(rich_help_panel=RUN)(registers.registers)
 app.command(rich_help_panel=RUN)(certs.certs)
 app.add_typer(record.app, name="record", rich_help_panel=RUN)
 app.command(rich_help_panel=SERVICES)(services.sim)
 app.command(rich_help_panel=SERVICES)(services.edge)
 app.command(rich_help_panel=SERVICES)(services.recorder)
+app.command(rich_help_panel=SERVICES)(router.router)
 app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
 app.command(rich_help_panel=REVIEW)(replay.replay)

@@ -1,0 +1,148 @@
+"""Who is on the bus: reachable at all, complete, of one version, with clocks that agree, without trouble?"""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from threading import Lock
+
+from hilrig_cli.checkup import Finding, good, notice, wrong
+from hilrig_runtime.clock import SYSTEM_CLOCK
+from hilrig_runtime.config import LabConfig
+from hilrig_runtime.errors import HilrigError
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas import Health
+from hilrig_schemas.topics import HEALTH, alive_key
+
+SERVICES = ("sim", "edge", "recorder")
+LISTENING_S = 2.5
+"""Each service says once a second how it is."""
+CLOCK_NOTICE_S = 1.0
+CLOCK_WRONG_S = 60.0
+
+
+@dataclass(slots=True)
+class Heard:
+    """What came over the bus."""
+
+    alive: set[str] = field(default_factory=set)
+    """ "<service>/<instance>" of those who show that they live."""
+    healths: dict[str, tuple[Health, int]] = field(default_factory=dict)
+    """The last report of each, and our wall clock when it came, ns."""
+
+    @property
+    def services(self) -> set[str]:
+        """Kinds of service that live."""
+        return {name.partition("/")[0] for name in self.alive}
+
+
+def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S, until: str = "") -> Heard:
+    """Listen on the lab's bus; with `until` only until that service has been heard.
+
+    Raises:
+        HilrigError: the bus can't be joined.
+    """
+    heard, lock = Heard(), Lock()
+
+    def on_health(key: str, payload: bytes) -> None:
+        del key
+        health = HEALTH.decode(payload)
+        with lock:
+            heard.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
+
+    def on_alive(key: str, alive: bool) -> None:
+        name = "/".join(key.split("/")[-2:])
+        with lock:
+            (heard.alive.add if alive else heard.alive.discard)(name)
+
+    with (
+        ZenohBus(lab.bus, identity) as bus,
+        bus.subscribe(HEALTH.key(lab.name, "*", "*"), on_health),
+        bus.watch(alive_key(lab.name, "*", "*"), on_alive),
+    ):
+        deadline_s = time.monotonic() + for_s
+        while time.monotonic() < deadline_s:
+            with lock:
+                if until and any(name.partition("/")[0] == until for name in heard.healths):
+                    break
+            time.sleep(0.02)
+    return heard
+
+
+def check_bus(lab: LabConfig) -> tuple[list[Finding], Heard]:
+    """Whether the bus can be joined, and what is heard there."""
+    where = f"router {lab.bus.router}" if lab.bus.topology == "router" else f"mesh on {lab.bus.host}"
+    try:
+        heard = listen(lab)
+    except HilrigError as error:
+        mend = "start the router (hilrig router), and look at the certificates below"
+        return [wrong("bus", str(error), mend)], Heard()
+    return [good("bus", f"{where}: joined")], heard
+
+
+def check_services(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
+    """Whether all that a lab needs is there."""
+    if not heard.services & set(SERVICES):
+        yield notice("services", f"nothing of lab {lab.name!r} runs", "start it: hilrig up, or service by service")
+        return
+    missing = [service for service in SERVICES if service not in heard.services]
+    if missing:
+        yield wrong("services", f"no {' and no '.join(missing)} runs", f"start it: hilrig {missing[0]}")
+    silent = sorted(name for name in heard.alive if name.partition("/")[0] in SERVICES and name not in heard.healths)
+    if silent:
+        yield wrong("services", f"{', '.join(silent)} shows that it lives, but says nothing", "start it again")
+    if not missing and not silent:
+        yield good("services", f"{', '.join(sorted(heard.alive))} live")
+    for name, (health, _) in sorted(heard.healths.items()):
+        if health.trouble:
+            yield wrong("services", f"{name}: {health.trouble}", "see what it says, and its log")
+        if health.lost_transport or health.lost_recorder:
+            lost = health.lost_transport + health.lost_recorder
+            yield notice("services", f"{name}: {lost} messages lost since it started", "see the sizing in the docs")
+
+
+def check_versions(healths: Iterable[Health], own: str) -> Iterator[Finding]:
+    """All services are of the version that this command is of."""
+    versions: dict[str, list[str]] = {}
+    for health in healths:
+        versions.setdefault(health.software_version or "an older version", []).append(
+            f"{health.service}/{health.instance}"
+        )
+    others = {version: names for version, names in versions.items() if version != own}
+    for version, names in sorted(others.items()):
+        say = notice if _series(version) == _series(own) else wrong
+        yield say(
+            "versions",
+            f"{', '.join(sorted(names))} of {version}; this command is {own}",
+            "install the same version everywhere; services can be exchanged one by one",
+        )
+    if versions and not others:
+        yield good("versions", f"all of {own}")
+
+
+def check_clocks(reports: Sequence[tuple[Health, int]]) -> Iterator[Finding]:
+    """Hosts' wall clocks agree; no figure depends on that, but people compare dates. Each report with our clock, ns."""
+    if not reports:
+        return
+    offsets = {
+        f"{health.service}/{health.instance}" + (f" on {health.host}" if health.host else ""): (
+            (health.wall_ns - heard_ns) / 1e9
+        )
+        for health, heard_ns in reports
+    }
+    name, offset_s = max(offsets.items(), key=lambda item: abs(item[1]))
+    if abs(offset_s) < CLOCK_NOTICE_S:
+        yield good("time", f"all clocks within {abs(offset_s) * 1e3:.0f} ms of this host's")
+        return
+    say = wrong if abs(offset_s) >= CLOCK_WRONG_S else notice
+    ahead = "ahead of" if offset_s > 0 else "behind"
+    yield say(
+        "time",
+        f"the clock of {name} is {abs(offset_s):.1f} s {ahead} this host's; it dates recordings",
+        "synchronise the hosts' clocks (NTP); latencies do not depend on them",
+    )
+
+
+def _series(version: str) -> tuple[str, ...]:
+    """What must be equal for two versions to be compatible: before 1.0 the second number too."""
+    parts = version.split(".")
+    return tuple(parts[:2] if parts[0] == "0" else parts[:1])

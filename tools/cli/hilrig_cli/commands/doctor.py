@@ -1,0 +1,113 @@
+"""`hilrig doctor`: is this deployment as it should be, and what is to be mended?"""
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilrig_cli.options import AsJson, Config
+
+if TYPE_CHECKING:
+    from hilrig_cli.checkup import Finding
+    from hilrig_runtime.config import LabConfig
+
+
+def doctor(
+    config: Config = None,
+    service: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Only ask whether this service is well (sim, edge, recorder or router), as health checks do.",
+            show_default=False,
+        ),
+    ] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Look at ports, bus, services, certificates, versions, clocks, limits and disk, and say what is to be mended.
+
+    Run it on each host, before or while the lab runs. Exit code 1 if something is wrong.
+    """
+    from hilrig_runtime.config import load_lab
+
+    lab = load_lab(config)
+    findings = _one_service(lab, service) if service else _everything(lab)
+    bad = [finding for finding in findings if finding.level.value == "wrong"]
+    if as_json:
+        rows = [
+            {"check": found.check, "level": found.level.value, "text": found.text, "mend": found.mend}
+            for found in findings
+        ]
+        print(json.dumps({"lab": lab.name, "well": not bad, "findings": rows}))
+    else:
+        _print(findings)
+    if bad:
+        raise typer.Exit(1)
+
+
+def _everything(lab: "LabConfig") -> "list[Finding]":
+    from datetime import UTC, datetime
+    from importlib.metadata import version
+
+    from hilrig_cli.checkup import good, host
+    from hilrig_cli.checkup import services as on_bus
+
+    findings = [good("lab", f"{lab.name!r}: {len(lab.rigs)} rigs, step {lab.sim.step_ms:g} ms")]
+    findings += host.check_software()
+    of_bus, heard = on_bus.check_bus(lab)
+    findings += of_bus
+    findings += on_bus.check_services(lab, heard)
+    findings += on_bus.check_versions((health for health, _ in heard.healths.values()), version("hilrig"))
+    findings += on_bus.check_clocks(list(heard.healths.values()))
+    if lab.bus.tls is not None or lab.edge.tls is not None:
+        # A host without certificates does not need what reads them.
+        from hilrig_cli.checkup.certificates import check_certificates
+
+        findings += check_certificates(lab, datetime.now(UTC))
+    findings += host.check_ports(lab, heard.services)
+    findings += host.check_open_files(lab)
+    findings += host.check_punctuality(lab)
+    findings += host.check_disk(lab)
+    return findings
+
+
+def _one_service(lab: "LabConfig", service: str) -> "list[Finding]":
+    from hilrig_cli.checkup import good, wrong
+    from hilrig_cli.checkup.services import SERVICES, listen
+    from hilrig_runtime.errors import HilrigError, InputError
+
+    if service not in (*SERVICES, "router"):
+        raise InputError(f"--service {service}: expected sim, edge, recorder or router")
+    if service == "router" and lab.bus.topology != "router":
+        raise InputError("--service router: this lab has none (bus.topology in lab.toml)")
+    # A container has its own service's certificate and no other; in a mesh a tool's is needed, for the port is taken.
+    identity = service if lab.bus.topology == "router" else "tool"
+    try:
+        heard = listen(lab, identity, until=service, for_s=0.0 if service == "router" else 2.5)
+    except HilrigError as error:
+        return [wrong(service, str(error), "see its log")]
+    if service == "router":
+        return [good(service, "it answers")]
+    for name, (health, _) in heard.healths.items():
+        if name.partition("/")[0] == service:
+            if health.trouble:
+                return [wrong(service, health.trouble, "see its log")]
+            return [good(service, f"{name} is well, {health.uptime_ns / 1e9:.0f} s after it started")]
+    return [wrong(service, f"no {service} says how it is", "see its log, or start it again")]
+
+
+def _print(findings: "list[Finding]") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    colours = {"good": "green", "notice": "yellow", "wrong": "bold red"}
+    table = Table()
+    for column in ("", "check", "found"):
+        table.add_column(column, no_wrap=column != "found", overflow="fold")
+    for found in findings:
+        mend = f"\n[dim]→ {found.mend}[/dim]" if found.mend else ""
+        level = found.level.value
+        table.add_row(f"[{colours[level]}]{level}[/]", found.check, found.text.replace("[", r"\[") + mend)
+    Console().print(table)
+    wrong = sum(found.level.value == "wrong" for found in findings)
+    Console().print("[green]all is well[/]" if not wrong else f"[bold red]{wrong} to mend[/]")

@@ -1,0 +1,35 @@
+"""`hilrig router`: the router of a lab on several machines."""
+
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.commands.services import StopWithParent
+from hilrig_cli.options import Config
+
+
+def router(
+    config: Config = None,
+    listen: Annotated[
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Where to listen, as tls/0.0.0.0:7447; without: at bus.router of lab.toml.",
+            show_default=False,
+        ),
+    ] = "",
+    print_only: Annotated[
+        bool, typer.Option("--print", help="Print the configuration for zenoh's own router (zenohd -c) instead.")
+    ] = False,
+    stop_with_parent: StopWithParent = False,
+) -> None:
+    """Run the zenoh router of a lab, with access control by certificate where the lab has [bus.tls]."""
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.router import router_endpoint, run_router
+    from hilrig_runtime.zenoh_config import router_config
+
+    lab = load_lab(config)
+    if print_only:
+        print(router_config(lab.bus, lab.name, router_endpoint(lab, listen)))
+        return
+    run_router(lab, listen, stop_with_parent=stop_with_parent)
