@@ -111,7 +111,7 @@ class Edge:
     def __init__(self, service: Service) -> None:
         self.service = service
         lab = service.lab
-        states = service.latest(topics.STATE)
+        states = service.latest_of_batches(topics.STATES)
         self._wires: dict[str, _Wire] = {}
         self._servers: list[RigServer] = []
         for rig in service.rigs:

@@ -20,7 +20,7 @@ from hilrig_runtime.bus import Bus
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.task_config import TaskConfig
-from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, parse_rig_key
+from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, TRAFFIC, parse_rig_key
 
 VIEWER_PERIOD_S: Final = 0.04
 """How often what has come in is drawn into a viewer, s."""
@@ -62,7 +62,9 @@ class Follower:
         self._incarnation = 0
         self._heard_ns = clock.monotonic_ns()
         self._silent = False
-        self._handles = [bus.subscribe(topic.key(lab, rig), self._on_message) for topic in (STATE, COMMAND, EVENT)]
+        self._handles = [
+            bus.subscribe(topic.key(lab, rig), self._on_message) for topic in (STATE, COMMAND, EVENT, TRAFFIC)
+        ]
 
     def _on_message(self, key: str, payload: bytes) -> None:
         self._waiting.append((parse_rig_key(key).topic.name, payload, self._clock.wall_ns()))

@@ -73,7 +73,6 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
             contents=[f"+ {_path(root, 'lanes')}/**" for root in roots],
         ),
     )
-    lateness = plot("Tick lateness, ms", "lateness", legend=False)
     curves = rrb.Vertical(
         plot("Positions: θ in °, d3 in mm; events as marks", "position", "marks"),
         plot("Velocities: θ in °/s, d3 in mm/s", "velocity", legend=False),
@@ -81,8 +80,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         plot("Loop latency, made of its stages, ms", "stages", "marks")
         if len(roots) == 1
         else plot("Loop latency, ms", "loop"),
-        # What controllers ask is on the record alone, not on the bus.
-        lateness if live else rrb.Tabs(lateness, plot("Modbus requests per second", "modbus")),
+        rrb.Tabs(plot("Tick lateness, ms", "lateness", legend=False), plot("Modbus requests per second", "modbus")),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
     )
     return rrb.Blueprint(

@@ -49,6 +49,7 @@ def write_run(stream: rr.RecordingStream, run: Run, *, root: str = "", color: st
     view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
     for block in run.blocks():
         view.add(block)
+    view.end()
 
 
 def root_names(runs: Sequence[Run]) -> list[str]:

@@ -33,6 +33,7 @@ from hilrig_replay.palette import (
     rgb,
 )
 from hilrig_replay.records import Records
+from hilrig_replay.request_rates import BIN_NS, Rate, RequestRates
 from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL, arm_path
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_replay.timebase import Timebase
@@ -40,11 +41,8 @@ from hilrig_runtime.task_config import TaskConfig
 from hilrig_sim.model import PartParameters, RigParameters
 from hilrig_sim.urdf import urdf
 
-_RATE_BIN_NS: Final = 100_000_000
-"""Modbus requests are counted over so long, ns."""
 _SAFE: Final = "safe zero"
 _NOBODY: Final = "nobody"
-_READS: Final = (1, 2, 3, 4, 23, 43)
 _TRAIL_COLOR: Final = "#f2b134"
 _BASELINE_COLOR: Final = "#5b6570"
 _SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
@@ -57,6 +55,8 @@ _YAW_ARROW: Final = 0.04
 _PART_COLOR: Final = "#c8ccd0"
 _PART_SIZE: Final = (0.03, 0.03, 0.03)
 _OTHER_EVENT: Final = "#9aa5b1"
+_UNSAFE: Final = re.compile(r"[^\w.-]")
+"""What does not belong into an entity path."""
 _KIND_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
 
 
@@ -103,6 +103,7 @@ class RigView:
         self._lanes: dict[str, str] = {}
         self._holder = ""
         self._holders = {_SAFE: "#e45756", _NOBODY: "#3a424c"}
+        self._rates = RequestRates(names)
         self._clients: set[str] = set()
         self._last_tip: NDArray[np.float64] | None = None
         self._placed: set[str] = set()
@@ -224,9 +225,13 @@ class RigView:
         if len(samples):
             self._add_latency(samples)
         if len(records.traffic):
-            self._add_traffic(records.traffic)
+            self._add_rates(self._rates.add(records.traffic))
         if len(records.events):
             self._add_events(records.events)
+
+    def end(self) -> None:
+        """Write what waited for more: nothing comes any more."""
+        self._add_rates(self._rates.end())
 
     def _add_states(self, states: Rows) -> None:
         times = self._times(states)
@@ -285,29 +290,16 @@ class RigView:
         ends = np.cumsum(np.stack([samples[stage] for stage in STAGES], axis=1), axis=1) / 1e6
         self._scalars("stages", times, np.hstack((np.zeros((len(ends), 1)), ends)))
 
-    def _add_traffic(self, traffic: Rows) -> None:
-        kinds = np.isin(traffic["function"], _READS)
-        for code in np.unique(traffic["controller"]):
-            controller = self._names[int(code)]
-            safe = re.sub(r"[^\w.-]", "_", controller) or "unknown"
-            if safe not in self._clients:
-                self._clients.add(safe)
-                for kind, color in _KIND_COLORS.items():
-                    self._static(
-                        f"modbus/{safe}/{kind}",
-                        rr.SeriesLines(names=[f"{controller} {kind}"], colors=[rgb(color)], widths=[1.5]),
-                    )
-            mine = traffic["controller"] == code
-            for kind, chosen in (("reads", mine & kinds), ("writes", mine & ~kinds)):
-                rows = traffic[chosen]
-                if not len(rows):
-                    continue
-                bins = rows["wall_ns"] // _RATE_BIN_NS
-                first, last = int(bins.min()), int(bins.max())
-                counts = np.bincount((bins - first).astype(np.intp), minlength=last - first + 1)
-                at = np.zeros(len(counts), np.dtype([("wall_ns", "<i8")]))
-                at["wall_ns"] = (first + np.arange(len(counts))) * _RATE_BIN_NS
-                self._scalars(f"modbus/{safe}/{kind}", self._times(at), counts[:, None] * (1e9 / _RATE_BIN_NS))
+    def _add_rates(self, rates: Iterable[Rate]) -> None:
+        for client, kind, begins_ns, counts in rates:
+            path = f"modbus/{_UNSAFE.sub('_', client)}/{kind}"
+            if path not in self._clients:
+                self._clients.add(path)
+                line = rr.SeriesLines(names=[f"{client} {kind}"], colors=[rgb(_KIND_COLORS[kind])], widths=[1.5])
+                self._static(path, line)
+            at = np.zeros(len(counts), np.dtype([("wall_ns", "<i8")]))
+            at["wall_ns"] = begins_ns
+            self._scalars(path, self._times(at), counts[:, None] * (1e9 / BIN_NS))
 
     def _add_events(self, events: Rows) -> None:
         texts = [

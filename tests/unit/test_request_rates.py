@@ -1,0 +1,67 @@
+"""Requests a second: the same whatever pieces they come in, and bounded whatever controllers come and go."""
+
+import numpy as np
+
+from hilrig_replay.columns import TRAFFIC, Names, Rows
+from hilrig_replay.request_rates import BIN_NS, MOST, OTHERS, RequestRates
+
+
+def requests(names: Names, at_ms: list[float], *, controller: str = "a:1", function: int = 3) -> Rows:
+    rows = np.zeros(len(at_ms), TRAFFIC)
+    rows["wall_ns"] = np.array(at_ms) * 1e6
+    rows["controller"] = names.code(controller)
+    rows["function"] = function
+    return rows
+
+
+def counted(pieces: list[Rows], names: Names) -> dict[tuple[str, str], dict[int, int]]:
+    rates = RequestRates(names)
+    found: dict[tuple[str, str], dict[int, int]] = {}
+    given = [rate for piece in pieces for rate in rates.add(piece)] + list(rates.end())
+    for client, kind, begins_ns, counts in given:
+        bins = found.setdefault((client, kind), {})
+        for begin_ns, count in zip(begins_ns.tolist(), counts.tolist(), strict=True):
+            assert begin_ns // BIN_NS not in bins, "a bin is given once"
+            bins[begin_ns // BIN_NS] = count
+    return found
+
+
+def test_requests_are_counted_by_controller_and_kind() -> None:
+    names = Names()
+    rows = np.concatenate(
+        (
+            requests(names, [0, 50, 99, 100, 350]),
+            requests(names, [10], function=16),
+            requests(names, [20], controller="b:2"),
+        )
+    )
+    assert counted([rows], names) == {
+        ("a:1", "reads"): {0: 3, 1: 1, 2: 0, 3: 1},
+        ("a:1", "writes"): {0: 1},
+        ("b:2", "reads"): {0: 1},
+    }
+
+
+def test_pieces_do_not_change_what_is_counted() -> None:
+    names = Names()
+    at_ms = np.sort(np.random.default_rng(2).uniform(0, 5000, 700)).tolist()
+    whole = counted([requests(names, at_ms)], names)
+    assert sum(whole["a:1", "reads"].values()) == 700
+    for size in (1, 7, 100):
+        pieces = [requests(names, at_ms[start : start + size]) for start in range(0, len(at_ms), size)]
+        assert counted(pieces, names) == whole
+
+
+def test_a_long_silence_costs_two_points() -> None:
+    names = Names()
+    hour_ms = 3_600_000.0
+    bins = counted([requests(names, [0, hour_ms])], names)["a:1", "reads"]
+    assert bins == {0: 1, 1: 0, 35_999: 0, 36_000: 1}
+
+
+def test_controllers_beyond_the_first_are_counted_together() -> None:
+    names = Names()
+    rows = [requests(names, [10], controller=f"10.0.0.1:{number}") for number in range(MOST + 50)]
+    found = counted([np.concatenate(rows)], names)
+    assert len(found) == MOST + 1
+    assert found[OTHERS, "reads"] == {0: 50}
