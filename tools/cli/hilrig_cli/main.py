@@ -31,6 +31,7 @@ from hilrig_cli.commands import (
     router,
     runs,
     services,
+    study,
     top,
     up,
     verify,
@@ -71,6 +72,7 @@ app.command(rich_help_panel=REVIEW)(runs.runs)
 app.command(rich_help_panel=REVIEW)(latency.latency)
 app.command(rich_help_panel=REVIEW)(replay.replay)
 app.command(rich_help_panel=REVIEW)(compare.compare)
+app.command(rich_help_panel=REVIEW)(study.study)
 app.command(rich_help_panel=REVIEW)(report.report)
 app.command(rich_help_panel=REVIEW)(verify.verify)
 app.command(rich_help_panel=REVIEW)(figures.figures)

@@ -1,0 +1,182 @@
+"""`hilrig study`: how much delay, jitter and loss a controller bears."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilrig_cli.options import AsJson
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def study(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="STUDY.TOML", help="What is swept (docs/studies.md).", show_default=False)
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("study-out"),
+    live: Annotated[
+        bool, typer.Option("--live", help="Run the study's live points over Modbus TCP too, on a lab of its own.")
+    ] = False,
+    from_run: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="RUN.MCAP",
+            help="Take the latency of this recording: which gains would have been stable, and with what margin.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Sweep a loop in virtual time, ask theory, and draw both; with --live measure chosen points on the real loop.
+
+    Results are runs.parquet, study.json, a picture of each controller (PNG, SVG) and study.rrd. Exit code 1: a live
+    point did what virtual time did not say; with --from: no gain of the study would have been stable.
+    """
+    from rich.console import Console
+
+    from hilrig_runtime.errors import InputError
+    from hilrig_study.study_config import load_study
+
+    console = Console(stderr=True, quiet=as_json)
+    if from_run is not None:
+        if live:
+            raise InputError("--from takes what was recorded, and --live runs anew: choose one")
+        _from_recording(from_run, file, as_json)
+        return
+    if file is None:
+        raise InputError("name a study's file, or a recording with --from; examples/studies has one to start from")
+    chosen = load_study(file)
+    said = _sweep(file, out, live, console)
+    if as_json:
+        print(json.dumps(said))
+    else:
+        _print(said, out)
+    if any(not point["as_predicted"] for point in said.get("live", [])):
+        raise typer.Exit(1)
+    del chosen
+
+
+def _sweep(file: Path, out: Path, live: bool, console: "Console") -> dict[str, Any]:
+    from rich.progress import Progress, TimeElapsedColumn
+
+    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_study.pictures import Dot, plane_figure, save_pictures, traces
+    from hilrig_study.rerun_pictures import save_study_rrd
+    from hilrig_study.results import save_results
+    from hilrig_study.study_config import load_study
+    from hilrig_study.sweep import sweep
+
+    chosen = load_study(file)
+    if live and not chosen.live:
+        raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OperationError(f"{out}: results can't be written there: {error.strerror}") from error
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress:
+        task = progress.add_task("sweep", total=1.0)
+        shown = traces(chosen, file.parent)
+        swept = sweep(chosen, file.parent, lambda share: progress.update(task, completed=share))
+    measured: list[dict[str, Any]] = []
+    if live:
+        from hilrig_cli.study_live import run_live_points
+
+        measured = run_live_points(
+            chosen, file.parent, out, lambda line: console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
+        )
+    with console.status("drawing"):
+        pictures = []
+        for number in range(len(chosen.controllers)):
+            name = chosen.controllers[number].name
+            dots = [Dot(p["x"], p["y"], p["live"]["settled"]) for p in measured if p["controller"] == name]
+            figure = plane_figure(chosen, swept, number, shown, dots)
+            pictures += save_pictures(figure, out / f"plane-{number + 1}")
+        save_study_rrd(chosen, swept, shown, out / "study.rrd")
+        more = {"pictures": [str(path) for path in pictures], "live": measured}
+        return save_results(chosen, swept, out, more)
+
+
+def _print(said: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    title = (
+        f"{said['title']}: {said['runs']:,} runs, {said['simulated_s']:,.0f} s simulated in {said['seconds']:.1f} s "
+        f"({said['times_real_time']:,.0f} times real time)"
+    )
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for column in ("controller", "gain", "stable up to, ms added", "delay margin, ms", "jitter margin, ms"):
+        table.add_column(column, justify="left" if column == "controller" else "right")
+    for controller in said["controllers"]:
+        theory = controller["theory"]
+        if not theory:
+            table.add_row(controller["name"], "–", f"{controller['settled_share']:.0%} of runs settle", "–", "–")
+        # A dozen gains tell as much as two hundred.
+        for one in theory[:: max(1, len(theory) // 12)]:
+            nominal = one["nominal"] or {}
+            until = one["stable_until_ms"]
+            table.add_row(
+                controller["name"],
+                f"{one['gain']:.3g}",
+                "any looked at" if until is None else "unstable" if until < 0 else f"{until:.1f}",
+                _ms(nominal.get("delay_margin_s")),
+                _ms(nominal.get("jitter_margin_s")),
+            )
+    console.print(table)
+    for point in said["live"]:
+        console.print(
+            f"live: {point['controller']} at x {point['x']:g}, y {point['y']:g}: loop p50 "
+            f"{point['live']['loop_p50_ms']:.1f} ms (virtual {point['virtual']['loop_p50_ms']:.1f}), error "
+            f"{point['live']['error_rms_deg']:.3f}° (virtual {point['virtual']['error_rms_deg']:.3f}): "
+            + ("as predicted" if point["as_predicted"] else "NOT as predicted"),
+            highlight=False,
+        )
+    console.print(f"results: {out}", highlight=False)
+
+
+def _ms(seconds: float | None) -> str:
+    return "–" if seconds is None else f"{seconds * 1e3:.1f}"
+
+
+def _from_recording(path: Path, file: Path | None, as_json: bool) -> None:
+    from hilrig_replay.run import open_run
+    from hilrig_study.from_recording import judge_gains
+    from hilrig_study.study_config import load_study
+
+    judged = judge_gains(open_run(path), None if file is None else load_study(file))
+    if as_json:
+        print(json.dumps(judged.as_dict()))
+    else:
+        _print_judged(judged.as_dict())
+    if not any(gain["stable"] for gain in judged.as_dict()["gains"]):
+        raise typer.Exit(1)
+
+
+def _print_judged(judged: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    latency = judged["latency"]
+    title = (
+        f"{judged['session']}: loop latency p50 {latency['p50_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
+        f"largest {latency['max_ms']:.1f} ms; step {judged['step_ms']:g} ms"
+    )
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for column in ("controller", "gain", "stable", "growth of the mean square", "expected cost", "delay to spare, ms"):
+        table.add_column(column, justify="left" if column == "controller" else "right")
+    for gain in judged["gains"]:
+        cost = gain["expected_cost"]
+        table.add_row(
+            gain["controller"],
+            f"{gain['gain']:.3g}",
+            "yes" if gain["stable"] else "[red]no[/red]",
+            f"{gain['mean_square_radius']:.4f}",
+            "–" if cost is None else f"{cost:.2f}",
+            "–" if gain["spare_ms"] is None else f"{gain['spare_ms']:.0f}",
+        )
+    Console().print(table)

@@ -1,0 +1,92 @@
+"""What a study found, for other tools: every run as a row of a Parquet file, the rest as JSON."""
+
+import json
+import math
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+
+from hilrig_runtime.errors import OperationError
+from hilrig_study.study_config import StudyConfig
+from hilrig_study.sweep import CELL, SweepResult
+
+JOINTS = ("theta1", "theta2", "d3", "theta4")
+
+
+def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
+    """One row a run: what it was, what it did, and what theory says of it; units in the names, angles in rad."""
+    names = np.array([controller.name for controller in study.controllers])
+    columns: dict[str, Any] = {"controller": names[swept.cells["controller"]].tolist()}
+    for name in (CELL.names or ())[3:]:
+        columns[name] = np.ascontiguousarray(swept.cells[name])
+    for name in ("cost", "settled", "failed_s", "loop_p50_ms", "loop_p99_ms"):
+        columns[name] = np.ascontiguousarray(swept.results[name])
+    for number, joint in enumerate(JOINTS):
+        columns[f"error_rms_{joint}"] = np.ascontiguousarray(swept.results["error_rms"][:, number])
+    columns["spectral_radius"] = swept.radius
+    return pa.table(columns)
+
+
+def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
+    """The study, its machine, and theory and outcome by controller and gain, as plain values."""
+    controllers = []
+    for number, controller in enumerate(study.controllers):
+        settled = swept.plane(study, number, swept.results["settled"])
+        theory = []
+        for one in swept.theory:
+            if one.controller == number:
+                theory.append({key: value for key, value in asdict(one).items() if key != "controller"})
+        controllers.append(
+            {
+                "name": controller.name,
+                "runs": int((swept.cells["controller"] == number).sum()),
+                "settled_share": float(settled.mean()),
+                "theory": theory,
+            }
+        )
+    simulated_s = len(swept.cells) * study.loop.duration_s
+    whole = {
+        "title": study.title,
+        "study": study.model_dump(mode="json"),
+        "software": f"hilrig {version('hilrig')}",
+        "machine": f"{platform.machine()} {platform.system()}, Python {platform.python_version()}",
+        "runs": len(swept.cells),
+        "simulated_s": simulated_s,
+        "seconds": swept.seconds,
+        "times_real_time": simulated_s / swept.seconds,
+        "controllers": controllers,
+    }
+    plain: dict[str, Any] = _plain(whole)
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no infinity and no NaN: both become null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
+    """Write `runs.parquet` and `study.json`, with `more` at its top level; gives what the JSON holds.
+
+    Raises:
+        OperationError: the folder can't be written.
+    """
+    said: dict[str, Any] = summary(study, swept) | _plain(more)
+    try:
+        pyarrow.parquet.write_table(run_table(study, swept), folder / "runs.parquet")
+        (folder / "study.json").write_text(json.dumps(said, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise OperationError(f"{folder}: results can't be written there: {error.strerror or error}") from error
+    return said

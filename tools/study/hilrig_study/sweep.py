@@ -1,0 +1,346 @@
+"""A study's plane of cells, run in virtual time in batches on all cores, with what theory says of each.
+
+A cell is a controller and a point (x, y); it is run `runs` times with seeds of its own. Cells that share the step and
+the poll's period step together. What is drawn depends on the study's seed and the cell alone, so a study gives the same
+numbers on one core and on many.
+"""
+
+import math
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_modbus_edge.impairment import Impairment
+from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
+from hilrig_study.controllers import LawController
+from hilrig_study.margins import Margins, linearise_law, margins, spectral_radius
+from hilrig_study.margins import loop_matrix as closed_loop
+from hilrig_study.plants import ArmPlant, LinearArms, StudyPlant
+from hilrig_study.study_config import AxisConfig, StudyConfig
+from hilrig_study.timing import LoopTiming, Timeline, poll_count, timeline
+from hilrig_study.virtual_loop import Outcome, simulate
+
+Floats = NDArray[np.float64]
+
+BATCH: Final = 1000
+"""Runs that step together: their arrays stay in a core's cache."""
+
+CELL: Final = np.dtype(
+    [
+        ("controller", "<i4"),
+        ("ix", "<i4"),
+        ("iy", "<i4"),
+        ("run", "<i4"),
+        ("gain", "<f8"),
+        ("delay_ms", "<f8"),
+        ("jitter_ms", "<f8"),
+        ("loss", "<f8"),
+        ("step_ms", "<f8"),
+        ("poll_ms", "<f8"),
+    ]
+)
+"""One row a run."""
+
+RESULT: Final = np.dtype(
+    [
+        ("cost", "<f8"),
+        ("settled", "|b1"),
+        ("failed_s", "<f8"),
+        ("error_rms", "<f8", (4,)),
+        ("loop_p50_ms", "<f8"),
+        ("loop_p99_ms", "<f8"),
+    ]
+)
+"""What a run did; units as in `Outcome`."""
+
+
+@dataclass(frozen=True, slots=True)
+class GainTheory:
+    """What theory says of one controller at one gain, step and period."""
+
+    controller: int
+    gain: float
+    step_ms: float
+    poll_ms: float
+    stable_until_ms: float
+    """Largest constant delay that can be added to the command's way before the loop is unstable; -1: it is, without
+    any; inf: more than was looked at."""
+    nominal: Margins | None
+    """At the loop's own latency; None: the controller does not poll once a step."""
+    nominal_latency_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class SweepResult:
+    """All runs of a study, and its theory."""
+
+    cells: NDArray[np.void]
+    """(R,), fields as `CELL`."""
+    results: NDArray[np.void]
+    """(R,), fields as `RESULT`."""
+    radius: Floats
+    """Spectral radius of each run's loop; NaN where its delay is not constant or its controller has no law, (R,)."""
+    theory: tuple[GainTheory, ...]
+    seconds: float
+    """What it took."""
+
+    def plane(self, study: StudyConfig, controller: int, values: NDArray[np.generic]) -> Floats:
+        """A value a run, (R,), as the mean of each cell, (len(y), len(x))."""
+        mine = self.cells["controller"] == controller
+        shape = (len(study.y.points), len(study.x.points))
+        total, count = np.zeros(shape), np.zeros(shape)
+        where = (self.cells["iy"][mine], self.cells["ix"][mine])
+        np.add.at(total, where, values[mine].astype(np.float64))
+        np.add.at(count, where, 1.0)
+        return total / count
+
+
+_Asked = tuple[int, float, float, float]
+"""Controller, gain, step and period, ms."""
+_Theory = tuple[GainTheory, dict[float, float]]
+
+
+def cells_of(study: StudyConfig) -> NDArray[np.void]:
+    """Every run of a study, (R,), fields as `CELL`."""
+    x, y = study.x.points, study.y.points
+    controllers, iy, ix, runs = (
+        index.ravel()
+        for index in np.meshgrid(
+            np.arange(len(study.controllers)),
+            np.arange(len(y)),
+            np.arange(len(x)),
+            np.arange(study.runs),
+            indexing="ij",
+        )
+    )
+    cells = np.zeros(len(ix), CELL)
+    cells["controller"], cells["ix"], cells["iy"], cells["run"] = controllers, ix, iy, runs
+    cells["gain"], cells["step_ms"], cells["poll_ms"] = 1.0, study.loop.step_ms, study.loop.poll_ms
+    cells[study.x.what], cells[study.y.what] = x[ix], y[iy]
+    if "poll_ms" not in (study.x.what, study.y.what) and study.loop.poll_ms == study.loop.step_ms:
+        # A loop that polls once a step goes on doing so.
+        cells["poll_ms"] = cells["step_ms"]
+    return cells
+
+
+def run_cells(
+    study: StudyConfig, cells: NDArray[np.void], folder: Path = Path(), *, keep: bool = False
+) -> tuple[NDArray[np.void], Outcome]:
+    """Run cells that share controller, step and period; their results, (R,), and what the runs did, with `keep` whole.
+
+    Raises:
+        InputError: a controller raised or gave no numbers, or a value is none that a loop can have.
+    """
+    first = cells[0]
+    timing = study.loop.timing(float(first["step_ms"]), float(first["poll_ms"]))
+    ticks = max(1, round(study.loop.duration_s * 1e9 / timing.step_ns))
+    lines = timelines(study, cells, timing, ticks)
+    rig, near, scenario = study.rig(float(first["step_ms"])), study.near(), study.task.scenario()
+    plant: StudyPlant
+    if study.plant == "arm":
+        plant = ArmPlant(rig, scenario.start, scenario.pose, len(cells))
+    else:
+        phi, gamma = near.discretise(timing.step_ns * 1e-9)
+        plant = LinearArms(near, phi, gamma, scenario.start, len(cells))
+    gain = np.ascontiguousarray(cells["gain"])
+    config = study.controllers[first["controller"]]
+    controller = config.build(rig, near, timing.period_ns * 1e-9, gain, folder)
+    outcome = simulate(
+        plant, controller, scenario, lines, ticks=ticks, holding=near.holding, keep=np.full(len(cells), keep)
+    )
+    results = np.zeros(len(cells), RESULT)
+    results["cost"], results["settled"], results["failed_s"] = outcome.cost, outcome.settled, outcome.failed_s
+    results["error_rms"] = outcome.error_rms.T
+    percentiles: dict[int, tuple[float, float]] = {}
+    for row, line in enumerate(lines):
+        if id(line) not in percentiles:
+            samples = line.samples_ns / 1e6
+            p50, p99 = np.percentile(samples, (50, 99)) if len(samples) else (math.nan, math.nan)
+            percentiles[id(line)] = (float(p50), float(p99))
+        results["loop_p50_ms"][row], results["loop_p99_ms"][row] = percentiles[id(line)]
+    return results, outcome
+
+
+def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDArray[np.void]:
+    """The run of one point of the plane, which need not be one of the sweep's: (1,), fields as `CELL`."""
+    axes = {"x": {"what": study.x.what, "values": (x,)}, "y": {"what": study.y.what, "values": (y,)}}
+    plane = {"x": AxisConfig.model_validate(axes["x"]), "y": AxisConfig.model_validate(axes["y"]), "runs": 1}
+    cells = cells_of(study.model_copy(update=plane))
+    mine: NDArray[np.void] = cells[cells["controller"] == controller]
+    return mine
+
+
+def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
+    """The timeline of each cell's run; runs whose times are the same share one."""
+    ways = study.impairment.ways
+    polls = poll_count(timing, ticks)
+    known: dict[tuple[float, ...], Timeline] = {}
+    lines = []
+    for cell in cells:
+        delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
+        random = jitter_ms > 0 or loss > 0 or not ways.do_nothing
+        # A run's draws depend on the study's seed and its number alone: cells beside each other meet the same luck.
+        key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
+        if key not in known:
+            seed = np.random.SeedSequence(study.seed, spawn_key=(int(cell["run"]),))
+            states, commands, added = (np.random.SeedSequence(s.entropy, spawn_key=s.spawn_key) for s in seed.spawn(3))
+            more = WayImpairment(
+                delay=UniformDelay(low_ms=0, high_ms=jitter_ms) if jitter_ms else ConstantDelay(),
+                loss=BernoulliLoss(rate=loss) if loss else NoLoss(),
+            )
+            state_ns, state_lost = Impairment(ways.state, states).draw(ticks)
+            command_ns, command_lost = Impairment(ways.command, commands).draw(polls)
+            more_ns, more_lost = Impairment(more, added).draw(polls)
+            known[key] = timeline(
+                timing, ticks, state_ns, command_ns + more_ns + delay_ns, state_lost, command_lost | more_lost
+            )
+        lines.append(known[key])
+    return lines
+
+
+def gain_theory(
+    study: StudyConfig, controller: int, gain: float, step_ms: float, poll_ms: float, delays_ms: Sequence[float]
+) -> _Theory | None:
+    """Theory of one controller at one gain, and the spectral radius at each constant added delay; None: it has no law.
+
+    The arm is discretised as the study steps it: by the simulation's integrator, or exactly.
+    """
+    rig, near = study.rig(step_ms), study.near()
+    timing = study.loop.timing(step_ms, poll_ms)
+    config = study.controllers[controller]
+    built = config.build(rig, near, timing.period_ns * 1e-9, np.array([gain])) if config.kind != "file" else None
+    if not isinstance(built, LawController):
+        return None
+    method, substeps = (rig.sim.integrator, rig.sim.substeps) if study.plant == "arm" else ("exact", 1)
+    phi, gamma = near.discretise(timing.step_ns * 1e-9, method, substeps)
+    by_pattern: dict[tuple[int, ...], float] = {}
+
+    def radius(delay_ms: float) -> float:
+        delay_ns = round(delay_ms * 1e6)
+        polls = range(math.lcm(timing.step_ns, timing.period_ns) // timing.period_ns)
+        pattern = tuple(timing.acts(poll, delay_ns) for poll in polls)
+        if pattern not in by_pattern:
+            latency_s = timing.latency_steps(0, delay_ns)[1] * timing.step_ns * 1e-9
+            law = linearise_law(built, near, timing.period_ns * 1e-9, latency_s)
+            by_pattern[pattern] = spectral_radius(closed_loop(phi, gamma, law, timing, 0, delay_ns))
+        return by_pattern[pattern]
+
+    radii = {delay_ms: radius(delay_ms) for delay_ms in delays_ms}
+    unstable = [delay_ms for delay_ms in sorted(radii) if radii[delay_ms] >= 1.0 - 1e-9]
+    # The boundary is a tick's: the last delay before the one from which the command comes a tick later.
+    until = math.inf if not unstable else _last_stable(radius, unstable[0])
+    steps = timing.latency_steps()[1]
+    nominal = None
+    if timing.period_ns == timing.step_ns:
+        law = linearise_law(built, near, timing.period_ns * 1e-9, steps * timing.step_ns * 1e-9)
+        nominal = margins(phi, gamma, law, timing, steps)
+    found = GainTheory(controller, gain, step_ms, poll_ms, until, nominal, steps * timing.step_ns / 1e6)
+    return found, radii
+
+
+def _last_stable(radius: Callable[[float], float], unstable_ms: float) -> float:
+    """Largest stable delay below an unstable one, ms, to 10 µs; -1: there is none."""
+    if radius(0.0) >= 1.0 - 1e-9:
+        return -1.0
+    low, high = 0.0, unstable_ms
+    while high - low > 0.01:
+        middle = (low + high) / 2
+        low, high = (middle, high) if radius(middle) < 1.0 - 1e-9 else (low, middle)
+    return low
+
+
+def sweep(
+    study: StudyConfig, folder: Path, tick: Callable[[float], None], *, workers: int | None = None, theory: bool = True
+) -> SweepResult:
+    """Run a study on all cores.
+
+    Args:
+        study: the study.
+        folder: of the study's file: students' files are named from there.
+        tick: hears the share of the work that is done.
+        workers: processes; default: one a core. 1 runs in this one.
+        theory: whether theory is asked too.
+
+    Raises:
+        InputError: as `run_cells`.
+    """
+    begin = time.perf_counter()
+    cells = cells_of(study)
+    parts = list(_batches(cells))
+    delays = sorted(set(cells["delay_ms"].tolist()))
+    asked = np.unique(cells[["controller", "gain", "step_ms", "poll_ms"]]) if theory else cells[:0]
+    results = np.zeros(len(cells), RESULT)
+    radius = np.full(len(cells), np.nan)
+    found: list[GainTheory] = []
+    constant = _constant(study, cells)
+    total, done = len(parts) * 20 + len(asked), 0
+    with _executor(workers, len(parts) + len(asked)) as executor:
+        batches: dict[Future[NDArray[np.void]], NDArray[np.intp]] = {
+            executor.submit(_results_of, study, cells[rows], folder): rows for rows in parts
+        }
+        theories: dict[Future[_Theory | None], _Asked] = {
+            executor.submit(_theory_of, study, row, delays): row for row in asked.tolist()
+        }
+        try:
+            for batch in as_completed(batches):
+                results[batches[batch]] = batch.result()
+                done += 20
+                tick(done / total)
+            for one in as_completed(theories):
+                one.result()
+                done += 1
+                tick(done / total)
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+        for theory_future, row in theories.items():
+            answer = theory_future.result()
+            if answer is None:
+                continue
+            found.append(answer[0])
+            controller, gain, step_ms, poll_ms = row
+            mine = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
+            mine &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
+            radius[mine] = [answer[1][delay] for delay in cells["delay_ms"][mine].tolist()]
+    return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - begin)
+
+
+def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
+    none = study.impairment.ways.do_nothing
+    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & none)
+
+
+def _batches(cells: NDArray[np.void]) -> Iterator[NDArray[np.intp]]:
+    """Rows of runs that can step together, at most `BATCH` each."""
+    groups: dict[tuple[float, ...], list[int]] = {}
+    for row, cell in enumerate(cells[["controller", "step_ms", "poll_ms"]].tolist()):
+        groups.setdefault(cell, []).append(row)
+    for rows in groups.values():
+        for begin in range(0, len(rows), BATCH):
+            yield np.array(rows[begin : begin + BATCH], dtype=np.intp)
+
+
+def _results_of(study: StudyConfig, cells: NDArray[np.void], folder: Path) -> NDArray[np.void]:
+    return run_cells(study, cells, folder)[0]
+
+
+def _theory_of(study: StudyConfig, asked: _Asked, delays_ms: Sequence[float]) -> _Theory | None:
+    controller, gain, step_ms, poll_ms = asked
+    return gain_theory(study, controller, gain, step_ms, poll_ms, delays_ms)
+
+
+@contextmanager
+def _executor(workers: int | None, tasks: int) -> Iterator[Executor]:
+    count = min(workers or os.cpu_count() or 1, tasks)
+    # Spawned, never forked: a process of threads that is forked may hang.
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as executor:
+        yield executor
