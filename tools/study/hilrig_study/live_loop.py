@@ -5,7 +5,8 @@ is heard from a rig of the same simulation that nothing is injected into: rigs o
 """
 
 import time
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final, cast
 
 import numpy as np
 from pymodbus.client import ModbusTcpClient
@@ -34,7 +35,8 @@ class RigClient:
             OperationError: no rig answers there.
         """
         self._where = f"{host}:{port}"
-        self._client = ModbusTcpClient(host, port=port, timeout=3)
+        # pymodbus leaves some of its methods without types.
+        self._client = cast(Any, ModbusTcpClient(host, port=port, timeout=3))
         if not self._client.connect():
             raise OperationError(f"no rig answers at {self._where}")
 
@@ -63,7 +65,7 @@ class RigClient:
         """End the connection."""
         self._client.close()
 
-    def _read(self, request: "_Request") -> list[int]:
+    def _read(self, request: Callable[[], ModbusPDU]) -> list[int]:
         try:
             answer = request()
         except ModbusException as error:
@@ -71,3 +73,60 @@ class RigClient:
         if answer.isError():
             raise OperationError(f"the rig at {self._where} refused a request: {answer}")
         return list(answer.registers)
+
+
+def listen_for_ticks(clock_rig: RigClient, step_ns: int) -> int:
+    """A time of the monotonic clock, ns, at which a state of the simulation got to the edge, as early as was seen.
+
+    Raises:
+        OperationError: the step counter stood still.
+    """
+    begin_ns = time.monotonic_ns()
+    before, phases = clock_rig.step(), []
+    while time.monotonic_ns() - begin_ns < LISTEN_S * 1e9:
+        asked_ns = time.monotonic_ns()
+        step = clock_rig.step()
+        if step != before:
+            phases.append(asked_ns)
+            before = step
+        time.sleep(2e-4)
+    if len(phases) < 3:
+        raise OperationError("the simulation does not step: its counter stood still")
+    # A change is seen late by up to the time between two requests, never early: the earliest is the nearest.
+    later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2
+    return int(phases[0] + later.min())
+
+
+def drive(
+    rig: RigClient,
+    controller: Controller,
+    scenario: Scenario,
+    first_read_ns: int,
+    period_ns: int,
+    duration_s: float,
+) -> None:
+    """Run a controller of one run on a rig for `duration_s`, reading first at `first_read_ns`, monotonic clock.
+
+    Raises:
+        InputError: the controller raised or gave no numbers.
+        OperationError: the rig stopped answering.
+    """
+    controller.begin(1)
+    latency_s, due_ns = 0.0, first_read_ns
+    while due_ns - first_read_ns < duration_s * 1e9:
+        _wait_until(due_ns)
+        position = np.array(rig.position())[:, np.newaxis]
+        now = np.array([(due_ns - first_read_ns) * 1e-9])
+        effort = controller.update(Measured(now, position, scenario.goal(now), np.array([latency_s])), None)
+        rig.write(effort[:, 0].tolist())
+        # Asked for after the write, so that it delays nothing.
+        latency_s = rig.latency_s()
+        due_ns += period_ns
+
+
+def _wait_until(due_ns: int) -> None:
+    remaining_ns = due_ns - time.monotonic_ns()
+    if remaining_ns > _SPIN_NS:
+        time.sleep((remaining_ns - _SPIN_NS) * 1e-9)
+    while time.monotonic_ns() < due_ns:
+        pass

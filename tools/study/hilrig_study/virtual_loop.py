@@ -7,7 +7,7 @@ numbers: the same arguments give the same bits, for one run or among a thousand.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class Scenario:
         first, second, third, fourth = (p + o for p, o in zip(self.pose, self.offset, strict=True))
         return first, second, third, fourth
 
-    def goal(self, time_s: Floats) -> Floats:
+    def goal(self, time_s: NDArray[np.floating[Any]]) -> Floats:
         """Where the joints should be, (4, N), at times, (N,)."""
         wave = np.sin(2 * np.pi * self.frequency_hz * time_s)
         return np.asarray(np.array(self.pose)[:, np.newaxis] + np.array(self.amplitude)[:, np.newaxis] * wave)
