@@ -40,7 +40,7 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus
 from hilrig_runtime.service import Arrival, Service
 from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas import JointState, topics
+from hilrig_schemas import JointState, RigBatch, topics
 
 QUESTION = "How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?"
 CONNECTIONS = (1, 2, 16)
@@ -267,7 +267,8 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
             if deliver is not None:
                 for rig in lab.rigs:
                     state = JointState(rig=rig.name, step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-                    deliver(topics.STATE.key(lab.name, rig.name), state.SerializeToString())
+                    batch = RigBatch(rigs=[rig.name], messages=[state.SerializeToString()])
+                    deliver(topics.STATES.key(lab.name, "sim", "1"), batch.SerializeToString())
             time.sleep(0.01)
         control.send(1)
         wait_for_end(control)
@@ -282,15 +283,19 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
 def send_states(lab: LabConfig, control: Connection) -> None:
     """In the simulation's place: states at 50 Hz, and every command received."""
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
-        senders = [service.sender(topics.STATE, rig.name) for rig in lab.rigs]
+        states = service.batch_sender(topics.STATES)
+        for rig in lab.rigs:
+            service.add_to_batch(states, topics.STATE, rig.name)
         service.latest(topics.COMMAND)
         control.send(1)
         step = 0
         while not control.poll(0.02):
             step += 1
-            for rig, sender in zip(lab.rigs, senders, strict=True):
-                state = JointState(rig=rig.name, step=step, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-                sender.send(state)
+            made = [
+                JointState(rig=rig.name, step=step, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
+                for rig in lab.rigs
+            ]
+            states.send([state.SerializeToString() for state in made])
             service.beat(service.clock.monotonic_ns())
 
 

@@ -15,7 +15,7 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.logstream import entries_of
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, TorqueCommand, topics
+from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, RigBatch, TorqueCommand, topics
 from waiting import eventually
 
 HEADER = struct.Struct(">HHHB")
@@ -61,7 +61,10 @@ class EdgeRig:
             effort=fields.pop("effort", (0.0, 0.0, 0.0, 0.0)),
             **fields,
         )
-        self.hub.deliver(topics.STATE.key(self.lab.name, rig), state.SerializeToString())
+        payload = state.SerializeToString()
+        self.hub.deliver(topics.STATE.key(self.lab.name, rig), payload)
+        batch = RigBatch(source="sim/1", rigs=[rig], messages=[payload])
+        self.hub.deliver(topics.STATES.key(self.lab.name, "sim", "1"), batch.SerializeToString())
         return state
 
     def kinds(self) -> list[str]:

@@ -207,10 +207,15 @@ class Service:
         return values
 
     def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
-        """An end that sends messages of many rigs together; give it the rigs with `BatchSender.add`."""
+        """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""
         key = topic.key(self.lab.name, self.name, self.instance)
         together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
         return BatchSender(self.source, together, self.log, self.clock, self.counters)
+
+    def add_to_batch(self, batch: BatchSender, topic: RigTopic[MessageT], rig: str) -> None:
+        """Let a batch sender send for one more rig, whose own messages go on `topic` too."""
+        key = topic.key(self.lab.name, rig)
+        batch.add(rig, key, self._closing.enter_context(self.bus.publisher(key, topic.traffic)))
 
     def emit(self, event: Event) -> None:
         """Send and record an event; source and time are filled in."""

@@ -16,7 +16,7 @@ import numpy as np
 from hilrig_runtime.rate import Rate, Tick
 from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Service
-from hilrig_schemas import JointState, RigConfig, topics
+from hilrig_schemas import JointState, RigConfig, RigReport, topics
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.configured import rig_parameters
 from hilrig_sim.machine import machine_name
@@ -37,11 +37,11 @@ def run(service: Service) -> None:
         InputError: the lab's parameters do not fit together.
     """
     lab = service.lab
-    parameters = [rig_parameters(lab, rig) for rig in lab.rigs]
+    parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
     with ExitStack() as served:
-        for rig, values in zip(lab.rigs, parameters, strict=True):
+        for rig, values in zip(service.rigs, parameters, strict=True):
             answer = Constant(_configuration(service, rig.name, values).SerializeToString())
             served.enter_context(service.bus.serve(topics.CONFIG.key(lab.name, rig.name), answer))
         service.counters.rigs = len(parameters)
@@ -85,11 +85,15 @@ class Simulation:
         self._step = 0
         self._effort = np.zeros((4, len(parameters)))
         self._magnet = np.zeros(len(parameters), dtype=np.bool_)
-        self._reporter = Reporter(service.emit, [rig.name for rig in lab.rigs], self._plant)
+        self._reporter = Reporter(service.emit, [rig.name for rig in service.rigs], self._plant)
         self._rigs = [
             _Rig(index, rig.name, values, service, self._plant)
-            for index, (rig, values) in enumerate(zip(lab.rigs, parameters, strict=True))
+            for index, (rig, values) in enumerate(zip(service.rigs, parameters, strict=True))
         ]
+        self._states = service.batch_sender(topics.STATES)
+        for rig in self._rigs:
+            service.add_to_batch(self._states, topics.STATE, rig.name)
+        service.health.rig_reports = self._rig_reports
 
     def tick(self, tick: Tick) -> None:
         """Latch, stamp, publish, integrate."""
@@ -110,6 +114,7 @@ class Simulation:
         positions, velocities = plant.position.T.tolist(), plant.velocity.T.tolist()
         errors = plant.error.T.tolist()
         lateness_ns = sampled_ns - tick.deadline_ns
+        encoded = []
         for rig, position, velocity, error in zip(rigs, positions, velocities, errors, strict=True):
             state = rig.state
             state.step = step
@@ -120,7 +125,8 @@ class Simulation:
             state.position[:] = position
             state.velocity[:] = velocity
             state.integration_error[:] = error
-            rig.publish(self._times, sampled_ns)
+            encoded.append(rig.encoded(self._times, sampled_ns))
+        self._states.send(encoded)
         for rig in rigs:
             if rig.follower.lost or rig.follower.back or rig.follower.reset:
                 self._reporter.tell_of_commands(rig.index, rig.follower, step)
@@ -132,6 +138,9 @@ class Simulation:
         self._counters.count_tick(tick, self._step_ns)
         if tick.missed_steps or tick.lateness_ns > self._step_ns:
             self._reporter.tell_of_overrun(tick, step, sampled_ns)
+
+    def _rig_reports(self) -> list[RigReport]:
+        return [rig.report() for rig in self._rigs]
 
     def _catch(self, step: int) -> None:
         """Bring rigs back whose motion the step could not follow: better at the start than nowhere for ever."""
@@ -167,13 +176,13 @@ class _Rig:
         self._world = plant.world
         self._plant = plant
         self._part_names = plant.world.part_names[index]
-        self._send = service.sender(topics.STATE, name).send
+        self._loops_us: list[int] = []
         self._has_commanded = False
         self._has_parts = False
         self._parts_due_ns = 0
 
-    def publish(self, times: StepTimes, sampled_ns: int) -> None:
-        """Complete the state with what seldom changes, and send it."""
+    def encoded(self, times: StepTimes, sampled_ns: int) -> bytes:
+        """Complete the state with what seldom changes, and encode it."""
         state, follower, world, index = self.state, self.follower, self._world, self.index
         if follower.changed:
             state.session = follower.session
@@ -186,6 +195,8 @@ class _Rig:
             state.command_arrived_ns = follower.arrived_ns
             state.basis_step = follower.basis_step if basis_ns is not None else 0
             state.loop_latency_ns = sampled_ns - basis_ns if basis_ns is not None else 0
+            if basis_ns is not None:
+                self._loops_us.append((sampled_ns - basis_ns) // 1000)
             self._has_commanded = True
         elif self._has_commanded:
             state.command_arrived_ns = state.basis_step = state.loop_latency_ns = 0
@@ -198,7 +209,12 @@ class _Rig:
             elif self._has_parts:
                 del state.parts[:]
                 self._has_parts = False
-        self._send(state)
+        return state.SerializeToString()
+
+    def report(self) -> RigReport:
+        """What is to be known of the rig since the last report."""
+        loops_us, self._loops_us = self._loops_us, []
+        return RigReport(rig=self.name, loop_us=loops_us, safe=self.follower.safe)
 
     def _state_parts(self) -> None:
         state, world, index = self.state, self._world, self.index
