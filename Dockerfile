@@ -1,5 +1,7 @@
-# One image a service: `docker build --build-arg PARTS=sim .` (sim, edge, recorder, or all for the command line's tools).
-FROM python:3.11-slim AS build
+# One image a service: `docker build --build-arg PARTS=sim .` (router, sim, edge, recorder, or all for every command).
+ARG PYTHON=3.11.11-slim-bookworm
+
+FROM python:${PYTHON} AS build
 ARG PARTS=all
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
@@ -8,14 +10,16 @@ COPY runtime runtime
 COPY services services
 COPY tools tools
 COPY examples examples
+# What installs is not needed to run.
 RUN python -m venv /opt/hilrig \
-    && /opt/hilrig/bin/pip install --no-cache-dir --constraint constraints.txt ".[${PARTS}]"
+    && /opt/hilrig/bin/pip install --no-cache-dir --constraint constraints.txt ".[${PARTS}]" \
+    && /opt/hilrig/bin/pip uninstall --yes setuptools pip
 
-FROM python:3.11-slim
+FROM python:${PYTHON}
 COPY --from=build /opt/hilrig /opt/hilrig
-ENV PATH=/opt/hilrig/bin:$PATH PYTHONUNBUFFERED=1
-# The recorder writes to /recordings: give the folder that is mounted there to this user.
+ENV PATH=/opt/hilrig/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+# The recorder writes to /recordings: give the folder that is mounted there to this user, and the certificates too.
 RUN useradd --create-home --uid 10001 hilrig && mkdir /recordings && chown hilrig /recordings
-USER hilrig
+USER 10001:10001
 STOPSIGNAL SIGTERM
 CMD ["hilrig", "--help"]

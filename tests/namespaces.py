@@ -45,9 +45,16 @@ class Network:
         self._closing.callback(_end, process)
         return process
 
-    def run(self, host: str, command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
+    def run(
+        self, host: str, command: list[str], *, check: bool = True, **options: Any
+    ) -> subprocess.CompletedProcess[Any]:
         """Run a command on a host to its end."""
-        return subprocess.run(["ip", "netns", "exec", self._namespace(host), *command], check=True, **options)
+        return subprocess.run(["ip", "netns", "exec", self._namespace(host), *command], check=check, **options)
+
+    def call(self, host: str, command: list[str]) -> int:
+        """Run a command on a host to its end, silently; gives its exit code."""
+        words = ["ip", "netns", "exec", self._namespace(host), *command]
+        return subprocess.run(words, check=False, capture_output=True).returncode
 
     def set_link(self, host: str, up: bool) -> None:
         """Plug a host's cable in or out."""

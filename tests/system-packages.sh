@@ -3,7 +3,7 @@
 # Installs what is missing as root on Debian; elsewhere it says what is missing and goes on: a test that needs a
 # missing part says so when it is skipped.
 set -eu
-packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
+packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl docker-compose xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
 # Node.js may have come another way than by apt.
 command -v npm >/dev/null 2>&1 || packages="$packages nodejs npm"
 

@@ -8,10 +8,8 @@ import zenoh
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.lifecycle import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
-from hilrig_runtime.zenoh_config import router_config
+from hilrig_runtime.zenoh_config import ROUTER, router_config
 from hilrig_schemas.topics import alive_key
-
-SERVICE = "router"
 
 
 def router_endpoint(lab: LabConfig, listen: str) -> str:
@@ -51,6 +49,6 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
         raise OperationError(
             f"the router can't listen on {endpoint} ({reason}): end what listens there, or choose another --listen"
         ) from error
-    with closing(session), session.liveliness().declare_token(alive_key(lab.name, SERVICE, "1")):
+    with closing(session), session.liveliness().declare_token(alive_key(lab.name, ROUTER, "1")):
         print(f"router of lab {lab.name!r} at {endpoint}", flush=True)
         stopping.wait()

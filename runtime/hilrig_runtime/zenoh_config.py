@@ -18,6 +18,7 @@ from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError
 
 MESH_ORDER: Final = ("sim", "edge", "recorder")
+ROUTER: Final = "router"
 FIRST_INSTANCE: Final = "1"
 """The instance that has a port of its own in the mesh."""
 
@@ -69,7 +70,7 @@ def router_config(bus: BusConfig, lab: str, listen: str) -> zenoh.Config:
     """
     settings = _common() | {"mode": "router", "listen/endpoints": [listen]}
     if bus.tls is not None:
-        settings |= _secured(bus.tls, "router")
+        settings |= _secured(bus.tls, ROUTER)
         settings["access_control"] = access_control(bus.tls, lab)
     return _made(settings)
 
@@ -84,6 +85,8 @@ def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE
     """
     roles = (service,) if service in MESH_ORDER else TOOLS
     names = [identity.name for role in roles for identity in identities(tls) if identity.role == role]
+    if service == ROUTER:
+        names = [ROUTER]
     for name in sorted(names, key=lambda name: name != instance):
         if (tls.folder / f"{name}.key").exists():
             return name

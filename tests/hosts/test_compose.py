@@ -1,7 +1,10 @@
-"""compose.yaml: what it says is started for real, each service on a host of its own."""
+"""compose.yaml: what it says is started for real, each service on a host of its own with its own certificate alone."""
 
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +12,22 @@ import pytest
 import yaml
 
 from hilrig_runtime.config import load_lab
+from labs import hilrig
 from namespaces import Network, require_namespaces
 from waiting import eventually
 
 ROOT = Path(__file__).parents[2]
+LAB_FILE = ROOT / "compose/lab.toml"
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
-SERVICES = ("sim", "edge", "recorder")
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+EDGES = {"east": "rig1,rig2", "west": "rig3,rig4"}
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 CONTROLLER = """
 import sys, time
 from pymodbus.client import ModbusTcpClient
 
-client = ModbusTcpClient(sys.argv[1], port=5020, timeout=2)
+client = ModbusTcpClient(sys.argv[1], port=int(sys.argv[2]), timeout=2)
 assert client.connect(), "no connection"
 for _ in range(60):
     before = client.read_holding_registers(4, count=4).registers
@@ -32,69 +38,163 @@ print(before[0], after[0])
 client.close()
 """
 
+STRANGER = """
+import zenoh
 
-def test_every_service_runs_a_command_of_ours_on_a_lab_that_is_mounted() -> None:
-    for name in SERVICES:
-        service = COMPOSE["services"][name]
-        program, command, option, config = service["command"]
-        assert (program, command, option) == ("hilrig", name, "--config")
-        assert f"./compose/lab.toml:{config}:ro" in service["volumes"]
-        assert service["build"]["args"]["PARTS"] == name
-        assert service["restart"] == "unless-stopped"
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect/endpoints", '["tls/router:7447"]')
+config.insert_json5("connect/timeout_ms", "2000")
+config.insert_json5("transport/link/tls/root_ca_certificate", '"%s"')
+try:
+    zenoh.open(config).close()
+except zenoh.ZError:
+    print("not let in")
+"""
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_service_is_confined_and_looked_after(name: str) -> None:
+    service = SERVICES[name]
+    assert service["user"] == "10001:10001"
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["restart"] == "unless-stopped"
+    assert {"mem_limit", "pids_limit", "logging"} <= set(service)
+    kind = "edge" if name in EDGES else name
+    assert service["command"][:2] == ["hilrig", kind]
+    assert service["build"]["args"]["PARTS"] == kind
+    check = service["healthcheck"]["test"]
+    assert check[:5] == ["CMD", "hilrig", "doctor", "--service", kind]
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
+    mounted = {source: (target, mode) for source, target, *mode in (v.split(":") for v in SERVICES[name]["volumes"])}
+    certificates = {source for source in mounted if source.startswith("./certs/")}
+    assert certificates == {f"./certs/bus/{file}" for file in ("ca.pem", f"{name}.pem", f"{name}.key")}
+    assert all(mounted[source][1] == ["ro"] for source in mounted if source != "./recordings")
 
 
 def test_the_lab_and_the_compose_file_agree() -> None:
-    lab = load_lab(ROOT / "compose/lab.toml")
-    assert lab.bus.topology == "router"
-    assert lab.bus.router == "tcp/router:7447"
-    assert "tcp/0.0.0.0:7447" in COMPOSE["services"]["router"]["command"]
-    ports = list(lab.ports.values())
-    assert COMPOSE["services"]["edge"]["ports"] == [f"127.0.0.1:{ports[0]}-{ports[-1]}:{ports[0]}-{ports[-1]}"]
-    assert f"./recordings:{lab.recorder.folder}" in COMPOSE["services"]["recorder"]["volumes"]
+    lab = load_lab(LAB_FILE)
+    assert lab.bus.router == "tls/router:7447"
+    assert SERVICES["router"]["command"][-2:] == ["--listen", "tls/0.0.0.0:7447"]
+    assert lab.bus.tls is not None
+    assert {edge: ",".join(rigs) for edge, rigs in lab.bus.tls.edges.items()} == EDGES
+    for edge, rigs in EDGES.items():
+        assert SERVICES[edge]["command"][-4:] == ["--instance", edge, "--rigs", rigs]
+        ports = [lab.ports[rig] for rig in rigs.split(",")]
+        span = f"{ports[0]}-{ports[-1]}"
+        # On this host alone, until somebody says otherwise.
+        assert SERVICES[edge]["ports"] == [f"127.0.0.1:{span}:{span}"]
+    assert f"./recordings:{lab.recorder.folder}" in SERVICES["recorder"]["volumes"]
+    assert COMPOSE["networks"]["bus"]["internal"] is True
+    assert all(SERVICES[name]["networks"] == ["bus"] for name in SERVICES if name not in EDGES)
 
 
 def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compose_names() -> None:
     dockerfile = (ROOT / "Dockerfile").read_text()
     for folder in ("schemas", "runtime", "services", "tools", "examples"):
         assert f"COPY {folder} {folder}" in dockerfile
+    assert "\nUSER 10001:10001\n" in dockerfile
+    assert ":latest" not in dockerfile
     pyproject = (ROOT / "pyproject.toml").read_text()
-    for name in SERVICES:
-        assert f"\n{name} = [" in pyproject
+    for service in SERVICES.values():
+        assert f"\n{service['build']['args']['PARTS']} = [" in pyproject
+
+
+def test_a_compose_implementation_reads_it() -> None:
+    if shutil.which("docker-compose") is None:
+        pytest.skip("needs docker-compose (Debian's package of that name)")
+    command = ["docker-compose", "--file", "compose.yaml", "config"]
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    understood = yaml.safe_load(done.stdout)
+    assert set(understood["services"]) == set(SERVICES)
+    assert understood["services"]["east"]["ports"] == ["127.0.0.1:5020:5020/tcp", "127.0.0.1:5021:5021/tcp"]
+    assert all(service["read_only"] for service in understood["services"].values())
+
+
+@dataclass
+class Containers:
+    """The services of compose.yaml, each on its own host, with what the file mounts and nothing else."""
+
+    network: Network
+    folder: Path
+    processes: dict[str, subprocess.Popen[Any]]
+
+    def start(self, name: str) -> None:
+        self.processes[name] = self.network.popen(name, self.words(name, SERVICES[name]["command"]))
+
+    def words(self, name: str, command: list[str]) -> list[str]:
+        """A command of a container's, with the paths that stand for its mounts here."""
+        inside = {"hilrig": HILRIG, "/etc/hilrig/lab.toml": str(self.folder / name / "lab.toml")}
+        return [inside.get(word, word) for word in command]
+
+    def mount(self, name: str, certificates: Path) -> None:
+        own = self.folder / name
+        own.mkdir()
+        for volume in SERVICES[name]["volumes"]:
+            source, target = volume.split(":")[:2]
+            if source.startswith("./certs/bus/"):
+                shutil.copy(certificates / Path(source).name, own / Path(target).name)
+        text = LAB_FILE.read_text().replace('"/certs"', f'"{own}"')
+        (own / "lab.toml").write_text(text.replace('"/recordings"', f'"{self.folder / "recordings"}"'))
+
+    def is_well(self, name: str) -> bool:
+        """What the health check of a container says."""
+        command = self.words(name, SERVICES[name]["healthcheck"]["test"][1:])
+        return self.network.call(name, command) == 0
+
+
+@pytest.fixture
+def containers(tmp_path: Path) -> Iterator[Containers]:
+    require_namespaces()
+    made = hilrig("certs", tmp_path / "certs", "--config", LAB_FILE)
+    assert made.returncode == 0, made.stderr
+    with Network([*SERVICES, "controller"]) as network:
+        running = Containers(network, tmp_path, {})
+        # The router comes last: each service waits for it.
+        for name in reversed(SERVICES):
+            running.mount(name, tmp_path / "certs/bus")
+            running.start(name)
+        yield running
 
 
 @pytest.mark.hosts
-def test_the_services_find_each_other_by_name_and_a_controller_moves_the_arm(tmp_path: Path) -> None:
-    require_namespaces()
-    recordings = tmp_path / "recordings"
-    lab = tmp_path / "lab.toml"
-    lab.write_text((ROOT / "compose/lab.toml").read_text().replace('"/recordings"', f'"{recordings}"'))
-    router_arguments = COMPOSE["services"]["router"]["command"]
-    with Network(["router", *SERVICES, "controller"]) as network:
-        processes = {}
-        # The services come first: each waits for its router.
-        for name in SERVICES:
-            command = [HILRIG if word == "hilrig" else word for word in COMPOSE["services"][name]["command"]]
-            command[-1] = str(lab)
-            processes[name] = network.popen(name, command)
-        router = [sys.executable, str(ROOT / "tests/zenoh_router.py"), *router_arguments]
-        network.popen("router", router, stdin=subprocess.PIPE)
+def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(containers: Containers) -> None:
+    network, folder = containers.network, containers.folder
 
-        def drive() -> tuple[int, int] | None:
-            command = [sys.executable, "-c", CONTROLLER, "edge"]
-            try:
-                output = network.run(
-                    "controller", command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-                )
-            except subprocess.CalledProcessError:
-                return None
-            before, after = map(int, output.stdout.split())
-            return (before, after) if after != before else None
+    def drive(edge: str, port: int) -> tuple[int, int] | None:
+        command = [sys.executable, "-c", CONTROLLER, edge, str(port)]
+        try:
+            output = network.run("controller", command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        except subprocess.CalledProcessError:
+            return None
+        before, after = map(int, output.stdout.split())
+        return (before, after) if after != before else None
 
-        before, after = eventually(drive, timeout_s=40, every_s=0.2)
+    for edge, port in (("east", 5020), ("west", 5023)):
+        before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=40, every_s=0.2)
         assert after > before
-        assert all(process.poll() is None for process in processes.values())
-        for name in ("edge", "sim", "recorder"):
-            processes[name].terminate()
-            assert processes[name].wait(5) == 0, f"{name} did not end well on SIGTERM"
-    assert list(recordings.rglob("*.mcap")), "the session was recorded"
-    assert not list(recordings.rglob("*.part"))
+    assert all(eventually(lambda name=name: containers.is_well(name)) for name in SERVICES)
+
+    stranger = [sys.executable, "-c", STRANGER % (folder / "router/ca.pem")]
+    assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "not let in\n"
+
+    containers.processes["sim"].kill()
+    containers.processes["sim"].wait()
+    assert not containers.is_well("sim")
+    containers.start("sim")
+    assert eventually(lambda: containers.is_well("sim"), timeout_s=30)
+
+    for name in ("east", "west", "sim", "recorder", "router"):
+        process = containers.processes[name]
+        assert process.poll() is None, f"{name} ended by itself"
+        process.terminate()
+        assert process.wait(5) == 0, f"{name} did not end well on SIGTERM"
+    assert {path.parent.name for path in (folder / "recordings").rglob("*.mcap")} == {"rig1", "rig4"}
+    assert not list((folder / "recordings").rglob("*.part"))

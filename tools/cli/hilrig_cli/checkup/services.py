@@ -35,8 +35,13 @@ class Heard:
         return {name.partition("/")[0] for name in self.alive}
 
 
+def is_one(name: str, wanted: str) -> bool:
+    """Whether "<service>/<instance>" is what is wanted: a service, or one instance of it."""
+    return wanted in (name, name.partition("/")[0])
+
+
 def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S, until: str = "") -> Heard:
-    """Listen on the lab's bus; with `until` only until that service has been heard.
+    """Listen on the lab's bus as `identity`; with `until` only until that service has said how it is, see `is_one`.
 
     Raises:
         HilrigError: the bus can't be joined.
@@ -62,7 +67,7 @@ def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S
         deadline_s = time.monotonic() + for_s
         while time.monotonic() < deadline_s:
             with lock:
-                if until and any(name.partition("/")[0] == until for name in heard.healths):
+                if until and any(is_one(name, until) for name in heard.healths):
                     break
             time.sleep(0.02)
     return heard

@@ -22,6 +22,10 @@ def doctor(
             show_default=False,
         ),
     ] = "",
+    instance: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="With --service: this one of its kind; without: any.", show_default=False),
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Look at ports, bus, services, certificates, versions, clocks, limits and disk, and say what is to be mended.
@@ -31,7 +35,7 @@ def doctor(
     from hilrig_runtime.config import load_lab
 
     lab = load_lab(config)
-    findings = _one_service(lab, service) if service else _everything(lab)
+    findings = _one_service(lab, service, instance) if service else _everything(lab)
     bad = [finding for finding in findings if finding.level.value == "wrong"]
     if as_json:
         rows = [
@@ -71,9 +75,9 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
     return findings
 
 
-def _one_service(lab: "LabConfig", service: str) -> "list[Finding]":
+def _one_service(lab: "LabConfig", service: str, instance: str) -> "list[Finding]":
     from hilrig_cli.checkup import good, wrong
-    from hilrig_cli.checkup.services import SERVICES, listen
+    from hilrig_cli.checkup.services import SERVICES, is_one, listen
     from hilrig_runtime.errors import HilrigError, InputError
 
     if service not in (*SERVICES, "router"):
@@ -82,18 +86,19 @@ def _one_service(lab: "LabConfig", service: str) -> "list[Finding]":
         raise InputError("--service router: this lab has none (bus.topology in lab.toml)")
     # A container has its own service's certificate and no other; in a mesh a tool's is needed, for the port is taken.
     identity = service if lab.bus.topology == "router" else "tool"
+    wanted = f"{service}/{instance}" if instance else service
     try:
-        heard = listen(lab, identity, until=service, for_s=0.0 if service == "router" else 2.5)
+        heard = listen(lab, identity, until=wanted, for_s=0.0 if service == "router" else 2.5)
     except HilrigError as error:
         return [wrong(service, str(error), "see its log")]
     if service == "router":
         return [good(service, "it answers")]
     for name, (health, _) in heard.healths.items():
-        if name.partition("/")[0] == service:
+        if is_one(name, wanted):
             if health.trouble:
                 return [wrong(service, health.trouble, "see its log")]
             return [good(service, f"{name} is well, {health.uptime_ns / 1e9:.0f} s after it started")]
-    return [wrong(service, f"no {service} says how it is", "see its log, or start it again")]
+    return [wrong(service, f"no {wanted} says how it is", "see its log, or start it again")]
 
 
 def _print(findings: "list[Finding]") -> None:
