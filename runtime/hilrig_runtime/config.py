@@ -206,6 +206,8 @@ class LabConfig(Section):
     """A whole lab, as `lab.toml` describes it."""
 
     name: Name = "lab"
+    realtime: bool = True
+    """Let simulation and edge go before all ordinary programs, where the system grants it (docs/operations.md)."""
     sim: SimConfig = SimConfig()
     edge: EdgeConfig = EdgeConfig()
     recorder: RecorderConfig = RecorderConfig()
@@ -293,6 +295,18 @@ class LabConfig(Section):
             if rig.name == name:
                 return rig
         raise InputError(f"no rig is called {name!r}; this lab has {', '.join(r.name for r in self.rigs)}")
+
+
+def read_rig(settings_json: str) -> RigSettings:
+    """One rig's settings as they travel between services, JSON.
+
+    Raises:
+        InputError: they say something that is no rig; every mistake is named.
+    """
+    try:
+        return RigSettings.model_validate_json(settings_json)
+    except ValidationError as error:
+        raise InputError("; ".join(mistakes_in(error))) from error
 
 
 def load_lab(path: Path | None) -> LabConfig:

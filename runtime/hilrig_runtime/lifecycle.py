@@ -16,15 +16,13 @@ from typing import Final
 from hilrig_runtime.bus import Bus
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.realtime import prefer_latency, yield_to_others
+from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency, yield_to_others
 from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
 ROUTER_RETRY_S: Final = 0.5
-CLOSES_THE_LOOP: Final = ("sim", "edge")
-"""Services whose punctuality is the product; the others may wait for their turn."""
 
 logger = logging.getLogger(__name__)
 
@@ -44,11 +42,7 @@ def run_service(
     Raises:
         HilrigError: the service can't start or can't go on; what it opened is closed.
     """
-    if name in CLOSES_THE_LOOP:
-        # Before the bus is opened: its threads inherit it.
-        prefer_latency()
-    else:
-        yield_to_others()
+    _ask_for_time(name, lab)
     stopping = threading.Event()
     stop_on_signals(stopping)
     if stop_with_parent:
@@ -61,6 +55,18 @@ def run_service(
         logger.debug("running as %s", service.source)
         run(service)
         service.check()
+
+
+def _ask_for_time(name: str, lab: LabConfig) -> None:
+    """Services whose punctuality is the product go first, the others may wait for their turn."""
+    priority = REALTIME_PRIORITIES.get(name)
+    if priority is None:
+        yield_to_others()
+        return
+    # Before the bus is opened: its threads inherit both.
+    prefer_latency()
+    if lab.realtime and not go_realtime(priority):
+        logger.debug("the system grants no real-time policy: other programs may hold up this one")
 
 
 def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:

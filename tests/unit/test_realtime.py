@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import struct
 import sys
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 import pytest
@@ -46,6 +47,41 @@ def test_the_thread_and_those_that_it_starts_get_short_slices_and_sharp_timers()
     release = tuple(int(part) for part in os.uname().release.split(".")[:2])
     if release >= (6, 12):
         assert slices == [realtime.SLICE_NS, realtime.SLICE_NS]
+
+
+def _asked_for_realtime(connection: Connection) -> None:
+    import threading
+
+    granted = realtime.go_realtime(1)
+    policies = [os.sched_getscheduler(0)]
+    thread = threading.Thread(target=lambda: policies.append(os.sched_getscheduler(0)))
+    thread.start()
+    thread.join()
+    connection.send((granted, policies))
+
+
+def _asked_without_the_right(connection: Connection) -> None:
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    os.setuid(65534)
+    _asked_for_realtime(connection)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the policy")
+@pytest.mark.parametrize("target", [_asked_for_realtime, _asked_without_the_right])
+def test_the_real_time_policy_holds_for_all_threads_where_it_is_granted(target: Callable[[Connection], None]) -> None:
+    if target is _asked_without_the_right and os.geteuid() != 0:
+        pytest.skip("only root can give the right away")
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=target, args=(theirs,))
+    process.start()
+    assert ours.poll(20)
+    granted, policies = ours.recv()
+    process.join(10)
+    if target is _asked_without_the_right:
+        assert not granted
+    assert policies == [os.SCHED_FIFO if granted else os.SCHED_OTHER] * 2
 
 
 def _stepped_back(connection: Connection) -> None:
