@@ -5,7 +5,7 @@ controller does, and when, is scripted; so a test knows every stage of every loo
 """
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -264,7 +264,7 @@ def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
 
 def write(
     path: Path,
-    made: list[Made],
+    made: Iterable[Made],
     *,
     script: Script = Script(),
     metadata: Mapping[str, Mapping[str, str]] | None = None,
@@ -283,6 +283,10 @@ def write(
     Without `finish` the file has no end, as after a kill; without `configured` the rig did not say what it is.
     `missing` leaves out messages by topic and sequence; the second half reaches the recorder `arrival_lag_ns` late.
     """
+    if arrival_lag_ns:
+        made = list(made)
+        late_from = made[len(made) // 2].publish_wall_ns
+    missed_steps = 0
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=64 * 1024, compression=compression)
         writer.start()
@@ -314,11 +318,12 @@ def write(
         if lab_toml:
             writer.add_attachment(0, START_WALL_NS, "lab.toml", "application/toml", lab_toml.encode())
         sequences = dict.fromkeys(RECORDED, 0)
-        for number, one in enumerate(made):
+        for one in made:
+            missed_steps += one.message.missed_steps if isinstance(one.message, JointState) else 0
             sequences[one.topic] += 1
             if sequences[one.topic] in missing.get(one.topic, ()):
                 continue
-            late_ns = 3 * MS + (arrival_lag_ns if number > len(made) // 2 else 0)
+            late_ns = 3 * MS + (arrival_lag_ns if arrival_lag_ns and one.publish_wall_ns > late_from else 0)
             writer.add_message(
                 channels[one.topic],
                 log_time=one.publish_wall_ns + late_ns,
@@ -334,7 +339,7 @@ def write(
             "lost_transport": str(script.lost_transport),
             "lost_recorder": str(script.lost_recorder),
             "overruns": str(len(script.stalls)),
-            "missed_steps": str(sum(one.message.missed_steps for one in made if isinstance(one.message, JointState))),
+            "missed_steps": str(missed_steps),
             "clock_steps": str(script.clock_steps),
         }
         for name, values in {"hilrig.summary": summary, **(metadata or {})}.items():

@@ -19,6 +19,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema, Statistics
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
 
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
@@ -95,7 +96,7 @@ class RecordingFile:
                         ):
                             topic = wanted[record.channel_id]
                             yield RawMessage(topic, record.sequence, record.log_time, record.publish_time, record.data)
-        except (McapError, struct.error, ValueError, RuntimeError, OSError) as error:
+        except (McapError, ZstdError, struct.error, ValueError, RuntimeError, OSError) as error:
             raise damaged(self.path, str(error)) from error
 
 
@@ -118,7 +119,7 @@ def open_recording(path: Path) -> RecordingFile:
         raise InputError(f"{path}: a folder, where a recording (.mcap) was expected") from None
     except OSError as error:
         raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
-    except (McapError, struct.error, ValueError, KeyError, RuntimeError, StopIteration) as error:
+    except (McapError, ZstdError, struct.error, ValueError, KeyError, RuntimeError, StopIteration) as error:
         raise damaged(path, str(error)) from error
     topic_of_channel = _topics(path, summary, metadata)
     counts = dict.fromkeys(RECORDED, 0)

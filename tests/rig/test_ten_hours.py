@@ -1,0 +1,96 @@
+"""A recording of ten hours: every command answers, and its memory does not grow with the run.
+
+It takes minutes, so it runs with HILRIG_LONG in the environment only; an hour is in `bench/review.py`.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilrig_schemas import Event, JointState, ModbusTraffic, TorqueCommand
+from labs import HILRIG
+from recordings import MS, Made, Script, make, write
+
+pytestmark = [
+    pytest.mark.rig,
+    pytest.mark.timeout(1200),
+    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes: set HILRIG_LONG"),
+]
+
+PIECE_S = 360.0
+PIECES = 100
+LARGEST_MB = 500.0
+PEAK = """
+import json, resource, subprocess, sys
+code = subprocess.run(sys.argv[1:], stdout=subprocess.PIPE, check=False)
+peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 * 1024 if sys.platform == "darwin" else 1024)
+print(json.dumps({"code": code.returncode, "peak_mb": peak, "said": code.stdout.decode()}))
+"""
+
+
+def ten_hours() -> Iterator[Made]:
+    """A piece of a run again and again: its messages moved on in time and number each time they are taken."""
+    script = Script(seconds=PIECE_S, poll_ms=20.0, delay_ms=3.0)
+    made = [one for one in make(script) if not isinstance(one.message, Event)]
+    steps = sum(isinstance(one.message, JointState) for one in made)
+    commands = sum(isinstance(one.message, TorqueCommand) for one in made)
+    piece_ns = steps * 20 * MS
+    for piece in range(PIECES):
+        for one in made:
+            if piece:
+                _move(one, piece_ns, steps, commands)
+            yield one
+
+
+def _move(one: Made, by_ns: int, steps: int, commands: int) -> None:
+    one.publish_wall_ns += by_ns
+    message = one.message
+    if isinstance(message, JointState):
+        message.step += steps
+        message.sampled_ns += by_ns
+        message.wall_ns += by_ns
+        if message.command_seq:
+            message.command_seq += commands
+        if message.basis_step:
+            message.basis_step += steps
+            message.command_arrived_ns += by_ns
+    elif isinstance(message, TorqueCommand):
+        message.seq += commands
+        message.basis_step += steps
+        for name in ("wall_ns", "state_arrived_ns", "state_served_ns", "write_arrived_ns", "sent_ns"):
+            setattr(message, name, getattr(message, name) + by_ns)
+    elif isinstance(message, ModbusTraffic):
+        message.wall_ns += by_ns
+        message.closed_ns += by_ns
+        for request in message.requests:
+            request.arrived_ns += by_ns
+            request.answered_ns += by_ns
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("long") / "ten.mcap", ten_hours(), script=Script(seconds=PIECE_S * PIECES))
+
+
+@pytest.mark.parametrize("command", ["latency", "replay", "report", "compare"])
+def test_each_command_answers_within_its_memory(run: Path, command: str, record_property: pytest.Function) -> None:
+    options = {
+        "latency": [run, "--json"],
+        "replay": [run, "--save", run.with_suffix(".rrd")],
+        "report": [run, "--out", run.with_suffix(".html"), "--json"],
+        "compare": [run, run, "--json"],
+    }[command]
+    words = [sys.executable, "-c", PEAK, *HILRIG, command, *map(str, options)]
+    done = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    record_property("peak_mb", done["peak_mb"])
+    print(f"{command}: {done['peak_mb']:.0f} MB")
+    assert done["code"] == 0
+    assert done["peak_mb"] < LARGEST_MB
+    if command == "latency":
+        # Where the pieces meet, a command or two of the one do not fit into the other.
+        assert json.loads(done["said"])["samples"] > 0.98 * PIECE_S * PIECES * 50

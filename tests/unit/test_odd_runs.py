@@ -1,0 +1,73 @@
+"""Runs that are not as they should be: every command gives one clear answer."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hilrig_replay.compare import compare
+from hilrig_replay.latency import measure
+from hilrig_replay.report import report
+from hilrig_replay.rerun_view import save_rrd
+from hilrig_replay.run import open_run
+from hilrig_replay.verify import verify
+from hilrig_runtime.errors import InputError
+from recordings import Script, make, record, write
+
+ALL: dict[str, Callable[[Path], object]] = {
+    "latency": lambda path: measure(open_run(path)),
+    "replay": lambda path: save_rrd(open_run(path), path.with_suffix(".rrd")),
+    "compare": lambda path: compare([open_run(path), open_run(path)]),
+    "report": lambda path: report([path]),
+    "verify": verify,
+}
+
+
+def torn(folder: Path) -> Path:
+    path = folder / "run.mcap"
+    path.write_bytes(record(folder / "whole.mcap", Script(seconds=2.0)).read_bytes()[:9000])
+    return path
+
+
+def damaged(folder: Path) -> Path:
+    path = record(folder / "run.mcap", Script(seconds=2.0))
+    whole = bytearray(path.read_bytes())
+    whole[len(whole) // 2] ^= 0x10
+    path.write_bytes(whole)
+    return path
+
+
+def newer(folder: Path) -> Path:
+    return write(folder / "run.mcap", make(Script(seconds=1.0)), schema_version="hilrig.v2")
+
+
+@pytest.mark.parametrize("command", ALL)
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (torn, "torn: it has no end; `hilrig recover .*` makes a whole file of it"),
+        (damaged, "damaged .*: `hilrig recover .*` saves what is whole"),
+        (newer, r"recorded with messages hilrig\.v2, and this hilrig reads hilrig\.v1: use a newer hilrig"),
+    ],
+)
+def test_what_can_not_be_read_is_said_with_what_to_do(
+    spoil: Callable[[Path], Path], words: str, command: str, tmp_path: Path
+) -> None:
+    path = spoil(tmp_path)
+    with pytest.raises(InputError, match=words) as said:
+        ALL[command](path)
+    assert str(said.value).startswith(f"{path}: ")
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("command", ["latency", "compare", "report"])
+def test_a_run_without_a_controller_has_no_loop(command: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
+    with pytest.raises(InputError, match=r"without commands: no controller wrote|never moves"):
+        ALL[command](path)
+
+
+def test_a_run_without_a_controller_can_be_looked_at(tmp_path: Path) -> None:
+    path = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
+    save_rrd(open_run(path), tmp_path / "run.rrd")
+    assert (tmp_path / "run.rrd").stat().st_size > 10_000
