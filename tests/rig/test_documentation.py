@@ -28,6 +28,7 @@ OPENS_A_WINDOW = ("hilrig replay", "hilrig live")
 """Run with --save, for there is no screen."""
 TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose up": "tests/hosts/test_compose.py",
+    "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
