@@ -33,12 +33,11 @@ Key = tuple[str, int, bytes]
 class RecorderProcess:
     """`hilrig recorder` as a user starts it; a context manager that leaves no process behind."""
 
-    def __init__(self, config: Path) -> None:
-        self.log = config.parent / "recorder.log"
+    def __init__(self, config: Path, *options: str) -> None:
+        self.log = config.parent / f"recorder{''.join(options[:2])}.log"
+        command = [*HILRIG, "recorder", "--config", str(config), *options]
         with self.log.open("a") as log:
-            self.process = subprocess.Popen(
-                [*HILRIG, "recorder", "--config", str(config)], stdout=log, stderr=log, cwd=config.parent
-            )
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=config.parent)
 
     def kill(self) -> None:
         """End it as a power cut would."""
@@ -190,13 +189,13 @@ def make_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> tuple[Path, Lab
     return path, load_lab(path)
 
 
-def wait_ready(lab: LabConfig, recorder: RecorderProcess, timeout_s: float = 30.0) -> None:
+def wait_ready(lab: LabConfig, recorder: RecorderProcess, instance: str = "*", timeout_s: float = 30.0) -> None:
     """Return when the recorder says that it records."""
     with ZenohBus(lab.bus, "tool") as bus:
 
         def ready() -> bool:
             assert recorder.process.poll() is None, recorder.log.read_text()
-            return bool(bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.2))
+            return bool(bus.alive(alive_key(lab.name, "recorder", instance), timeout_s=0.2))
 
         eventually(ready, timeout_s=timeout_s)
 

@@ -72,8 +72,9 @@ def test_a_session_by_hand_and_its_refusals(tmp_path: Path) -> None:
         assert again.returncode == 3
         assert f"is being recorded by hand already: {session}" in again.stderr
         unknown = hilrig("record", "start", "rig9", "--config", config)
-        assert unknown.returncode == 3
-        assert "'rig9' is no rig of this lab; it has rig1" in unknown.stderr
+        assert unknown.returncode == 2
+        assert "'rig9' is recorded by nobody in lab" in unknown.stderr
+        assert "its rigs are rig1" in unknown.stderr
         # By hand too, a session outlives the recorder.
         recorder.kill()
         with RecorderProcess(config) as second:
@@ -127,8 +128,45 @@ def test_a_second_recorder_on_the_same_bus_refuses(tmp_path: Path) -> None:
             (other / "lab.toml").write_text(text)
             with RecorderProcess(other / "lab.toml") as second:
                 assert second.process.wait(30) == 3
-            assert "another recorder records this lab already: recorder/1" in second.log.read_text()
+            assert "another recorder is called '1' already: recorder/1" in second.log.read_text()
             assert recorder.process.poll() is None
+
+
+@pytest.mark.rig
+def test_recorders_share_the_rigs_of_a_lab_and_no_rig_has_two(tmp_path: Path) -> None:
+    with router() as endpoint:
+        config, lab = make_lab(tmp_path, rigs=3, extra=f'bus.topology = "router"\nbus.router = "{endpoint}"')
+        rigs = [rig.name for rig in lab.rigs]
+        shares = [("--instance", "one", "--rigs", "rig1,rig2"), ("--instance", "two", "--rigs", "rig3")]
+        with (
+            RecorderProcess(config, *shares[0]) as first,
+            RecorderProcess(config, *shares[1]) as second,
+            sending(lab, rigs) as senders,
+        ):
+            wait_ready(lab, first, "one")
+            wait_ready(lab, second, "two")
+            with RecorderProcess(config, "--instance", "three", "--rigs", "rig2,rig3") as third:
+                assert third.process.wait(30) == 3
+            assert "serves rig2 already; a rig has one recorder" in third.log.read_text()
+            by_hand = hilrig("record", "start", "rig3", "--config", config, "--json")
+            assert by_hand.returncode == 0, by_hand.stderr
+            for rig in rigs:
+                senders.begin(rig)
+            eventually(lambda: min(map(senders.count, rigs)) > 100)
+            assert hilrig("record", "stop", "rig3", "--config", config).returncode == 0
+            for rig in rigs:
+                senders.end(rig)
+            for rig, count in (("rig1", 1), ("rig2", 1), ("rig3", 2)):
+                eventually(lambda rig=rig, count=count: len(files_of(lab, rig)) == count)
+        for rig in rigs:
+            assert set(senders.sent[rig]) <= set(recorded(files_of(lab, rig)))
+            for path in files_of(lab, rig):
+                about = metadata(path)
+                assert about["hilrig.session"]["recorder"] == ("recorder/two" if rig == "rig3" else "recorder/one")
+                assert (about["hilrig.summary"]["lost_transport"], about["hilrig.summary"]["lost_recorder"]) == (
+                    "0",
+                    "0",
+                )
 
 
 @pytest.mark.rig

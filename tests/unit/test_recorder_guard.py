@@ -1,4 +1,4 @@
-"""One recorder a lab, and sessions that a person begins and ends."""
+"""One recorder a rig, and sessions that a person begins and ends."""
 
 import random
 from pathlib import Path
@@ -6,28 +6,32 @@ from pathlib import Path
 import pytest
 
 from hilrig_recorder.by_hand import HandSessions
-from hilrig_recorder.guard import FolderLock, elder, introduction
-from hilrig_runtime.bus import Answer
+from hilrig_recorder.guard import FolderLock
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Event, OpenSession
 
 WALL = 1_767_225_600_000_000_000
 
 
-def test_a_folder_is_held_by_one_and_free_when_it_lets_go(tmp_path: Path) -> None:
-    with FolderLock(tmp_path), pytest.raises(OperationError, match=r"another recorder \(process \d+ on .*\) records"):
-        FolderLock(tmp_path)
-    FolderLock(tmp_path).close()
+def test_a_rig_s_recordings_are_held_by_one_recorder_and_free_when_it_lets_go(tmp_path: Path) -> None:
+    refusal = r"another recorder \(process \d+ on .*\) records rig2 there"
+    with FolderLock(tmp_path, "1", ["rig1", "rig2"]), pytest.raises(OperationError, match=refusal):
+        FolderLock(tmp_path, "2", ["rig2", "rig3"])
+    FolderLock(tmp_path, "2", ["rig2", "rig3"]).close()
 
 
-def test_of_two_recorders_the_younger_gives_way() -> None:
-    answers = [Answer("k1", introduction("recorder/1", 100)), Answer("k2", introduction("recorder/2", 200))]
-    assert elder(answers, 100) == ""
-    assert elder(answers, 200) == "recorder/1 (k1)"
+def test_two_recorders_share_a_folder_when_they_share_no_rig(tmp_path: Path) -> None:
+    with FolderLock(tmp_path, "1", ["rig1"]), FolderLock(tmp_path, "2", ["rig2"]):
+        with pytest.raises(OperationError, match="choose another --instance"):
+            FolderLock(tmp_path, "2", ["rig3"])
+        with pytest.raises(OperationError, match="records rig1 there"):
+            FolderLock(tmp_path, "3", ["rig1", "rig3"])
 
 
-def test_answers_that_mean_nothing_are_passed_over() -> None:
-    assert elder([Answer("k", b"\xff"), Answer("k", b"", "refused"), Answer("k", b"")], 200) == ""
+@pytest.mark.parametrize("content", ["", "no json", "[]", "{}"])
+def test_a_lock_that_says_nothing_and_is_held_by_nobody_is_in_nobody_s_way(tmp_path: Path, content: str) -> None:
+    (tmp_path / ".recorder-old.lock").write_text(content)
+    FolderLock(tmp_path, "1", ["rig1"]).close()
 
 
 def sessions() -> HandSessions:

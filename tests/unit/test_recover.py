@@ -187,7 +187,7 @@ def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path:
 
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     writer = RunWriter(tmp_path / "run.mcap")
-    with pytest.raises(InputError, match="being written just now"):
+    with pytest.raises(InputError, match="is writing it just now"):
         recover(writer.part, tmp_path / "new.mcap")
     writer.close()
     recover(writer.part, tmp_path / "new.mcap")

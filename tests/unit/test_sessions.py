@@ -8,7 +8,7 @@ import pytest
 from hilrig_recorder.channels import message_head
 from hilrig_recorder.intake import Arrival
 from hilrig_recorder.recording import Recording
-from hilrig_recorder.sessions import KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
+from hilrig_recorder.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
 from hilrig_runtime.logstream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
@@ -81,9 +81,9 @@ class FakeShelf:
 class Desk:
     """A book, its shelf, and a time that the test moves."""
 
-    def __init__(self, preroll_s: float = 2.0) -> None:
+    def __init__(self, preroll_s: float = 2.0, rigs: Sequence[str] | None = None) -> None:
         self.shelf = FakeShelf()
-        self.book = SessionBook(LAB, preroll_s, self.shelf)
+        self.book = SessionBook(LAB, preroll_s, self.shelf, rigs)
         self.shelf.flush = self.book.flush
         self.now = 100 * SECOND
         self.offset = WALL
@@ -277,6 +277,42 @@ def test_rigs_do_not_mix() -> None:
     assert set(payloads(*one)) <= set(first.payloads)
     assert not set(payloads(*one)) & set(second.payloads)
     assert set(payloads(*two)) <= set(second.payloads)
+
+
+def test_a_recorder_of_some_rigs_passes_over_the_others() -> None:
+    desk = Desk(rigs=["rig2"])
+    desk.start("s1", "rig1")
+    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    desk.start("s2", "rig2")
+    desk.states(3, "rig1")
+    states = desk.states(3, "rig2")
+    assert desk.file.recording.rig == "rig2"
+    assert set(payloads(*states)) <= set(desk.file.payloads)
+    assert desk.shelf.refused == []
+    # What is missing of another recorder's rig is not lost here.
+    desk.sim.state("rig1", desk.wall)
+    desk.sim.batch()
+    desk.states(1, "rig1")
+    assert (desk.file.recording.tally.lost_transport, desk.book.lost_transport) == (0, 0)
+
+
+def test_messages_are_written_within_a_second_and_not_of_all_rigs_at_once() -> None:
+    desk = Desk()
+    rigs = [f"rig{number}" for number in range(20)]
+    for rig in rigs:
+        desk.start(rig, rig)
+    for rig in rigs:
+        desk.sim.state(rig, desk.wall)
+    desk.take(desk.sim.batch())
+    written = [len(file.records) for file in desk.shelf.files]
+    turns = []
+    for _ in range(10):
+        desk.wait(BLOCK_NS // 10)
+        counts = [len(file.records) for file in desk.shelf.files]
+        turns.append(sum(now > before for now, before in zip(counts, written, strict=True)))
+        written = counts
+    assert sum(turns) == len(rigs)
+    assert max(turns) <= 4
 
 
 def test_a_gap_is_counted_as_lost_on_the_way() -> None:

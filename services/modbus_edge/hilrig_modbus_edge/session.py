@@ -4,18 +4,9 @@ A controller that comes back from the same host within the grace time goes on wi
 that reconnects, or a chain of one-shot commands, is one recording. Pure: time is passed in.
 """
 
-import random
-import string
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from hilrig_schemas import OpenSession
-
-
-def session_id(rig: str, wall_ns: int, letters: random.Random) -> str:
-    """`<UTC time>-<rig>-<4 letters>`; the letters tell apart what begins within one second."""
-    time = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
-    return f"{time}-{rig}-{''.join(letters.choices(string.ascii_lowercase, k=4))}"
 
 
 @dataclass(slots=True)

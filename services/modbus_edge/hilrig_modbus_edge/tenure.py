@@ -15,11 +15,12 @@ from hilrig_modbus_edge.commander import Commander
 from hilrig_modbus_edge.errors import ModbusError
 from hilrig_modbus_edge.journal import Journal, times
 from hilrig_modbus_edge.lease import Lease
-from hilrig_modbus_edge.session import Session, session_id
+from hilrig_modbus_edge.session import Session
 from hilrig_modbus_edge.settings import MS, DeviceSettings, Outlet
 from hilrig_modbus_edge.throttle import Throttle
 from hilrig_modbus_edge.watchdog import Watchdog
 from hilrig_runtime.clock import Clock
+from hilrig_runtime.session_id import session_id
 from hilrig_schemas import Event, LeaseStatus
 
 REFUSAL_PERIOD_NS: Final = 1_000 * MS

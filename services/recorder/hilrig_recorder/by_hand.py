@@ -4,11 +4,10 @@ Beginning one only says so on the recorder's own log stream: from there on it is
 """
 
 import random
-import string
 from collections.abc import Iterable
-from datetime import UTC, datetime
 
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.session_id import session_id
 from hilrig_schemas import Event, OpenSession
 
 
@@ -36,11 +35,10 @@ class HandSessions:
             OperationError: there is no such rig, or it is being recorded by hand already.
         """
         if rig not in self._rigs:
-            raise OperationError(f"{rig!r} is no rig of this lab; it has {', '.join(self._rigs)}")
+            raise OperationError(f"{rig!r} is no rig of this recorder; it has {', '.join(self._rigs)}")
         if rig in self._open:
             raise OperationError(f"{rig} is being recorded by hand already: {self._open[rig].session}")
-        time = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
-        session = f"{time}-{rig}-{''.join(self._letters.choices(string.ascii_lowercase, k=4))}"
+        session = session_id(rig, wall_ns, self._letters)
         self._open[rig] = OpenSession(rig=rig, session=session, start_wall_ns=wall_ns)
         return self._event(Event.SESSION_START, rig, session, "begun by hand")
 

@@ -25,9 +25,6 @@ _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
 """Of a message's record."""
 
-_NOTE: Final = struct.Struct("<QQQIIB")
-_COUNT: Final = struct.Struct("<HI")
-
 
 class ChunkNote(NamedTuple):
     """What the index at a file's end needs of a chunk; times are wall clock, ns."""
@@ -46,6 +43,12 @@ class ChunkNote(NamedTuple):
     def messages(self) -> int:
         """How many there are."""
         return sum(count for _, count in self.counts)
+
+    @property
+    def end(self) -> int:
+        """Offset behind it and its indexes."""
+        indexes = sum(_INDEX_HEAD.size + 16 * count for _, count in self.counts)
+        return self.start + _CHUNK.size + self.data_size + indexes
 
     def index_record(self) -> bytes:
         """The record that leads a reader to it."""
@@ -71,34 +74,64 @@ class ChunkNote(NamedTuple):
 
 
 class ChunkNotes:
-    """The notes of all chunks of a file, packed: a day of them is four megabytes."""
+    """The notes of all chunks of a file, as differences in seven bits a byte: an hour of them is sixty kilobytes."""
 
     def __init__(self) -> None:
         self._packed = bytearray()
+        self._end = self._last_ns = 0
 
     def add(self, note: ChunkNote) -> None:
         """Add the next one."""
+        since_last_ns = note.first_ns - self._last_ns
+        numbers = [
+            note.start - self._end,
+            2 * since_last_ns if since_last_ns >= 0 else -2 * since_last_ns - 1,
+            note.last_ns - note.first_ns,
+            note.data_size,
+            note.raw_size,
+            len(note.counts),
+        ]
         for count in note.counts:
-            self._packed += _COUNT.pack(*count)
-        self._packed += _NOTE.pack(*note[:-1], len(note.counts))
+            numbers += count
+        for number in numbers:
+            while number > 0x7F:
+                self._packed.append(number & 0x7F | 0x80)
+                number >>= 7  # noqa: PLW2901
+            self._packed.append(number)
+        self._end, self._last_ns = note.end, note.last_ns
 
-    def newest_first(self) -> Iterator[ChunkNote]:
-        """All of them."""
-        end = len(self._packed)
-        while end:
-            start, first_ns, last_ns, data_size, raw_size, channels = _NOTE.unpack_from(self._packed, end - _NOTE.size)
-            end -= _NOTE.size + channels * _COUNT.size
-            counts = tuple(_COUNT.iter_unpack(self._packed[end : end + channels * _COUNT.size]))
-            yield ChunkNote(start, first_ns, last_ns, data_size, raw_size, counts)
+    def __iter__(self) -> Iterator[ChunkNote]:
+        """All of them, in the order of the file."""
+        numbers = self._numbers()
+        end = last_ns = 0
+        for gap in numbers:
+            coded_ns, span_ns, data_size, raw_size, channels = (next(numbers) for _ in range(5))
+            counts = tuple((next(numbers), next(numbers)) for _ in range(channels))
+            first_ns = last_ns + (coded_ns >> 1 if coded_ns & 1 == 0 else -(coded_ns + 1 >> 1))
+            note = ChunkNote(end + gap, first_ns, first_ns + span_ns, data_size, raw_size, counts)
+            end, last_ns = note.end, note.last_ns
+            yield note
 
     def take_back(self) -> ChunkNote:
         """Remove the newest, and give it back."""
-        note = next(self.newest_first())
-        del self._packed[len(self._packed) - _NOTE.size - len(note.counts) * _COUNT.size :]
-        return note
+        *kept, newest = self
+        self._packed.clear()
+        self._end = self._last_ns = 0
+        for note in kept:
+            self.add(note)
+        return newest
 
     def __bool__(self) -> bool:
         return bool(self._packed)
+
+    def _numbers(self) -> Iterator[int]:
+        number = shift = 0
+        for byte in self._packed:
+            number |= (byte & 0x7F) << shift
+            shift += 7
+            if byte <= 0x7F:
+                yield number
+                number = shift = 0
 
 
 def compressor() -> Compress:

@@ -1,60 +1,59 @@
-"""One recorder a lab: a lock on its folder, and a question on the bus.
+"""One recorder a rig: a lock in the lab's folder, which shows whose recordings a recorder writes there.
 
-The lock catches two recorders on one disk and is gone with the process that held it, however that ended. The question
-catches one that writes elsewhere, where every session would be recorded twice.
+On one bus services tell each other for which rigs they run; this catches two recorders on one disk that do not hear
+each other. A lock is gone with the process that held it, however that ended. Of two that begin at the same moment
+both may see the other and refuse, but never neither.
 """
 
 import json
 import os
 import platform
 import sys
-from collections.abc import Iterable
+import time
+from collections.abc import Collection
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
-
-from google.protobuf.message import DecodeError
+from typing import IO, Any, Final, Self
 
 from hilrig_recorder.durable import lock_file
-from hilrig_runtime.bus import Answer
 from hilrig_runtime.errors import OperationError
-from hilrig_schemas import Event
 
-LOCK_NAME: Final = ".recorder.lock"
+NAMED: Final = 3
+"""Rigs that a refusal names."""
 _LOCKED_BYTE: Final = 1 << 20
+_ATTEMPTS: Final = 10
+_PAUSE_S: Final = 0.02
 
 
 class FolderLock:
-    """Holds a lab's folder of recordings for this process.
+    """Holds some rigs' recordings in a lab's folder for this process.
 
     Raises:
-        OperationError: another recorder holds it; says which.
+        OperationError: another recorder holds one of them, or has the same name; says which.
     """
 
-    def __init__(self, folder: Path) -> None:
-        path = folder / LOCK_NAME
+    def __init__(self, folder: Path, instance: str, rigs: Collection[str]) -> None:
+        path = folder / f".recorder-{instance}.lock"
         self._file = path.open("a+")
         try:
-            if not self._lock():
-                raise OperationError(f"{folder}: {_holder(path)} records there; two would write the same files")
+            if not _lock_soon(self._file):
+                raise OperationError(f"{folder}: {_holder(path)} is called {instance!r} too; choose another --instance")
+            self._file.truncate(0)
+            self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "rigs": sorted(rigs)}))
+            self._file.flush()
+            for other in sorted(folder.glob(".recorder-*.lock")):
+                if other != path and not _is_free(other):
+                    self._refuse_shared(folder, other, rigs)
         except BaseException:
             self._file.close()
             raise
-        self._file.truncate(0)
-        self._file.write(json.dumps({"process": os.getpid(), "host": platform.node()}))
-        self._file.flush()
 
-    def _lock(self) -> bool:
-        if sys.platform != "win32":
-            return lock_file(self._file.fileno())
-        import msvcrt
-
-        self._file.seek(_LOCKED_BYTE)
-        try:
-            msvcrt.locking(self._file.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
+    @staticmethod
+    def _refuse_shared(folder: Path, other: Path, rigs: Collection[str]) -> None:
+        shared = sorted(set(rigs) & set(_read(other).get("rigs", ())))
+        if shared:
+            names = ", ".join(shared[:NAMED]) + (f" and {len(shared) - NAMED} more" if len(shared) > NAMED else "")
+            raise OperationError(f"{folder}: {_holder(other)} records {names} there; two would write the same files")
 
     def close(self) -> None:
         """Let go of the folder."""
@@ -69,29 +68,47 @@ class FolderLock:
         self.close()
 
 
-def _holder(path: Path) -> str:
+def _lock_soon(file: IO[str]) -> bool:
+    # Another recorder that begins may just be looking whether somebody holds it.
+    for _ in range(_ATTEMPTS):
+        if _lock(file):
+            return True
+        time.sleep(_PAUSE_S)
+    return False
+
+
+def _lock(file: IO[str]) -> bool:
+    if sys.platform != "win32":
+        return lock_file(file.fileno())
+    import msvcrt
+
+    # Far behind what is read: on Windows a locked byte can't be.
+    file.seek(_LOCKED_BYTE)
     try:
-        holder: dict[str, Any] = json.loads(path.read_text())
-        return f"another recorder (process {holder['process']} on {holder['host']})"
-    except (OSError, ValueError, KeyError, TypeError):
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    except OSError:
+        return False
+    return True
+
+
+def _is_free(path: Path) -> bool:
+    try:
+        with path.open("r+") as file:
+            return _lock(file)
+    except OSError:
+        return False
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        said = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+def _holder(path: Path) -> str:
+    holder = _read(path)
+    if "process" not in holder:
         return "another recorder"
-
-
-def introduction(source: str, incarnation: int) -> bytes:
-    """What a recorder says of itself when it is asked."""
-    return Event(source=source, wall_ns=incarnation).SerializeToString()
-
-
-def elder(answers: Iterable[Answer], incarnation: int) -> str:
-    """The recorder among those who answered that ran before this one, for people; empty: there is none.
-
-    Of two that start together the younger gives way, so that exactly one goes on.
-    """
-    for answer in answers:
-        try:
-            other = Event.FromString(answer.payload)
-        except DecodeError:
-            continue
-        if not answer.error and 0 < other.wall_ns < incarnation:
-            return f"{other.source} ({answer.key})"
-    return ""
+    return f"another recorder (process {holder['process']} on {holder.get('host', '?')})"

@@ -4,8 +4,9 @@ The original is not touched before the new file is safe on the disk under its na
 """
 
 import contextlib
+import errno
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -122,7 +123,11 @@ def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: Tru
         InputError: `source` can't be read, holds nothing of an MCAP file, or is being written just now.
         OperationError: the new file can't be written, or `go_on` said no.
     """
-    _refuse_open(source)
+    with _held(source):
+        return _recover(source, path, go_on)
+
+
+def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
     recovery = Recovery(source)
     view = map_file(source)
     if is_whole(view):
@@ -143,16 +148,26 @@ def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: Tru
     return recovery
 
 
-def _refuse_open(source: Path) -> None:
+@contextlib.contextmanager
+def _held(source: Path) -> Iterator[None]:
+    """Nobody else writes or recovers a file meanwhile."""
     try:
-        with source.open("r+b") as file:
-            if not lock_file(file.fileno()):
-                raise InputError(f"{source}: is being written just now by a recorder")
-    except PermissionError:
+        file = source.open("r+b")
+    except (PermissionError, IsADirectoryError) as error:
+        if source.is_dir():
+            raise InputError(f"{source}: is a folder; name the MCAP files in it") from error
         # What can't be written can be read all the same, and nobody writes it.
+        yield
         return
     except OSError as error:
-        raise InputError(f"{source}: can't be read: {error.strerror}") from error
+        if error.errno != errno.EROFS:
+            raise InputError(f"{source}: can't be read: {error.strerror}") from error
+        yield
+        return
+    with file:
+        if not lock_file(file.fileno()):
+            raise InputError(f"{source}: a recorder is writing it just now, or it is being recovered already")
+        yield
 
 
 class _Copy:

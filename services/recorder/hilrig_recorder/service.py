@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from hilrig_recorder.by_hand import HandSessions
 from hilrig_recorder.disk import Disk
 from hilrig_recorder.files import Files
-from hilrig_recorder.guard import FolderLock, elder, introduction
+from hilrig_recorder.guard import FolderLock
 from hilrig_recorder.housekeeping import Housekeeping, unfinished
 from hilrig_recorder.intake import Intake
 from hilrig_recorder.recording import SECOND_NS, Recording
@@ -32,7 +32,6 @@ TICK_NS: Final = SECOND_NS // 10
 _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
 _ANSWER_TIMEOUT_S: Final = 1.0
-_ELDER_PERIOD_NS: Final = 10 * SECOND_NS
 _LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
 """When it is told to stop, the recorder waits so long for what the others still have to say."""
 _DRAIN_NS: Final = SECOND_NS // 2
@@ -45,8 +44,9 @@ def run(service: Service) -> None:
     """Record every session of the lab until the service is told to stop.
 
     Raises:
-        OperationError: the folder for recordings can't be written, or another recorder records this lab.
+        OperationError: the folder for recordings can't be written, or another recorder records one of the rigs.
     """
+    service.claim()
     with ExitStack() as closing:
         closing.enter_context(_own_folder(service))
         recorder = Recorder(service)
@@ -61,7 +61,7 @@ def _own_folder(service: Service) -> FolderLock:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
         probe.unlink()
-        return FolderLock(folder)
+        return FolderLock(folder, service.instance, [rig.name for rig in service.rigs])
     except OSError as error:
         raise OperationError(
             f"{folder}: recordings can't be written there: {error.strerror}; choose another recorder.folder"
@@ -89,8 +89,6 @@ class Recorder:
         self._troubles: SimpleQueue[tuple[RunWriter, OSError] | str] = SimpleQueue()
         self._configs: SimpleQueue[tuple[str, RigConfig | None]] = SimpleQueue()
         self._requests: SimpleQueue[_Request] = SimpleQueue()
-        self._elders: SimpleQueue[str] = SimpleQueue()
-        self._elder_due_ns = 0
         self._asked: dict[str, int] = {}
         self._asking = ThreadPoolExecutor(max_workers=2, thread_name_prefix="asking")
         self._intake = Intake(config.queue_entries, service.clock)
@@ -109,9 +107,12 @@ class Recorder:
             ask_config=self._ask_config,
             give_up=self._give_up,
         )
-        self._book = SessionBook(lab.name, config.preroll_s, self._files)
-        self._by_hand = HandSessions((rig.name for rig in lab.rigs), random.Random(service.incarnation))
-        parts = unfinished(self._files.folder)
+        rigs = {rig.name for rig in service.rigs}
+        others = {rig.name for rig in lab.rigs} - rigs
+        # Alone, it records whoever is in the lab, also rigs that were added since.
+        self._book = SessionBook(lab.name, config.preroll_s, self._files, rigs if others else None)
+        self._by_hand = HandSessions(rigs, random.Random(service.incarnation))
+        parts = [part for part in unfinished(self._files.folder) if part.parent.name not in others]
         self._restore(parts)
         self._stream = service.bus.subscribe_recording(LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss)
         self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
@@ -131,14 +132,9 @@ class Recorder:
     # -- the loop ---------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Record until the service is told to stop, then what was sent before that.
-
-        Raises:
-            OperationError: another recorder was here before.
-        """
+        """Record until the service is told to stop, then what was sent before that."""
         service, clock = self._service, self._clock
         due_ns = clock.monotonic_ns()
-        self._make_way(self._find_elder())
         service.log.set_sessions(self._by_hand.sessions)
         service.ready()
         while not service.stopping.is_set():
@@ -169,9 +165,6 @@ class Recorder:
         for rig in self._files.unconfigured():
             if now_ns >= self._asked.get(rig, 0):
                 self._ask_config(rig)
-        if now_ns >= self._elder_due_ns:
-            self._elder_due_ns = now_ns + _ELDER_PERIOD_NS
-            self._asking.submit(lambda: self._elders.put(self._find_elder()))
         self._report(now_ns)
 
     def _hear(self) -> None:
@@ -188,9 +181,6 @@ class Recorder:
         with contextlib.suppress(Empty):
             while True:
                 self._do(self._requests.get_nowait())
-        with contextlib.suppress(Empty):
-            while True:
-                self._make_way(self._elders.get_nowait())
 
     def _report(self, now_ns: int) -> None:
         counters, intake, book = self._service.counters, self._intake, self._book
@@ -227,8 +217,6 @@ class Recorder:
             request = _Request(Event.FromString(payload))
         except DecodeError as error:
             raise OperationError("a request that can't be decoded") from error
-        if request.event.kind == Event.KIND_UNSPECIFIED:
-            return introduction(self._service.source, self._service.incarnation)
         self._requests.put(request)
         if not request.done.wait(_ANSWER_TIMEOUT_S):
             raise OperationError("the recorder is too busy to answer")
@@ -252,19 +240,6 @@ class Recorder:
         request.done.set()
 
     # -- questions to others ----------------------------------------------------------------------------------------
-
-    def _find_elder(self) -> str:
-        key = CONTROL.key(self._service.lab.name, self._service.name, "*")
-        try:
-            return elder(self._service.bus.ask(key, timeout_s=_ANSWER_TIMEOUT_S), self._service.incarnation)
-        except OperationError:
-            # The bus is being closed.
-            return ""
-
-    @staticmethod
-    def _make_way(found: str) -> None:
-        if found:
-            raise OperationError(f"another recorder records this lab already: {found}; one is enough")
 
     def _ask_config(self, rig: str) -> None:
         # Not again while an answer is awaited.

@@ -37,7 +37,7 @@ class Contents:
         """What finishes a file of `size` bytes that holds this."""
         data_end = encoded(DataEnd(0))
         start = size + len(data_end)
-        chunks = list(self.chunks.newest_first())[::-1]
+        chunks = list(self.chunks)
         summary = bytearray()
         offsets = bytearray()
         groups: list[tuple[Opcode, bytes]] = [

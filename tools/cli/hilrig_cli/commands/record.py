@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 ANSWER_TIMEOUT_S = 5.0
 """How long a recorder is looked for: a tool needs a moment to be linked to it."""
+NAMED = 5
+"""Rigs that a refusal names."""
 
 app = typer.Typer(help="Record a rig by hand, whether a controller is there or not.", no_args_is_help=True)
 
@@ -40,24 +42,30 @@ def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
 
 def _ask(config: "Path | None", request: "Event") -> "Event":
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.errors import OperationError
+    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_runtime.presence import rosters
     from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas.topics import CONTROL
 
     lab = load_lab(config)
-    key = CONTROL.key(lab.name, "recorder", "*")
     deadline_s = time.monotonic() + ANSWER_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
-        while time.monotonic() < deadline_s:
-            # Asked first who is there: a request must not be heard twice.
-            if not bus.ask(key, timeout_s=0.3):
-                time.sleep(0.05)
-                continue
-            for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
-                if answer.error:
-                    raise OperationError(answer.error)
-                return CONTROL.decode(answer.payload)
-    raise OperationError(f"no recorder answers in lab {lab.name}: is `hilrig up` running with this lab.toml?")
+        while not (recorders := rosters(bus, lab.name, "recorder")):
+            if time.monotonic() > deadline_s:
+                raise OperationError(
+                    f"no recorder answers in lab {lab.name}: is `hilrig up` running with this lab.toml?"
+                )
+        for recorder in recorders:
+            if request.rig in recorder.rigs:
+                key = CONTROL.key(lab.name, recorder.service, recorder.instance)
+                for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
+                    if answer.error:
+                        raise OperationError(answer.error)
+                    return CONTROL.decode(answer.payload)
+                raise OperationError(f"recorder/{recorder.instance} does not answer; see its log")
+        recorded = [rig for recorder in recorders for rig in recorder.rigs]
+        named = ", ".join(recorded[:NAMED]) + (f" and {len(recorded) - NAMED} more" if len(recorded) > NAMED else "")
+    raise InputError(f"{request.rig!r} is recorded by nobody in lab {lab.name}; its rigs are {named}")
 
 
 def _print(event: "Event", text: str, as_json: bool) -> None:
