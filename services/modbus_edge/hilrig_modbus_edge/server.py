@@ -67,11 +67,13 @@ class RigServer:
         self._doors: list[asyncio.Task[None]] = []
         self._tls_servers: list[asyncio.Server] = []
 
-    async def listen(self, loop: DirectLoop, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
-        """Take connections from a socket that listens, with TLS where there is a policy for it.
+    async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
+        """Take connections from a socket that listens, with TLS where there is a policy for it; on a `DirectLoop`.
 
         What has connected already is served now.
         """
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, DirectLoop)
         if policy is None:
             self._doors.append(loop.create_task(accept_connections(loop, listening, self._welcome)))
         else:
