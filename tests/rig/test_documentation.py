@@ -30,6 +30,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose up": "tests/hosts/test_compose.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
+    "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
     "make demo": "tests/rig/test_demo.py",
@@ -108,7 +109,8 @@ def test_a_documented_command_runs(place: Place, command: str) -> None:
     words = [*HILRIG, *words[1:]]
     if command.startswith(OPENS_A_WINDOW) and "--save" not in words:
         words += ["--save", "shown.rrd"]
-    if command.startswith(("hilrig live", "hilrig record", "hilrig lease", "hilrig play")) and "--config" not in words:
+    of_a_lab = ("hilrig live", "hilrig record", "hilrig lease", "hilrig impair", "hilrig play")
+    if command.startswith(of_a_lab) and "--config" not in words:
         words += ["--config", str(place.lab.config)]
     if command.startswith(FOLLOWS):
         _follow(words, place.folder)

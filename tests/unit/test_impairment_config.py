@@ -127,3 +127,16 @@ def test_a_trace_with_gaps_is_refused(tmp_path: Path, lines: str | None, complai
 def test_a_mistake_is_named_with_its_place(text: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         parse_lab(f"[impairment]\n{text}\n")
+
+
+def test_the_page_says_what_the_models_say() -> None:
+    page = (Path(__file__).parents[2] / "docs/studies.md").read_text()
+    section = page.partition("## Delay and loss in the live loop")[2]
+    example = section.partition("```toml\n")[2].partition("```")[0]
+    impairment = parse_lab(example).impairment
+    assert impairment.ways.command == WayImpairment.model_validate({"delay": "gamma:20,8", "loss": "gilbert:0.01,0.3"})
+    assert [entry.preset for entry in impairment.schedule] == ["mobile", "none"]
+    for name in ("constant", "uniform", "normal", "gamma", "exponential", "trace", "none", "bernoulli", "gilbert"):
+        assert f"| `{name}` |" in section
+    for preset in PRESETS:
+        assert preset == "none" or f"| `{preset}` |" in section
