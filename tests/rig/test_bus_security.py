@@ -36,11 +36,12 @@ SENT = [
     *(f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("state", "command", "event", "traffic")),
     *(f"{service}/event" for service in ("sim", "edge", "recorder")),
     *(f"{topic}/{service}/1" for topic in ("log", "health") for service in ("sim", "edge", "recorder")),
+    "states/sim/1",
 ]
 _EVENTS = {key for key in SENT if key.endswith("/event")}
 _LOGS = {key for key in SENT if key.startswith("log/")}
 MAY_SEND: dict[str, set[str]] = {
-    "sim": {"rig1/state", "rig2/state", "log/sim/1", "health/sim/1", *_EVENTS},
+    "sim": {"rig1/state", "rig2/state", "states/sim/1", "log/sim/1", "health/sim/1", *_EVENTS},
     "east": {"rig1/command", "rig1/event", "rig1/traffic", "edge/event", "log/edge/1", "health/edge/1"},
     "west": {"rig2/command", "rig2/event", "rig2/traffic", "edge/event", "log/edge/1", "health/edge/1"},
     "recorder": {"log/recorder/1", "health/recorder/1", *_EVENTS},
@@ -48,37 +49,46 @@ MAY_SEND: dict[str, set[str]] = {
     "viewer": set(),
     "student": set(),
 }
+_HEALTHS = {key for key in SENT if key.startswith("health/")}
+_STATES = {"rig1/state", "rig2/state", "states/sim/1"}
 MAY_READ: dict[str, set[str]] = {
-    "sim": {"rig1/command", "rig2/command"},
-    "east": {"rig1/state", "rig2/state"},
-    "west": {"rig1/state", "rig2/state"},
-    "recorder": _EVENTS | _LOGS,
+    "sim": {"rig1/command", "rig2/command", *_HEALTHS},
+    "east": _STATES | _HEALTHS,
+    "west": _STATES | _HEALTHS,
+    "recorder": _EVENTS | _LOGS | _HEALTHS,
     "operator": set(SENT) - _LOGS,
     "viewer": set(SENT) - _LOGS,
     "student": set(),
 }
-ASKED = ["rig1/config", "rig2/config", "rig1/lease", "rig2/lease", "control/recorder/1"]
 _CONFIGS = {"rig1/config", "rig2/config"}
+_OF_EDGES = {f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("lease", "impairment")}
+_ROSTERS = {"roster/sim/1", "roster/edge/1", "roster/recorder/1"}
+_CONTROLS = {"control/sim/1", "control/edge/1", "control/recorder/1"}
+ASKED = sorted(_CONFIGS | _OF_EDGES | _ROSTERS | _CONTROLS)
 MAY_ASK: dict[str, set[str]] = {
-    "sim": set(),
-    "east": _CONFIGS,
-    "west": _CONFIGS,
-    "recorder": {*_CONFIGS, "control/recorder/1"},
+    "sim": _ROSTERS,
+    "east": _CONFIGS | _ROSTERS,
+    "west": _CONFIGS | _ROSTERS,
+    "recorder": _CONFIGS | _ROSTERS | _CONTROLS,
     "operator": set(ASKED),
-    "viewer": _CONFIGS,
+    "viewer": _CONFIGS | _ROSTERS,
     "student": set(),
 }
 MAY_ANSWER: dict[str, set[str]] = {
-    "sim": _CONFIGS,
-    "east": {"rig1/lease"},
-    "west": {"rig2/lease"},
-    "recorder": {"control/recorder/1"},
+    "sim": {*_CONFIGS, "roster/sim/1", "control/sim/1"},
+    "east": {"rig1/lease", "rig1/impairment", "roster/edge/1", "control/edge/1"},
+    "west": {"rig2/lease", "rig2/impairment", "roster/edge/1", "control/edge/1"},
+    "recorder": {"roster/recorder/1", "control/recorder/1"},
     "operator": set(),
     "viewer": set(),
     "student": set(),
 }
-# A question to all rigs goes out to every edge; what it answers is held by the other direction's rules.
-MAY_BE_ASKED = MAY_ANSWER | {edge: {"rig1/lease", "rig2/lease"} for edge in EDGES}
+# A question to all goes out to everyone of a kind; what one answers is held by the other direction's rules.
+MAY_BE_ASKED = MAY_ANSWER | {
+    "sim": _CONFIGS | _ROSTERS | _CONTROLS,
+    **dict.fromkeys(EDGES, _OF_EDGES | _ROSTERS | _CONTROLS),
+    "recorder": _ROSTERS | _CONTROLS,
+}
 FLOWS = {"ingress", "egress"}
 LIVING = ["alive/sim/1", "alive/edge/1", "alive/recorder/1"]
 MAY_LIVE: dict[str, set[str]] = {name: {f"alive/{SERVICE[name]}/1"} if name in SERVICE else set() for name in MAY_SEND}
