@@ -10,10 +10,10 @@ aged.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, eigs
 
 from hilrig_runtime.errors import InputError
 from hilrig_study.controllers import LawController, Measured
@@ -24,6 +24,9 @@ from hilrig_study.virtual_loop import EFFORT_COST, ERROR_SCALE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+MOST_TURNS: Final = 3000
+CONVERGED: Final = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,21 +98,27 @@ def turns(phi: Floats, gamma: Floats, law: LinearLaw, most: int) -> list[Floats]
 
 
 def mean_square_radius(chain: AgeChain, matrices: Sequence[Floats]) -> float:
-    """Growth of the second moment a step, in the long run; below 1 the loop is mean-square stable."""
+    """Growth of the second moment a step, in the long run; below 1 the loop is mean-square stable.
+
+    Power iteration on the recursion plus the identity: the recursion keeps moments positive, so its largest eigenvalue
+    is real (Krein and Rutman), and the shift leaves behind those of the same modulus that a swaying loop has.
+    """
     lasting = np.flatnonzero(chain.ages > 0)
     p = chain.transition[np.ix_(lasting, lasting)].T
-    some = [matrices[age] for age in chain.ages[lasting].tolist()]
-    size = len(some[0])
-
-    def move(flat: Floats) -> Floats:
-        moments = flat.reshape(len(some), size, size)
-        moved = np.stack([matrix @ moment @ matrix.T for matrix, moment in zip(some, moments, strict=True)])
-        return np.asarray(np.tensordot(p, moved, axes=1).ravel(), dtype=np.float64)
-
-    count = len(some) * size * size
-    first = np.stack([np.eye(size)] * len(some)).ravel()
-    values = eigs(LinearOperator((count, count), matvec=move, dtype=np.float64), k=1, v0=first, tol=1e-8)[0]
-    return float(np.abs(values[0]))
+    some = np.stack([matrices[age] for age in chain.ages[lasting].tolist()])
+    turned = some.transpose(0, 2, 1)
+    count, size, _ = some.shape
+    moments = np.repeat(np.eye(size)[np.newaxis], count, axis=0)
+    moments /= np.trace(moments.sum(axis=0))
+    radius = 0.0
+    for _ in range(MOST_TURNS):
+        moved = (p @ (some @ moments @ turned).reshape(count, -1)).reshape(moments.shape)
+        before, radius = radius, float(np.trace(moved.sum(axis=0)))
+        moments = moved + moments
+        moments /= np.trace(moments.sum(axis=0))
+        if abs(radius - before) < CONVERGED:
+            break
+    return radius
 
 
 def expected_cost(

@@ -24,9 +24,9 @@ Ints = NDArray[np.int64]
 
 GAINS: Final = np.round(np.geomspace(0.1, 2.0, 14), 3)
 """Gain factors that are judged where no study's file names others."""
-LONGEST: Final = 15
+LONGEST: Final = 12
 """Ages beyond this, steps, count as so many: a stall is no latency, and what is rare adds little."""
-MOST_SPARE: Final = 8
+MOST_SPARE: Final = 6
 """Further delays up to this are tried, steps."""
 _INSIDE: Final = np.array([0.01, 0.01, 0.001, 0.01])
 
@@ -45,6 +45,8 @@ class GainVerdict:
     """Of going 3°, 3°, 5 mm, 3° in 10 s, or as the study's file says; None: it is not stable."""
     spare_ms: float | None
     """Constant delay that could have been added, in whole steps; None: it is not stable."""
+    spare_at_least: bool
+    """More than `spare_ms` was not tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +131,9 @@ def judge_gains(run: Run, study: StudyConfig | None = None) -> Judged:
             now = radius(0)
             stable = now < 1.0
             cost = expected_cost(near, phi, gamma, controller, law, chain, offset, ticks) if stable else None
-            spare = _largest(lambda more, of=radius: of(more) < 1.0) * run.step_ns / 1e6 if stable else None
-            verdicts.append(GainVerdict(config.name, gain, stable, now, cost, spare))
+            spare = _largest(lambda more, of=radius: of(more) < 1.0) if stable else None
+            spare_ms = None if spare is None else spare * run.step_ns / 1e6
+            verdicts.append(GainVerdict(config.name, gain, stable, now, cost, spare_ms, spare == MOST_SPARE))
     return Judged(
         run.session, run.step_ns / 1e6, len(latency), (float(p50), float(p99), float(latency.max())), tuple(verdicts)
     )

@@ -39,7 +39,6 @@ def study(
     from rich.console import Console
 
     from hilrig_runtime.errors import InputError
-    from hilrig_study.study_config import load_study
 
     console = Console(stderr=True, quiet=as_json)
     if from_run is not None:
@@ -49,7 +48,6 @@ def study(
         return
     if file is None:
         raise InputError("name a study's file, or a recording with --from; examples/studies has one to start from")
-    chosen = load_study(file)
     said = _sweep(file, out, live, console)
     if as_json:
         print(json.dumps(said))
@@ -57,7 +55,6 @@ def study(
         _print(said, out)
     if any(not point["as_predicted"] for point in said.get("live", [])):
         raise typer.Exit(1)
-    del chosen
 
 
 def _sweep(file: Path, out: Path, live: bool, console: "Console") -> dict[str, Any]:
@@ -148,12 +145,12 @@ def _from_recording(path: Path, file: Path | None, as_json: bool) -> None:
     from hilrig_study.from_recording import judge_gains
     from hilrig_study.study_config import load_study
 
-    judged = judge_gains(open_run(path), None if file is None else load_study(file))
+    judged = judge_gains(open_run(path), None if file is None else load_study(file)).as_dict()
     if as_json:
-        print(json.dumps(judged.as_dict()))
+        print(json.dumps(judged))
     else:
-        _print_judged(judged.as_dict())
-    if not any(gain["stable"] for gain in judged.as_dict()["gains"]):
+        _print_judged(judged)
+    if not any(gain["stable"] for gain in judged["gains"]):
         raise typer.Exit(1)
 
 
@@ -177,6 +174,6 @@ def _print_judged(judged: dict[str, Any]) -> None:
             "yes" if gain["stable"] else "[red]no[/red]",
             f"{gain['mean_square_radius']:.4f}",
             "–" if cost is None else f"{cost:.2f}",
-            "–" if gain["spare_ms"] is None else f"{gain['spare_ms']:.0f}",
+            "–" if gain["spare_ms"] is None else f"{'≥ ' if gain['spare_at_least'] else ''}{gain['spare_ms']:.0f}",
         )
     Console().print(table)
