@@ -40,7 +40,7 @@ RULES: Final[dict[str, Rule]] = {
     topics.ROSTER.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
     topics.STATES.name: Rule(("sim",), ("edge", *TOOLS)),
     # A recorder asks whether another one records the lab already.
-    topics.CONTROL.name: Rule(("recorder",), ("recorder", "operator")),
+    topics.CONTROL.name: Rule(SERVICES, ("recorder", "operator")),
 }
 """Rule of each topic, by its name."""
 

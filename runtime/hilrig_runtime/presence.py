@@ -81,14 +81,17 @@ def rosters(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = ASK_TI
 
 
 class Presence:
-    """Answers for one service, and watches for others of its kind; `on_conflict` gets the reason to end."""
+    """Answers for one service, and watches for others of its kind.
+
+    `rigs` gives the name of each of its rigs and where it is reached; `on_conflict` gets the reason to end.
+    """
 
     def __init__(
         self,
         bus: Bus,
         lab: str,
         own: Roster,
-        rigs: Callable[[], Sequence[str]],
+        rigs: Callable[[], Sequence[tuple[str, str]]],
         clock: Clock,
         on_conflict: Callable[[str], None],
     ) -> None:
@@ -132,7 +135,9 @@ class Presence:
     def _roster(self) -> Roster:
         own = Roster()
         own.CopyFrom(self._own)
-        own.rigs.extend(self._rigs())
+        for rig, address in self._rigs():
+            own.rigs.append(rig)
+            own.addresses.append(address)
         own.wall_ns = self._clock.wall_ns()
         return own
 

@@ -7,7 +7,7 @@ gives the same bytes to the bus and to the log stream; `latest` keeps the newest
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Final, Generic, NamedTuple, Self, TypeVar
@@ -160,7 +160,9 @@ class Service:
         self._token: Handle | None = None
         self._failure = ""
         roster = Roster(service=name, instance=instance, incarnation=self.incarnation)
-        self._presence = Presence(bus, lab.name, roster, self._rig_names, clock, self.fail)
+        self.addresses: Callable[[str], str] = lambda _: ""
+        """Where a rig is reached, for the roster; the edge sets it."""
+        self._presence = Presence(bus, lab.name, roster, self._rigs_reached, clock, self.fail)
         self._closing.callback(self._presence.close)
         self.health.clock_offset = lambda: self._presence.clock_offset
 
@@ -251,8 +253,8 @@ class Service:
         if self._failure:
             raise OperationError(self._failure)
 
-    def _rig_names(self) -> list[str]:
-        return [rig.name for rig in self.rigs]
+    def _rigs_reached(self) -> list[tuple[str, str]]:
+        return [(rig.name, self.addresses(rig.name)) for rig in self.rigs]
 
     def __enter__(self) -> Self:
         return self

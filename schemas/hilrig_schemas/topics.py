@@ -94,7 +94,7 @@ IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
-"""What a person asks of a service: the recorder begins and ends sessions by hand."""
+"""What a person asks of a service: sessions by hand of the recorder, rigs more or fewer of simulation and edge."""
 ROSTER: Final = ServiceTopic("roster", Roster, Traffic.QUERY)
 """Who runs, where, and for which rigs."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)

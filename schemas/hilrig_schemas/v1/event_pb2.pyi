@@ -30,6 +30,8 @@ class Event(_message.Message):
         RESET: _ClassVar[Event.Kind]
         CONNECTION_REFUSED: _ClassVar[Event.Kind]
         RECORDING: _ClassVar[Event.Kind]
+        RIG_ADDED: _ClassVar[Event.Kind]
+        RIG_REMOVED: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -50,6 +52,8 @@ class Event(_message.Message):
     RESET: Event.Kind
     CONNECTION_REFUSED: Event.Kind
     RECORDING: Event.Kind
+    RIG_ADDED: Event.Kind
+    RIG_REMOVED: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]

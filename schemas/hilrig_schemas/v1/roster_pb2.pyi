@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Roster(_message.Message):
-    __slots__ = ("service", "instance", "incarnation", "host", "software_version", "wall_ns", "rigs", "revision", "added", "removed")
+    __slots__ = ("service", "instance", "incarnation", "host", "software_version", "wall_ns", "rigs", "addresses")
     SERVICE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
@@ -15,9 +15,7 @@ class Roster(_message.Message):
     SOFTWARE_VERSION_FIELD_NUMBER: _ClassVar[int]
     WALL_NS_FIELD_NUMBER: _ClassVar[int]
     RIGS_FIELD_NUMBER: _ClassVar[int]
-    REVISION_FIELD_NUMBER: _ClassVar[int]
-    ADDED_FIELD_NUMBER: _ClassVar[int]
-    REMOVED_FIELD_NUMBER: _ClassVar[int]
+    ADDRESSES_FIELD_NUMBER: _ClassVar[int]
     service: str
     instance: str
     incarnation: int
@@ -25,7 +23,5 @@ class Roster(_message.Message):
     software_version: str
     wall_ns: int
     rigs: _containers.RepeatedScalarFieldContainer[str]
-    revision: int
-    added: _containers.RepeatedScalarFieldContainer[str]
-    removed: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., wall_ns: _Optional[int] = ..., rigs: _Optional[_Iterable[str]] = ..., revision: _Optional[int] = ..., added: _Optional[_Iterable[str]] = ..., removed: _Optional[_Iterable[str]] = ...) -> None: ...
+    addresses: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., wall_ns: _Optional[int] = ..., rigs: _Optional[_Iterable[str]] = ..., addresses: _Optional[_Iterable[str]] = ...) -> None: ...

@@ -22,8 +22,8 @@ from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_modbus_edge.transport import DirectLoop
 from hilrig_runtime.bus import Handle
-from hilrig_runtime.config import mistakes_in
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.config import RigSettings, mistakes_in, read_rig
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.rate import Tick
 from hilrig_runtime.realtime import freeze_garbage
@@ -105,93 +105,158 @@ class _Wire:
             self.watch(deadline_ns)
 
 
+class _Seat:
+    """One rig at this edge, with all that is closed when it is taken away."""
+
+    def __init__(self, wire: _Wire, server: RigServer) -> None:
+        self.wire = wire
+        self.server = server
+        self.closing = ExitStack()
+        self.sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
+
+
 class Edge:
     """The rigs of one edge."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
-        lab = service.lab
-        states = service.latest_of_batches(topics.STATES)
-        self._wires: dict[str, _Wire] = {}
-        self._servers: list[RigServer] = []
-        for rig in service.rigs:
-            wire = _Wire(self, rig.name)
-            settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
-            wire.device = Device(rig.name, settings, service.clock, wire, partial(states.get, rig.name))
-            self._wires[rig.name] = wire
-            limits = Limits(
-                lab.edge.max_connections,
-                lab.edge.max_connections_per_host,
-                round(lab.edge.idle_timeout_s * 1e9),
-                rig.allow,
-            )
-            self._servers.append(RigServer(wire.device, limits, service.clock, service.counters))
+        self._states = service.latest_of_batches(topics.STATES)
+        self._seats: dict[str, _Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
         service.counters.rigs = len(service.rigs)
         service.health.rig_reports = self._rig_reports
+        service.addresses = self._address_of
         self._traffic_due_ns = 0
-        self._answers: list[Handle] = []
+        self._control: Handle | None = None
         self.alarm: Alarm
+
+    def _seat(self, rig: RigSettings) -> _Seat:
+        service, lab = self.service, self.service.lab
+        wire = _Wire(self, rig.name)
+        settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
+        wire.device = Device(rig.name, settings, service.clock, wire, partial(self._states.get, rig.name))
+        limits = Limits(
+            lab.edge.max_connections,
+            lab.edge.max_connections_per_host,
+            round(lab.edge.idle_timeout_s * 1e9),
+            rig.allow,
+        )
+        return _Seat(wire, RigServer(wire.device, limits, service.clock, service.counters))
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
-        service = self.service
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, DirectLoop)
-        self.alarm = Alarm(loop, service.clock)
-        # Sockets listen before the first state is there: whoever connects early is served as soon as it can be done.
-        sockets = self._bind()
-        self.state_sessions()
-        for server in self._servers:
-            server.device.begin()
+        service, lab = self.service, self.service.lab
+        # Before the first word: another edge's controllers must not feel it.
+        service.claim()
+        self.alarm = Alarm(asyncio.get_running_loop(), service.clock)
         try:
-            self._answer_people()
+            # Sockets listen before the first state is there: whoever connects early is served as soon as it can be
+            # done. All or none: a rig without its port must not leave the others' open.
+            for rig, seat in self._seats.items():
+                self._bind(seat, lab.ports[rig], lab.tls_ports.get(rig))
+            self.state_sessions()
+            for seat in self._seats.values():
+                seat.wire.device.begin()
+                self._answer_people(seat)
+            loop = asyncio.get_running_loop()
+            key = topics.CONTROL.key(lab.name, service.name, service.instance)
+            self._control = service.bus.serve(key, partial(_on_loop, loop, self._answer_control))
             await self._first_states()
-            for server, listening, policy in sockets:
-                await server.listen(loop, listening, policy)
+            for seat in self._seats.values():
+                await self._listen(seat)
             freeze_garbage()
             service.ready()
             await self._tick()
         finally:
             self._close()
-            for _, listening, _ in sockets:
-                listening.close()
 
-    def _bind(self) -> list[tuple[RigServer, socket.socket, TlsPolicy | None]]:
-        edge, lab = self.service.lab.edge, self.service.lab
-        policy = None if edge.tls is None else TlsPolicy(edge.tls)
-        with ExitStack() as bound:
-            sockets: list[tuple[RigServer, socket.socket, TlsPolicy | None]] = []
-            for server in self._servers:
-                rig = server.device.rig
-                if edge.plain:
-                    listening = bound.enter_context(bind(rig, edge.host, lab.ports[rig]))
-                    sockets.append((server, listening, None))
-                if policy is not None:
-                    port = lab.tls_ports[rig]
-                    listening = bound.enter_context(bind(rig, edge.host, port, "edge.tls.first_port"))
-                    sockets.append((server, listening, policy))
-            # All or none: a rig without its port must not leave the others' open.
-            bound.pop_all()
-            return sockets
+    def _bind(self, seat: _Seat, port: int, tls_port: int | None) -> None:
+        edge, rig = self.service.lab.edge, seat.wire.device.rig
+        if edge.plain:
+            seat.sockets.append((seat.closing.enter_context(bind(rig, edge.host, port)), None))
+        if edge.tls is not None and tls_port is not None:
+            listening = seat.closing.enter_context(bind(rig, edge.host, tls_port, "edge.tls.first_port"))
+            seat.sockets.append((listening, TlsPolicy(edge.tls)))
+
+    async def _listen(self, seat: _Seat) -> None:
+        for listening, policy in seat.sockets:
+            await seat.server.listen(listening, policy)
+
+    def _address_of(self, rig: str) -> str:
+        seat = self._seats.get(rig)
+        host = self.service.lab.edge.host
+        return ", ".join(f"{host}:{listening.getsockname()[1]}" for listening, _ in seat.sockets) if seat else ""
 
     def state_sessions(self) -> None:
         """Tell the log stream which sessions are open."""
-        open_sessions = [wire.device.session for wire in self._wires.values() if wire.device.session is not None]
-        self.service.log.set_sessions([session.as_message() for session in open_sessions])
+        sessions = [session for seat in self._seats.values() if (session := seat.wire.device.session) is not None]
+        self.service.log.set_sessions([session.as_message() for session in sessions])
 
-    def _answer_people(self) -> None:
+    def _answer_people(self, seat: _Seat) -> None:
         loop, bus, lab = asyncio.get_running_loop(), self.service.bus, self.service.lab
-        for rig, wire in self._wires.items():
-            for topic, answer in ((topics.LEASE, _answer_lease), (topics.IMPAIRMENT, _answer_impairment)):
-                # Asked on a thread of the bus, answered on the loop, which alone touches devices.
-                on_loop = partial(_on_loop, loop, partial(answer, wire.device))
-                self._answers.append(bus.serve(topic.key(lab.name, rig), on_loop))
+        device = seat.wire.device
+        for topic, answer in ((topics.LEASE, _answer_lease), (topics.IMPAIRMENT, _answer_impairment)):
+            # Asked on a thread of the bus, answered on the loop, which alone touches devices.
+            on_loop = partial(_on_loop, loop, partial(answer, device))
+            seat.closing.enter_context(bus.serve(topic.key(lab.name, device.rig), on_loop))
+
+    def _answer_control(self, payload: bytes) -> bytes:
+        """Add, take away or reset a rig; on the loop."""
+        request = Event.FromString(payload)
+        if request.kind == Event.RIG_ADDED:
+            text = self._add(read_rig(request.configuration_data.text))
+        elif request.kind == Event.RIG_REMOVED:
+            text = self._remove(request.rig)
+        elif request.kind == Event.RESET:
+            self._seat_of(request.rig).wire.device.reset()
+            text = f"{request.rig} goes back to its start pose"
+        else:
+            raise OperationError("a request that the edge does not know")
+        answer = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
+        if request.kind != Event.RESET:
+            # Of a reset the simulation tells, when it is done.
+            self.service.emit(answer)
+        return answer.SerializeToString()
+
+    def _seat_of(self, rig: str) -> _Seat:
+        if rig not in self._seats:
+            raise OperationError(f"{rig!r} is not served here")
+        return self._seats[rig]
+
+    def _add(self, rig: RigSettings) -> str:
+        if rig.name in self._seats:
+            raise OperationError(f"{rig.name!r} is served already")
+        if rig.port is None:
+            raise OperationError(f"{rig.name!r} needs a port of its own")
+        seat = self._seat(rig)
+        with ExitStack() as undo:
+            undo.callback(seat.closing.close)
+            self._bind(seat, rig.port, None)
+            undo.pop_all()
+        self._seats[rig.name] = seat
+        self._answer_people(seat)
+        seat.wire.device.begin()
+        listening = asyncio.get_running_loop().create_task(self._listen(seat))
+        seat.closing.callback(listening.cancel)
+        self._changed((*self.service.rigs, rig))
+        return f"{rig.name} is at {self._address_of(rig.name)}"
+
+    def _remove(self, rig: str) -> str:
+        seat = self._seat_of(rig)
+        self._shut(seat, "the rig was taken away")
+        del self._seats[rig]
+        self.state_sessions()
+        self._changed(tuple(other for other in self.service.rigs if other.name != rig))
+        return f"{rig} is served no more"
+
+    def _changed(self, rigs: tuple[RigSettings, ...]) -> None:
+        self.service.rigs = rigs
+        self.service.counters.rigs = len(rigs)
 
     async def _first_states(self) -> None:
         clock, stopping = self.service.clock, self.service.stopping
         deadline_ns = clock.monotonic_ns() + FIRST_STATE_TIMEOUT_NS
         while clock.monotonic_ns() < deadline_ns and not stopping.is_set():
-            if all(wire.device.has_state for wire in self._wires.values()):
+            if all(seat.wire.device.has_state for seat in self._seats.values()):
                 return
             self.service.beat(clock.monotonic_ns())
             await asyncio.sleep(TICK_NS * 1e-9)
@@ -209,21 +274,21 @@ class Edge:
             self._do_due(now_ns)
 
     def _do_due(self, now_ns: int) -> None:
-        for server in self._servers:
+        traffic_due = now_ns >= self._traffic_due_ns
+        if traffic_due:
+            self._traffic_due_ns = now_ns + TRAFFIC_PERIOD_NS
+        for seat in self._seats.values():
+            server = seat.server
             server.device.check(now_ns)
             if server.connections:
                 server.device.look()
                 server.close_idle(now_ns)
-        traffic_due = now_ns >= self._traffic_due_ns
-        if traffic_due:
-            self._traffic_due_ns = now_ns + TRAFFIC_PERIOD_NS
-        for server in self._servers:
             if server.traffic.count and (traffic_due or server.traffic.count >= MOST):
-                self._send_traffic(server, now_ns)
+                self._send_traffic(seat, now_ns)
         self.service.beat(now_ns)
 
     def _rig_reports(self) -> list[RigReport]:
-        statuses = [wire.device.lease_status() for wire in self._wires.values()]
+        statuses = [seat.wire.device.lease_status() for seat in self._seats.values()]
         return [
             RigReport(
                 rig=status.rig,
@@ -235,22 +300,24 @@ class Edge:
             for status in statuses
         ]
 
-    def _send_traffic(self, server: RigServer, now_ns: int) -> None:
-        message = server.traffic.take(now_ns, self.service.clock.wall_ns())
-        self._wires[server.device.rig].traffic.send(message)
+    def _send_traffic(self, seat: _Seat, now_ns: int) -> None:
+        seat.wire.traffic.send(seat.server.traffic.take(now_ns, self.service.clock.wall_ns()))
+
+    def _shut(self, seat: _Seat, reason: str) -> None:
+        seat.wire.device.shut(reason)
+        seat.server.close(reason)
+        if seat.server.traffic.count:
+            self._send_traffic(seat, self.service.clock.monotonic_ns())
+        seat.closing.close()
 
     def _close(self) -> None:
-        now_ns = self.service.clock.monotonic_ns()
-        for answer in self._answers:
-            answer.close()
+        if self._control is not None:
+            self._control.close()
         self.alarm.close()
-        for server in self._servers:
-            server.device.shut("the edge stops")
-            server.close("the edge stops")
-            if server.traffic.count:
-                self._send_traffic(server, now_ns)
+        for seat in self._seats.values():
+            self._shut(seat, "the edge stops")
         self.state_sessions()
-        self.service.log.flush(now_ns)
+        self.service.log.flush(self.service.clock.monotonic_ns())
 
 
 def _answer_lease(device: Device, payload: bytes) -> bytes:

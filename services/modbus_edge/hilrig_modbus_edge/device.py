@@ -239,6 +239,11 @@ class Device:
         """Take the rig from its controller: who held it; empty: nobody. See `Tenure.release`."""
         return self._tenure.release(reason)
 
+    def reset(self) -> None:
+        """Put the arm back to its start pose, without torque; the controller that holds it goes on from there."""
+        self._commander.reset()
+        self._commander.say()
+
     def lease_status(self) -> LeaseStatus:
         """How the lease and the watchdog stand."""
         status = self._tenure.status()

@@ -5,9 +5,6 @@ state x_k is published with the effort that acts from now on, and only then is x
 start of its step.
 """
 
-from contextlib import ExitStack
-from dataclasses import dataclass
-from importlib.metadata import version
 from math import isfinite
 from typing import Final
 
@@ -16,14 +13,14 @@ import numpy as np
 from hilrig_runtime.rate import Rate, Tick
 from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Service
-from hilrig_schemas import JointState, RigConfig, RigReport, topics
+from hilrig_runtime.turns import Turns
+from hilrig_schemas import JointState, RigReport, topics
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.configured import rig_parameters
-from hilrig_sim.machine import machine_name
+from hilrig_sim.membership import Membership
 from hilrig_sim.model import RigParameters
 from hilrig_sim.plant import Plant
 from hilrig_sim.reports import Reporter
-from hilrig_sim.urdf import urdf
 from hilrig_sim.world import NONE
 
 ALL_PARTS_PERIOD_NS: Final = 1_000_000_000
@@ -40,11 +37,8 @@ def run(service: Service) -> None:
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
-    with ExitStack() as served:
-        for rig, values in zip(service.rigs, parameters, strict=True):
-            answer = Constant(_configuration(service, rig.name, values).SerializeToString())
-            served.enter_context(service.bus.serve(topics.CONFIG.key(lab.name, rig.name), answer))
-        service.counters.rigs = len(parameters)
+    turns = Turns()
+    with Membership(service, simulation, turns):
         rate = Rate(step_ns, service.clock)
         freeze_garbage()
         service.ready()
@@ -54,19 +48,8 @@ def run(service: Service) -> None:
             while not stopping.is_set():
                 tick = rate.wait()
                 simulation.tick(tick)
+                turns.run_waiting()
                 service.beat(service.clock.monotonic_ns())
-
-
-@dataclass(frozen=True, slots=True)
-class Constant:
-    """Answers every question alike."""
-
-    payload: bytes
-
-    def __call__(self, question: bytes) -> bytes:
-        """The answer, whatever is asked."""
-        del question
-        return self.payload
 
 
 class Simulation:
@@ -74,6 +57,7 @@ class Simulation:
 
     def __init__(self, service: Service, parameters: list[RigParameters]) -> None:
         lab = service.lab
+        self._service = service
         self._plant = Plant(parameters)
         self._warm_up()
         self._commands = service.latest(topics.COMMAND)
@@ -139,6 +123,36 @@ class Simulation:
         if tick.missed_steps or tick.lateness_ns > self._step_ns:
             self._reporter.tell_of_overrun(tick, step, sampled_ns)
 
+    @property
+    def parameters(self) -> tuple[RigParameters, ...]:
+        """Of every rig, in their order."""
+        return self._plant.rigs
+
+    def add(self, name: str, plant: Plant) -> None:
+        """Simulate one more rig, the last one of `plant`; the others of it are those that are simulated now."""
+        count = len(self._rigs)
+        plant.adopt(self._plant, range(count), range(count))
+        self._rigs.append(_Rig(count, name, plant.rigs[count], self._service, plant))
+        self._effort = np.hstack([self._effort, np.zeros((4, 1))])
+        self._magnet = np.append(self._magnet, False)
+        self._service.add_to_batch(self._states, topics.STATE, name)
+        self._regroup(plant)
+
+    def remove(self, index: int, plant: Plant) -> None:
+        """Simulate a rig no more; `plant` has all the others."""
+        kept = [number for number in range(len(self._rigs)) if number != index]
+        plant.adopt(self._plant, range(len(kept)), kept)
+        del self._rigs[index]
+        self._effort, self._magnet = self._effort[:, kept].copy(), self._magnet[kept]
+        self._states.remove(index)
+        self._regroup(plant)
+
+    def _regroup(self, plant: Plant) -> None:
+        self._plant = plant
+        for index, rig in enumerate(self._rigs):
+            rig.move_to(index, plant)
+        self._reporter.regroup([rig.name for rig in self._rigs], plant)
+
     def _rig_reports(self) -> list[RigReport]:
         return [rig.report() for rig in self._rigs]
 
@@ -162,7 +176,6 @@ class _Rig:
     """What one rig sends: a message that is filled anew each step."""
 
     def __init__(self, index: int, name: str, parameters: RigParameters, service: Service, plant: Plant) -> None:
-        self.index = index
         self.name = name
         self.follower = CommandFollower(service.incarnation, service.lab.sim.command_timeout_ns)
         self.state = JointState(
@@ -173,13 +186,18 @@ class _Rig:
             external_torque_z=parameters.arm.external_torque_z,
             safe=True,
         )
-        self._world = plant.world
-        self._plant = plant
-        self._part_names = plant.world.part_names[index]
+        self.move_to(index, plant)
         self._loops_us: list[int] = []
         self._has_commanded = False
         self._has_parts = False
         self._parts_due_ns = 0
+
+    def move_to(self, index: int, plant: Plant) -> None:
+        """Be the rig `index` of a plant."""
+        self.index = index
+        self._world = plant.world
+        self._plant = plant
+        self._part_names = plant.world.part_names[index]
 
     def encoded(self, times: StepTimes, sampled_ns: int) -> bytes:
         """Complete the state with what seldom changes, and encode it."""
@@ -232,17 +250,3 @@ class _Rig:
         for name, x, y, z, yaw in poses:
             state.parts.add(name=name, x=x, y=y, z=z, yaw=yaw)
         self._has_parts = True
-
-
-def _configuration(service: Service, rig: str, parameters: RigParameters) -> RigConfig:
-    """What a rig is, for whoever asks."""
-    return RigConfig(
-        rig=rig,
-        incarnation=service.incarnation,
-        step_ns=parameters.sim.step_ns,
-        parameters_json=parameters.to_json(),
-        urdf=urdf(parameters, rig),
-        lab_toml=service.lab.source,
-        software_version=version("hilrig"),
-        machine=machine_name(),
-    )

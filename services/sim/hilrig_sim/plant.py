@@ -129,6 +129,15 @@ class Plant:
             self.world.place(rig, parts, held, self.tool(np.array([rig]))[:, 0])
         self._begin_anew()
 
+    def adopt(self, other: "Plant", mine: Sequence[int], theirs: Sequence[int]) -> None:
+        """Take over the state of rigs of another plant with the same parameters: `mine[i]` goes on as `theirs[i]`."""
+        here, there = np.array(mine, dtype=np.int64), np.array(theirs, dtype=np.int64)
+        self.position[:, here] = other.position[:, there]
+        self.velocity[:, here] = other.velocity[:, there]
+        self.error[:, here] = other.error[:, there]
+        self.world.adopt(other.world, here, there)
+        self._begin_anew()
+
     def step(self, effort: Floats, magnet: Bools) -> Sequence[PlantEvent]:
         """Move every rig on by one step of the loop; says what happened, in a list that the next step reuses.
 

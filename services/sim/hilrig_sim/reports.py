@@ -29,6 +29,12 @@ class Reporter:
         self._missed = 0
         self._worst_ns = 0
 
+    def regroup(self, rigs: Sequence[str], plant: Plant) -> None:
+        """Tell of these rigs from now on."""
+        self._rigs = tuple(rigs)
+        self._plant = plant
+        self._limit_told_ns.clear()
+
     def tell_of_plant(self, events: Sequence[PlantEvent], step: int, now_ns: int, sessions: Sequence[str]) -> None:
         """What a step of the plant brought; `step` is the first whose state shows it."""
         for happened in events:

@@ -85,6 +85,17 @@ class World:
         self._let_go(np.array([rig]))
         self._moved(rig)
 
+    def adopt(self, other: "World", mine: Ints, theirs: Ints) -> None:
+        """Take over how things stand from rigs of another world with the same scenes, column by column."""
+        rows = min(self.x.shape[0], other.x.shape[0])
+        for name in ("x", "y", "z", "yaw", "_fall_speed", "_falling"):
+            getattr(self, name)[:rows, mine] = getattr(other, name)[:rows, theirs]
+        for name in ("held", "_grip", "held_height", "_held_radius", "highest", "moving", "holds"):
+            getattr(self, name)[..., mine] = getattr(other, name)[..., theirs]
+        self.falling = bool(self._falling.any())
+        self.holding = bool(self.holds.any())
+        self._any_moving = bool(self.moving.any())
+
     def place(self, rig: int, poses: Sequence[tuple[float, float, float, float]], held: int, tip: Floats) -> None:
         """Set a rig's parts to (x, y, z, yaw) each, at rest, `held` on the magnet at `tip` (x, y, z, yaw), (4,)."""
         for row, pose in enumerate(poses):

@@ -28,6 +28,7 @@ from hilrig_cli.commands import (
     registers,
     replay,
     report,
+    rig,
     router,
     runs,
     services,
@@ -57,6 +58,7 @@ app.command(rich_help_panel=RUN)(live.live)
 app.command(rich_help_panel=RUN)(top.top)
 app.command(rich_help_panel=RUN)(metrics.metrics)
 app.command(rich_help_panel=RUN)(check.check)
+app.add_typer(rig.app, name="rig", rich_help_panel=RUN)
 app.command(rich_help_panel=RUN)(doctor.doctor)
 app.command(rich_help_panel=RUN)(lease.lease)
 app.command(rich_help_panel=RUN)(impair.impair)

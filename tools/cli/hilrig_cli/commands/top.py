@@ -103,4 +103,4 @@ def _state(rig: "RigView") -> str:
         return "watchdog tripped"
     if rig.safe:
         return "no command"
-    return "moving" if rig.controller else "held torque"
+    return "in use" if rig.controller else "free"

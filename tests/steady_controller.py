@@ -1,0 +1,36 @@
+"""A controller for tests of faults: the same torque fifty times a second, connecting again whenever it must.
+
+usage: steady_controller.py HOST PORT; ends with its standard input, and then prints how many writes were answered.
+"""
+
+import socket
+import struct
+import sys
+import threading
+import time
+
+WRITE = struct.pack(">HHHBBHHB4h", 1, 0, 15, 1, 16, 0, 4, 8, 300, 0, 0, 0)
+
+
+def main() -> None:
+    host, port = sys.argv[1], int(sys.argv[2])
+    stopping = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.read(), stopping.set()), daemon=True).start()
+    answered = 0
+    while not stopping.is_set():
+        try:
+            with socket.create_connection((host, port), timeout=1.0) as connection:
+                while not stopping.is_set():
+                    connection.sendall(WRITE)
+                    answer = connection.recv(64)
+                    if not answer:
+                        break
+                    answered += not answer[7] & 0x80
+                    time.sleep(0.02)
+        except OSError:
+            time.sleep(0.1)
+    print(answered)
+
+
+if __name__ == "__main__":
+    main()

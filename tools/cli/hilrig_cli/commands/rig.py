@@ -1,0 +1,194 @@
+"""`hilrig rig`: which rigs a running lab has, and having more or fewer of them."""
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilrig_cli.options import AsJson, Config
+
+if TYPE_CHECKING:
+    from hilrig_runtime.bus import Bus
+    from hilrig_runtime.config import LabConfig, RigSettings
+    from hilrig_schemas import Event, Roster
+
+app = typer.Typer(help="See which rigs a running lab has; add, take away or reset one.", no_args_is_help=True)
+ANSWER_WITHIN_S = 3.0
+
+Name = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
+
+
+@app.command(name="list")
+def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
+    """Print each rig with who simulates and who serves it, those of the lab's file and those added since."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.zenoh_bus import ZenohBus
+
+    lab = load_lab(config)
+    with ZenohBus(lab.bus, "rig") as bus:
+        rows = _rows(lab, _rosters(bus, lab))
+    if as_json:
+        print(json.dumps(rows))
+        return
+    table = Table()
+    for column in ("rig", "at", "simulation", "edge", "from"):
+        table.add_column(column)
+    for row in rows:
+        origin = "lab.toml" if row["in_file"] else "added"
+        table.add_row(row["rig"], row["address"], row["sim"] or "none", row["edge"] or "none", origin)
+    Console().print(table)
+
+
+@app.command()
+def add(
+    rig: Name,
+    port: Annotated[
+        int | None, typer.Option(help="Modbus TCP port; without: the next one behind all others.", show_default=False)
+    ] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option(metavar="RIG.TOML", help="What differs from the lab, as in [[rigs]].", show_default=False),
+    ] = None,
+    config: Config = None,
+) -> None:
+    """Add a rig to a running lab; the others do not feel it.
+
+    It is there until the lab ends, or its simulation or edge is started anew: to keep it, write it into lab.toml too.
+    """
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import HilrigError, OperationError
+    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_schemas import Event
+
+    lab = load_lab(config)
+    with ZenohBus(lab.bus, "rig") as bus:
+        rosters = _rosters(bus, lab)
+        new = _settings(lab, rosters, rig, port, settings)
+        simulation = _least_loaded(rosters, "sim", lab)
+        edge = _least_loaded(rosters, "edge", lab)
+        request = Event(kind=Event.RIG_ADDED, rig=rig)
+        request.configuration_data.text = new.model_dump_json()
+        _ask(bus, lab, simulation, request)
+        try:
+            done = _ask(bus, lab, edge, request)
+        except HilrigError as error:
+            # Both or none: a rig that nobody serves must not be left behind.
+            _ask(bus, lab, simulation, Event(kind=Event.RIG_REMOVED, rig=rig))
+            raise OperationError(f"{rig} was not added: {error}") from error
+    print(done.text)
+
+
+@app.command()
+def remove(rig: Name, config: Config = None) -> None:
+    """Take a rig away from a running lab: no torque, its session ends, its port closes; the others do not feel it."""
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_schemas import Event
+
+    lab = load_lab(config)
+    with ZenohBus(lab.bus, "rig") as bus:
+        owners = [roster for roster in _rosters(bus, lab) if rig in roster.rigs and roster.service in ("edge", "sim")]
+        if not owners:
+            raise InputError(f"no running service has a rig called {rig!r}: hilrig rig list shows those that there are")
+        # The edge first: its last word is that there is no torque.
+        for roster in sorted(owners, key=lambda roster: roster.service):
+            print(_ask(bus, lab, roster, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
+
+
+@app.command()
+def reset(rig: Name, config: Config = None) -> None:
+    """Put a rig's arm and parts back to the start; a controller that holds it goes on from there."""
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_schemas import Event
+
+    lab = load_lab(config)
+    with ZenohBus(lab.bus, "rig") as bus:
+        for roster in _rosters(bus, lab):
+            if roster.service == "edge" and rig in roster.rigs:
+                print(_ask(bus, lab, roster, Event(kind=Event.RESET, rig=rig)).text)
+                return
+    raise InputError(f"no edge serves a rig called {rig!r}: hilrig rig list shows those that there are")
+
+
+def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
+    from hilrig_runtime.errors import OperationError
+    from hilrig_runtime.presence import rosters
+
+    deadline_s = time.monotonic() + ANSWER_WITHIN_S
+    found: list[Roster] = []
+    # A link to each has to be made first: what one look finds and the next one too is all that there is.
+    while time.monotonic() < deadline_s:
+        before, found = found, rosters(bus, lab.name)
+        if {"sim", "edge"} <= {roster.service for roster in found} and len(found) == len(before):
+            return found
+        time.sleep(0.05)
+    if not found:
+        raise OperationError(f"nothing is heard of lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
+    return found
+
+
+def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
+    in_file = [rig.name for rig in lab.rigs]
+    names = dict.fromkeys([*in_file, *(rig for roster in rosters if roster.service == "edge" for rig in roster.rigs)])
+    rows = []
+    for name in names:
+        row: dict[str, Any] = {"rig": name, "in_file": name in in_file, "address": "", "sim": "", "edge": ""}
+        for roster in rosters:
+            if name in roster.rigs and roster.service in row:
+                row[roster.service] = f"{roster.instance} on {roster.host}"
+                row["address"] = row["address"] or roster.addresses[list(roster.rigs).index(name)]
+        rows.append(row)
+    return rows
+
+
+def _settings(
+    lab: "LabConfig", rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None
+) -> "RigSettings":
+    import tomllib
+
+    from hilrig_runtime.config import read_lab_text, read_rig
+    from hilrig_runtime.errors import InputError
+
+    if any(rig in roster.rigs for roster in rosters if roster.service in ("sim", "edge")):
+        raise InputError(f"the lab has a rig called {rig!r} already")
+    try:
+        said = {} if settings is None else tomllib.loads(read_lab_text(settings))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{settings}: no valid TOML: {error}") from error
+    if port is not None:
+        said["port"] = port
+    if "port" not in said:
+        reached = [part for roster in rosters for at in roster.addresses for part in at.split(", ") if part]
+        taken = [int(part.rpartition(":")[2]) for part in reached]
+        said["port"] = max([*taken, *lab.ports.values(), *lab.tls_ports.values()]) + 1
+    return read_rig(json.dumps(said | {"name": rig}))
+
+
+def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "Roster":
+    from hilrig_runtime.errors import OperationError
+
+    able = [roster for roster in rosters if roster.service == service]
+    if not able:
+        raise OperationError(f"no {service} of lab {lab.name!r} is heard: is it running?")
+    return min(able, key=lambda roster: len(roster.rigs))
+
+
+def _ask(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
+    from hilrig_runtime.errors import OperationError
+    from hilrig_schemas import Event, topics
+
+    key = topics.CONTROL.key(lab.name, roster.service, roster.instance)
+    answers = bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_WITHIN_S)
+    if not answers:
+        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} does not answer")
+    if answers[0].error:
+        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} refused: {answers[0].error}")
+    return Event.FromString(answers[0].payload)
