@@ -182,6 +182,7 @@ def test_a_disk_that_fails_one_rig_s_file_is_told_and_the_others_go_on(
                 sim.state(rig, now())
             lab.send(sim)
         eventually(lambda: any("Input/output error" in event.text for event in told))
+        assert {event.kind for event in told if event.severity == Event.ERROR} == {Event.RECORDING}
         eventually(lambda: "Input/output error" in service.counters.trouble)
         edge.end("rig2", f"{SESSION}-rig2", now())
         lab.send(edge)

@@ -1,5 +1,6 @@
 """Recordings for other tools: what is in them is what was recorded, and the arm stands where the states say."""
 
+import errno
 import json
 from pathlib import Path
 
@@ -11,11 +12,12 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 import recordings
-from hilrig_replay.export import TABLES, export_foxglove, export_tables, table
+from hilrig_recorder.writer import RunWriter
+from hilrig_replay.export import DRAFT_SUFFIX, TABLES, export_foxglove, export_tables, table
 from hilrig_replay.run import open_run
 from hilrig_replay.scene import rotate
 from hilrig_replay.shapes import Solid, solids_of
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.kinematics import forward
 from hilrig_sim.model import ArmParameters
 from labs import hilrig
@@ -47,6 +49,28 @@ def test_tables_hold_every_row_with_a_column_a_number(recording: Path, tmp_path:
 def test_a_table_has_no_column_that_is_a_code(recording: Path) -> None:
     states = table(open_run(recording), "state")
     assert {str(states.schema.field(name).type) for name in ("session", "held_part")} == {"string"}
+
+
+def test_an_export_that_was_killed_is_in_nobody_s_way(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / f"fox.mcap{DRAFT_SUFFIX}").write_bytes(b"half of it")
+    out = export_foxglove(open_run(recording), tmp_path / "fox.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+
+
+def test_an_export_that_does_not_fit_is_no_export(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = RunWriter._append
+
+    def full(writer: RunWriter, data: bytes) -> None:
+        if writer.size + len(data) > 200_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        append(writer, data)
+
+    monkeypatch.setattr(RunWriter, "_append", full)
+    with pytest.raises(OperationError, match=r"fox\.mcap: can't be written: [Nn]o space"):
+        export_foxglove(open_run(recording), tmp_path / "fox.mcap")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_recorded_message_is_in_the_export_as_it_was(recording: Path, tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_a_verdict_stands_beside_the_recording_and_holds_for_that_file_only(tmp_
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no folder of recordings"):
+    with pytest.raises(InputError, match="no such folder"):
         RunIndex(tmp_path / "nowhere").load()
 
 

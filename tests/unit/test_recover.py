@@ -1,9 +1,11 @@
 """Whole files of torn and damaged ones: nothing whole is lost, nothing is invented, and nothing crashes."""
 
+import errno
 import random
 import shutil
 import struct
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 from mcap.reader import make_reader
@@ -281,6 +283,47 @@ def test_a_full_disk_leaves_the_original(tmp_path: Path, monkeypatch: pytest.Mon
         recover(source, tmp_path / "new.mcap")
     assert source.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "torn.mcap"]
+
+
+def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
+    answer = hilrig("recover", tmp_path)
+    assert answer.returncode == 2
+    assert "is a folder; name the MCAP files in it" in answer.stderr
+    assert "Traceback" not in answer.stderr
+
+
+def test_where_nothing_can_be_written_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good_file(tmp_path / "run.mcap")
+    source = tmp_path / "torn.mcap"
+    source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for method in ("unlink", "open"):
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, method, refuse)
+            if method == "unlink":
+                with pytest.raises(OperationError, match="can't be written: Read-only file system"):
+                    recover(source, tmp_path / "new.mcap")
+            else:
+                with pytest.raises(InputError, match="can't be read"):
+                    recover(source, tmp_path / "new.mcap")
+
+
+def test_a_file_on_a_read_only_disk_is_recovered_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good_file(tmp_path / "run.mcap")
+    source = tmp_path / "torn.mcap"
+    source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
+    open_path = Path.open
+
+    def read_only(path: Path, mode: str = "r", **options: Any) -> IO[Any]:
+        if "+" in mode:
+            raise OSError(errno.EROFS, "Read-only file system")
+        return open_path(path, mode, **options)
+
+    monkeypatch.setattr(Path, "open", read_only)
+    assert recover(source, tmp_path / "new.mcap").messages > 0
 
 
 def test_a_lock_shows_whether_a_file_is_open(tmp_path: Path) -> None:

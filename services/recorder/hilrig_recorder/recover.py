@@ -135,15 +135,11 @@ def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
     if path.exists():
         raise OperationError(f"{path}: exists; choose another name for what is recovered from {source.name}")
     part = path.with_name(path.name + RECOVERING_SUFFIX)
-    part.unlink(missing_ok=True)
     try:
+        part.unlink(missing_ok=True)
         _Copy(view, recovery).write(path, part, go_on)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OperationError(f"{path}: can't be written: {error.strerror}") from error
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
     recovery.path = path
     return recovery
 
@@ -153,9 +149,7 @@ def _held(source: Path) -> Iterator[None]:
     """Nobody else writes or recovers a file meanwhile."""
     try:
         file = source.open("r+b")
-    except (PermissionError, IsADirectoryError) as error:
-        if source.is_dir():
-            raise InputError(f"{source}: is a folder; name the MCAP files in it") from error
+    except PermissionError:
         # What can't be written can be read all the same, and nobody writes it.
         yield
         return
@@ -296,7 +290,13 @@ class _Copy:
 
 
 def recovered_path(source: Path) -> Path:
-    """Where what is recovered from a file goes: a `.part` gets its name, any other keeps its own beside it."""
+    """Where what is recovered from a file goes: a `.part` gets its name, any other keeps its own beside it.
+
+    Raises:
+        InputError: it is a folder.
+    """
+    if source.is_dir():
+        raise InputError(f"{source}: is a folder; name the MCAP files in it")
     if source.name.endswith(PART_SUFFIX):
         return source.with_name(source.name.removesuffix(PART_SUFFIX))
     return source.with_name(f"{source.stem}.recovered{source.suffix or '.mcap'}")

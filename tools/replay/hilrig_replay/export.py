@@ -39,6 +39,8 @@ _TEXT_CODES: Final = frozenset({"session", "held_part", "controller", "part"})
 
 
 # -- tables ---------------------------------------------------------------------------------------------------------
+DRAFT_SUFFIX: Final = ".exporting"
+"""What an export is called until it is whole."""
 
 
 def table(run: Run, name: str) -> pa.Table:
@@ -103,13 +105,16 @@ def export_foxglove(run: Run, path: Path) -> Path:
     if path.exists():
         raise InputError(f"{path}: exists; choose another name")
     arm, solids = read_arm(run.urdf), solids_of(run.urdf)
+    draft = path.with_name(path.name + DRAFT_SUFFIX)
     try:
+        # Left by an export that was killed.
+        draft.unlink(missing_ok=True)
         with run.path.open("rb") as stream:
             reader = SeekingReader(stream)
             summary = reader.get_summary()
             if summary is None:
                 raise InputError(f"{run.path}: has no index; `hilrig recover` makes one")
-            writer = RunWriter(path, schemas=(), channels=(), library="hilrig export")
+            writer = RunWriter(path, part=draft, schemas=(), channels=(), library="hilrig export")
             try:
                 drawing = _Drawing(writer, run, arm, solids, max(summary.schemas, default=0), max(summary.channels))
                 for schema in summary.schemas.values():
@@ -125,6 +130,8 @@ def export_foxglove(run: Run, path: Path) -> Path:
                     )
                 _copy(run, writer, drawing, {channel.topic: channel.id for channel in summary.channels.values()})
                 writer.finish()
+                if writer.given_up:
+                    raise OperationError(f"{path}: can't be written: no space is left for it")
                 writer.publish()
             except BaseException:
                 writer.discard()

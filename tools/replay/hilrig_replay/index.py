@@ -93,7 +93,8 @@ class RunIndex:
             InputError: there is no such folder.
         """
         if not self.folder.is_dir():
-            raise InputError(f"{self.folder}: no folder of recordings")
+            what = "a file, where a folder of recordings was expected" if self.folder.exists() else "no such folder"
+            raise InputError(f"{self.folder}: {what}")
         known = {} if rebuild else self._read()
         self._changed = rebuild
         self._known = {}

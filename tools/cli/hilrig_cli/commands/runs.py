@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from hilrig_replay.index import RunEntry
 
 
+UNTOWARD = ("disk full", "write failed", "keeper lost")
+"""Endings that are told with their reason."""
 WIDE = 130
 """Columns of a terminal from which on everything is shown."""
 
@@ -132,7 +134,6 @@ def _date(wall_ns: int, form: str) -> str:
 
 def _print_table(folder: Path, entries: "list[RunEntry]", total: int) -> None:
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     console = Console() if sys.stdout.isatty() else Console(width=200)
@@ -162,11 +163,21 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int) -> None:
             f"[red]{lost}[/]" if lost else "0",
             *([entry.controller, _answer(entry.verified)] if wide else []),
             _answer(entry.fit),
-            f"[red]{escape(entry.trouble)}[/]" if entry.trouble else entry.ended,
+            _ending(entry),
         )
     console.print(table)
     if total > len(entries):
         Console(stderr=True).print(f"{total - len(entries)} more: --limit 0 shows all")
+
+
+def _ending(entry: "RunEntry") -> str:
+    from rich.markup import escape
+
+    if entry.trouble:
+        return f"[red]{escape(entry.trouble)}[/]"
+    if entry.ended in UNTOWARD:
+        return f"[yellow]{escape(f'{entry.ended}: {entry.reason}')}[/]"
+    return escape(entry.ended)
 
 
 def _duration(seconds: float) -> str:
