@@ -257,11 +257,12 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 def _rank(page: _Page) -> tuple[float, ...]:
     task, grade, way = page.summary.task, page.summary.grade, page.summary.motion.tool_path_m
     if grade is not None:
-        return (*grade.rank, way)
+        return (0.0, *grade.rank, way)
+    # Beside graded runs, those without a task come last.
     if task is None:
-        return (0.0, 0.0, 0.0, way)
+        return (1.0, 0.0, 0.0, 0.0, way)
     error = task.largest_error_mm
-    return (-task.placed, 0.0, float("inf") if error is None else error, way)
+    return (1.0, -task.placed, 0.0, float("inf") if error is None else error, way)
 
 
 def _figures(statistics: Statistics) -> list[str]:
