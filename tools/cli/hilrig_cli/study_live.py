@@ -66,7 +66,7 @@ def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
     Raises:
         InputError: the study's own impairment and what the sweep adds are both on the command's way.
     """
-    base = study.impairment.ways
+    base = study.ways(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base

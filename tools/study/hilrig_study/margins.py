@@ -24,7 +24,7 @@ Complex = NDArray[np.complex128]
 STABLE: Final = 1.0 - 1e-9
 """Spectral radii below this are stable; what is closer to 1 is the rounding of an integrator's pole."""
 _SETTLING_POLLS: Final = 200
-_FREQUENCIES: Final = 4000
+_FREQUENCIES: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,52 +49,38 @@ class LinearLaw:
         return np.asarray(self.c @ np.linalg.solve(z * np.eye(len(self.a)) - self.a, self.b) + self.d)
 
 
-def linearise_law(
-    controller: LawController, plant: LinearPlant, period_s: float, latency_s: float = 0.0, run: int = 0
-) -> LinearLaw:
+def linearise_law(controller: LawController, plant: LinearPlant, period_s: float, latency_s: float = 0.0) -> LinearLaw:
     """A law near rest at the plant's pose, by central differences: exact but for rounding where it is linear.
 
     Args:
-        controller: its law; one run, or `run` of several.
+        controller: its law, with one set of gains.
         plant: says the pose and the effort that holds it.
         period_s: of the polls, s.
         latency_s: loop latency that the controller measures, constant, s.
-        run: which of the runs that the controller's gains are made for.
 
     Raises:
         InputError: its memory does not come to rest with the arm at rest at its goal.
     """
-    runs = run + 1
-    goal = np.repeat(np.array(plant.pose)[:, np.newaxis], runs, axis=1)
-    still = Measured(np.zeros(runs), goal, goal, np.full(runs, latency_s))
-    rest = controller.start(runs)
+    goal = np.array(plant.pose)[:, np.newaxis]
+    still = Measured(np.zeros(1), goal, goal, np.full(1, latency_s))
+    rest = controller.start(1)
     for _ in range(_SETTLING_POLLS):
         _, following = controller.law(rest, still)
         moved, rest = np.abs(following - rest), following
-    if not np.nanmax(moved[:, run]) < 1e-9:
+    if not np.nanmax(moved) < 1e-9:
         raise InputError("the controller's memory does not come to rest while the arm rests at its goal")
     rows = len(rest)
-    a, b, c, d = np.zeros((rows, rows)), np.zeros((rows, 4)), np.zeros((4, rows)), np.zeros((4, 4))
-
-    def difference(index: int, small: float) -> tuple[Floats, Floats]:
-        results = []
-        for sign in (1.0, -1.0):
-            memory, position = rest.copy(), goal.copy()
-            if index < rows:
-                memory[index] += sign * small
-            else:
-                position[index - rows] += sign * small
-            effort, following = controller.law(memory, Measured(still.time_s, position, goal, still.latency_s))
-            results.append((effort[:, run], following[:, run]))
-        (more, after), (less, before) = results
-        return (more - less) / (2 * small), (after - before) / (2 * small)
-
-    for index in range(rows):
-        c[:, index], a[:, index] = difference(index, 1e-5)
-    for joint in range(4):
-        d[:, joint], b[:, joint] = difference(rows + joint, 1e-5)
-    needed = _needed(a, c)
-    return LinearLaw(a[np.ix_(needed, needed)], b[needed], c[:, needed], d, period_s, needed)
+    # Every difference is a run of its own, and all are one evaluation: first the one side of each, then the other.
+    count = rows + 4
+    small = 1e-5 * np.concatenate([np.eye(count), -np.eye(count)], axis=1)
+    goals = np.repeat(goal, 2 * count, axis=1)
+    asked = Measured(np.zeros(2 * count), goal + small[rows:], goals, np.full(2 * count, latency_s))
+    effort, following = controller.law(rest + small[:rows], asked)
+    c_and_d = (effort[:, :count] - effort[:, count:]) / 2e-5
+    a_and_b = (following[:, :count] - following[:, count:]) / 2e-5
+    needed = _needed(a_and_b[:, :rows], c_and_d[:, :rows])
+    a, b = a_and_b[np.ix_(needed, needed)], a_and_b[needed, rows:]
+    return LinearLaw(a, b, c_and_d[:, needed], c_and_d[:, rows:], period_s, needed)
 
 
 def _needed(a: Floats, c: Floats) -> NDArray[np.intp]:

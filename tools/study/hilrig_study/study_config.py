@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig, mistakes_in
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.impairment_config import ImpairmentSetting
+from hilrig_runtime.impairment_config import ImpairmentSetting, Ways
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import NotNegative, Number, Positive, Section, Vector4
 from hilrig_sim.configured import rig_parameters
@@ -89,7 +89,7 @@ class TaskConfig(Section):
 
 
 class ControllerConfig(Section):
-    """One controller; which keys count depends on its kind."""
+    """One controller, and its ways; which keys count depends on its kind."""
 
     name: str = Field(default="PD", min_length=1, max_length=40)
     kind: Literal["pd", "pid", "computed_torque", "lqr", "file"] = "pd"
@@ -109,6 +109,8 @@ class ControllerConfig(Section):
     """lqr: what (1 N·m)² costs beside (1°)². A gain factor divides it by its square."""
     compensate: bool = True
     """lqr: predict over the measured loop latency."""
+    impairment: ImpairmentSetting | None = None
+    """What is on its ways; default: the study's."""
     file: Path | None = None
     """file: a Python file with a class Controller, relative to the study's file; it gets the gain factor."""
 
@@ -248,6 +250,11 @@ class StudyConfig(Section):
             )
         except ValidationError as error:
             raise InputError("; ".join(mistakes_in(error))) from error
+
+    def ways(self, controller: int) -> Ways:
+        """What is on a controller's ways before the sweep adds to the command's."""
+        own = self.controllers[controller].impairment
+        return (self.impairment if own is None else own).ways
 
     def near(self) -> LinearPlant:
         """The arm near the task's pose.

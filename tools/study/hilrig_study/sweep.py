@@ -180,8 +180,8 @@ def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDAr
 
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
-    """The timeline of each cell's run; runs whose times are the same share one."""
-    ways = study.impairment.ways
+    """The timeline of each cell's run, all of one controller; runs whose times are the same share one."""
+    ways = study.ways(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
     known: dict[tuple[float, ...], Timeline] = {}
     lines = []
@@ -315,8 +315,9 @@ def sweep(
 
 
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
-    none = study.impairment.ways.do_nothing
-    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & none)
+    """Where nothing is random."""
+    nothing = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
+    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & nothing[cells["controller"]])
 
 
 def _batches(cells: NDArray[np.void]) -> Iterator[NDArray[np.intp]]:
