@@ -241,6 +241,15 @@ def test_a_trip_leaves_the_magnet_as_the_simulation_has_it() -> None:
     assert not bench.commands[-1].magnet, "it was asked for, but never arrived"
 
 
+def test_the_teachers_reset_is_not_held_up() -> None:
+    bench = impaired(command="constant:300")
+    bench.write(bench.connect(), 0, 1000)
+    bench.device.reset()
+    assert (bench.commands[-1].resets, list(bench.commands[-1].effort)) == (1, [0.0] * 4)
+    let_pass(bench, 400)
+    assert not words_of(bench), "the torque of before comes no more"
+
+
 def test_a_session_that_ends_does_not_bring_the_last_torque_early() -> None:
     bench = impaired(command="constant:300")
     first = bench.connect(host="10.0.0.1")

@@ -305,6 +305,7 @@ class Edge:
 
     def _shut(self, seat: _Seat, reason: str) -> None:
         seat.wire.device.shut(reason)
+        seat.wire.follow_states(None)
         seat.server.close(reason)
         if seat.server.traffic.count:
             self._send_traffic(seat, self.service.clock.monotonic_ns())

@@ -183,11 +183,10 @@ class Commander:
     def _recall(self, way: Line[tuple[TorqueCommand, bytes]]) -> None:
         """Make void what is on its way: what stands is what the simulation was told, or zero."""
         if way.void():
-            standing, message = self._standing, self._message
+            # A reset that was asked for is not taken back: it does no harm, and the teacher's is the edge's own word.
             if self.moves:
                 self.torque[:] = self._standing_torque
-            message.magnet = standing.magnet
-            message.resets = standing.resets
+            self._message.magnet = self._standing.magnet
         self._standing_torque = bytes(self.torque)
 
     # -- sending
