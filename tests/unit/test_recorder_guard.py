@@ -7,6 +7,7 @@ import pytest
 
 from hilrig_recorder.by_hand import HandSessions
 from hilrig_recorder.guard import FolderLock
+from hilrig_recorder.share import Share
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Event, OpenSession
 
@@ -34,8 +35,16 @@ def test_a_lock_that_says_nothing_and_is_held_by_nobody_is_in_nobody_s_way(tmp_p
     FolderLock(tmp_path, "1", ["rig1"]).close()
 
 
+def test_each_rig_is_one_recorder_s_also_those_that_were_added_since() -> None:
+    lab = ["rig1", "rig2", "rig3"]
+    shares = [Share(lab, ["rig1", "rig3"]), Share(lab, ["rig2"])]
+    for rig, owner in (("rig1", 0), ("rig2", 1), ("rig3", 0), ("added", 0)):
+        assert [share.has(rig) for share in shares] == [owner == 0, owner == 1]
+    assert [share.lists("added") for share in shares] == [False, False]
+
+
 def sessions() -> HandSessions:
-    return HandSessions(["rig1", "rig2"], random.Random(1))
+    return HandSessions(["rig1", "rig2"].__contains__, random.Random(1))
 
 
 def test_a_session_by_hand_has_an_id_like_any_other() -> None:
@@ -53,7 +62,7 @@ def test_what_can_not_be_is_refused_with_the_reason() -> None:
     by_hand.begin("rig1", WALL)
     with pytest.raises(OperationError, match="already"):
         by_hand.begin("rig1", WALL)
-    with pytest.raises(OperationError, match="it has rig1, rig2"):
+    with pytest.raises(OperationError, match="there is no rig 'rig3'"):
         by_hand.begin("rig3", WALL)
     with pytest.raises(OperationError, match="not being recorded by hand"):
         by_hand.end("rig2")

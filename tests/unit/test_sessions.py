@@ -83,7 +83,7 @@ class Desk:
 
     def __init__(self, preroll_s: float = 2.0, rigs: Sequence[str] | None = None) -> None:
         self.shelf = FakeShelf()
-        self.book = SessionBook(LAB, preroll_s, self.shelf, rigs)
+        self.book = SessionBook(LAB, preroll_s, self.shelf, lambda rig: rigs is None or rig in rigs)
         self.shelf.flush = self.book.flush
         self.now = 100 * SECOND
         self.offset = WALL

@@ -4,7 +4,7 @@ Beginning one only says so on the recorder's own log stream: from there on it is
 """
 
 import random
-from collections.abc import Iterable
+from collections.abc import Callable
 
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.session_id import session_id
@@ -12,10 +12,10 @@ from hilrig_schemas import Event, OpenSession
 
 
 class HandSessions:
-    """At most one session by hand for each rig."""
+    """At most one session by hand for each rig that `is_there`."""
 
-    def __init__(self, rigs: Iterable[str], letters: random.Random) -> None:
-        self._rigs = sorted(rigs)
+    def __init__(self, is_there: Callable[[str], bool], letters: random.Random) -> None:
+        self._is_there = is_there
         self._letters = letters
         self._open: dict[str, OpenSession] = {}
 
@@ -34,8 +34,8 @@ class HandSessions:
         Raises:
             OperationError: there is no such rig, or it is being recorded by hand already.
         """
-        if rig not in self._rigs:
-            raise OperationError(f"{rig!r} is no rig of this recorder; it has {', '.join(self._rigs)}")
+        if not self._is_there(rig):
+            raise OperationError(f"there is no rig {rig!r} in this lab: `hilrig rig list` names those that there are")
         if rig in self._open:
             raise OperationError(f"{rig} is being recorded by hand already: {self._open[rig].session}")
         session = session_id(rig, wall_ns, self._letters)

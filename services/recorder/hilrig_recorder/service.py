@@ -22,6 +22,7 @@ from hilrig_recorder.intake import Intake
 from hilrig_recorder.recording import SECOND_NS, Recording
 from hilrig_recorder.recover import session_of
 from hilrig_recorder.sessions import SessionBook
+from hilrig_recorder.share import Share
 from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.service import Service
@@ -107,12 +108,13 @@ class Recorder:
             ask_config=self._ask_config,
             give_up=self._give_up,
         )
-        rigs = {rig.name for rig in service.rigs}
-        others = {rig.name for rig in lab.rigs} - rigs
-        # Alone, it records whoever is in the lab, also rigs that were added since.
-        self._book = SessionBook(lab.name, config.preroll_s, self._files, rigs if others else None)
-        self._by_hand = HandSessions(rigs, random.Random(service.incarnation))
-        parts = [part for part in unfinished(self._files.folder) if part.parent.name not in others]
+        share = Share([rig.name for rig in lab.rigs], [rig.name for rig in service.rigs])
+        self._book = SessionBook(lab.name, config.preroll_s, self._files, share.has)
+        self._by_hand = HandSessions(
+            lambda rig: share.lists(rig) or (share.has(rig) and self._book.has_heard_of(rig)),
+            random.Random(service.incarnation),
+        )
+        parts = [part for part in unfinished(self._files.folder) if share.has(part.parent.name)]
         self._restore(parts)
         self._stream = service.bus.subscribe_recording(LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss)
         self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)

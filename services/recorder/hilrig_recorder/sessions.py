@@ -7,7 +7,7 @@ passed the end, by their own stamps. Of the messages nothing is decoded but even
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable
 from typing import Final
 
 from google.protobuf.message import DecodeError
@@ -41,12 +41,12 @@ _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
 class SessionBook:
     """Follows the log streams; time is passed in: arrival on the wall clock, and `now_ns` of the monotonic clock.
 
-    With `rigs` those alone are recorded, and what is sent of others is passed over; None: every rig of the lab.
+    What is sent of rigs that are not `mine` is passed over: another recorder has them.
     """
 
-    def __init__(self, lab: str, preroll_s: float, shelf: Shelf, rigs: Collection[str] | None = None) -> None:
+    def __init__(self, lab: str, preroll_s: float, shelf: Shelf, mine: Callable[[str], bool] = lambda _: True) -> None:
         self._lab = lab
-        self._mine = None if rigs is None else frozenset(rigs)
+        self._is_mine = mine
         self._preroll_ns = round(preroll_s * SECOND_NS)
         self._shelf = shelf
         self._rigs: dict[str, RigLog] = {}
@@ -64,6 +64,10 @@ class SessionBook:
     def recordings(self) -> list[Recording]:
         """The recordings that are open."""
         return list(self._recordings.values())
+
+    def has_heard_of(self, rig: str) -> bool:
+        """Whether anything of a rig has been sent."""
+        return rig in self._rigs
 
     # -- what comes in ----------------------------------------------------------------------------------------------
 
@@ -132,9 +136,6 @@ class SessionBook:
             for recording in rig.recordings:
                 self._shelf.source(recording, source.name, source.incarnation)
         return stream
-
-    def _is_mine(self, rig: str) -> bool:
-        return self._mine is None or rig in self._mine
 
     def _rig(self, name: str, now_ns: int) -> RigLog:
         rig = self._rigs.get(name)

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 ANSWER_TIMEOUT_S = 5.0
 """How long a recorder is looked for: a tool needs a moment to be linked to it."""
-NAMED = 5
-"""Rigs that a refusal names."""
 
 app = typer.Typer(help="Record a rig by hand, whether a controller is there or not.", no_args_is_help=True)
 
@@ -42,7 +40,7 @@ def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
 
 def _ask(config: "Path | None", request: "Event") -> "Event":
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_runtime.errors import OperationError
     from hilrig_runtime.presence import rosters
     from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas.topics import CONTROL
@@ -55,17 +53,15 @@ def _ask(config: "Path | None", request: "Event") -> "Event":
                 raise OperationError(
                     f"no recorder answers in lab {lab.name}: is `hilrig up` running with this lab.toml?"
                 )
-        for recorder in recorders:
-            if request.rig in recorder.rigs:
-                key = CONTROL.key(lab.name, recorder.service, recorder.instance)
-                for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
-                    if answer.error:
-                        raise OperationError(answer.error)
-                    return CONTROL.decode(answer.payload)
-                raise OperationError(f"recorder/{recorder.instance} does not answer; see its log")
-        recorded = [rig for recorder in recorders for rig in recorder.rigs]
-        named = ", ".join(recorded[:NAMED]) + (f" and {len(recorded) - NAMED} more" if len(recorded) > NAMED else "")
-    raise InputError(f"{request.rig!r} is recorded by nobody in lab {lab.name}; its rigs are {named}")
+        # Rigs that were added since are the one's that has the first of the lab's file.
+        has = next((one for one in recorders if request.rig in one.rigs), None)
+        has = has or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
+        key = CONTROL.key(lab.name, has.service, has.instance)
+        for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
+            if answer.error:
+                raise OperationError(answer.error)
+            return CONTROL.decode(answer.payload)
+    raise OperationError(f"{has.service}/{has.instance} does not answer: see its log")
 
 
 def _print(event: "Event", text: str, as_json: bool) -> None:
