@@ -13,6 +13,7 @@ FLOORS = {
     "modbus_edge": "services/modbus_edge/hilrig_modbus_edge",
     "recorder": "services/recorder/hilrig_recorder",
     "replay": "tools/replay/hilrig_replay",
+    "study": "tools/study/hilrig_study",
 }
 
 

@@ -33,6 +33,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
+    "hilrig study examples/": "tests/rig/test_study_live.py",
     "make demo": "tests/rig/test_demo.py",
 }
 """Beginning of a command, and the test that runs what it does."""
