@@ -286,7 +286,7 @@ def send_states(lab: LabConfig, control: Connection) -> None:
         states = service.batch_sender(topics.STATES)
         for rig in lab.rigs:
             service.add_to_batch(states, topics.STATE, rig.name)
-        service.latest(topics.COMMAND)
+        service.latest_of_batches(topics.COMMANDS)
         control.send(1)
         step = 0
         while not control.poll(0.02):

@@ -15,8 +15,8 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.rate import Rate
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, JointState, TorqueCommand
-from hilrig_schemas.topics import COMMAND, EVENT, STATE
+from hilrig_schemas import Event, JointState, RigBatch, TorqueCommand
+from hilrig_schemas.topics import COMMANDS, EVENT, STATE
 from hilrig_sim.configured import rig_parameters
 from hilrig_sim.loop import Simulation
 from recordings import Made
@@ -40,9 +40,7 @@ class VirtualRig:
         witness = MemoryBus(hub)
         witness.subscribe(STATE.key(self.lab.name, "*"), lambda _, payload: self.states.append(STATE.decode(payload)))
         witness.subscribe(EVENT.key(self.lab.name, "*"), lambda _, payload: self.events.append(EVENT.decode(payload)))
-        self._commands = {
-            rig.name: witness.publisher(COMMAND.key(self.lab.name, rig.name), COMMAND.traffic) for rig in self.lab.rigs
-        }
+        self._commands = witness.publisher(COMMANDS.key(self.lab.name, "edge", "1"), COMMANDS.traffic)
         self._rate = Rate(self.lab.sim.step_ns, self.clock)
         self._seq = 0
 
@@ -79,8 +77,8 @@ class VirtualRig:
         self.send(command.SerializeToString(), rig)
 
     def send(self, payload: bytes, rig: str = "rig1") -> None:
-        """Send any bytes on a rig's command topic."""
-        self._commands[rig].put(payload)
+        """Send any bytes as a rig's command."""
+        self._commands.put(RigBatch(source="edge/1", rigs=[rig], messages=[payload]).SerializeToString())
 
     def kinds(self) -> list[str]:
         """Kinds of the events so far."""

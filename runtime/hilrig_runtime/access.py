@@ -39,6 +39,7 @@ RULES: Final[dict[str, Rule]] = {
     # A service asks whether another one does its work already.
     topics.ROSTER.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
     topics.STATES.name: Rule(("sim",), ("edge", *TOOLS)),
+    topics.COMMANDS.name: Rule(("edge",), ("sim", *TOOLS)),
     # A recorder asks whether another one records the lab already.
     topics.CONTROL.name: Rule(SERVICES, ("recorder", "operator")),
 }
@@ -133,7 +134,9 @@ def _keys(identity: Identity, lab: str) -> tuple[list[str], list[str], list[str]
     for topic in SERVICE_TOPICS:
         rule, query = RULES[topic.name], topic.traffic is Traffic.QUERY
         if identity.role in rule.senders:
-            (serves if query else sends).append(topic.key(lab, identity.role, "*"))
+            # Whose commands a batch holds is told by its key: an edge with rigs of its own has a key of its own.
+            own_key = topic is topics.COMMANDS and identity.rigs != ("*",)
+            (serves if query else sends).append(topic.key(lab, identity.role, identity.name if own_key else "*"))
         if identity.role in rule.readers:
             (asks if query else reads).append(topic.key(lab, "*", "*"))
     return sends, serves, reads, asks

@@ -7,6 +7,7 @@ on its rig's own key, which costs little while nobody listens there. Recorded is
 
 from collections.abc import Callable, Sequence
 from itertools import repeat
+from typing import Final
 
 from hilrig_runtime.bus import Publisher
 from hilrig_runtime.clock import Clock
@@ -51,3 +52,44 @@ class BatchSender:
         self._sequences = [sequence + 1 for sequence in self._sequences]
         self._log.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
         self._counters.published += len(payloads)
+
+
+class Gatherer:
+    """Sends messages of single rigs as they come; where many rigs speak, those of a short while together.
+
+    `later` is asked to call a function in that while.
+    """
+
+    MANY: Final = 32
+    """Rigs that spoke since the last `look`."""
+
+    def __init__(self, source: str, together: Publisher, later: Callable[[Callable[[], None]], object]) -> None:
+        self._put = together.put
+        self._later = later
+        self._batch = RigBatch(source=source)
+        self._spoke: set[str] = set()
+        self._waits = False
+
+    def add(self, rig: str, payload: bytes) -> None:
+        """Send an encoded message of a rig."""
+        batch = self._batch
+        batch.rigs.append(rig)
+        batch.messages.append(payload)
+        self._spoke.add(rig)
+        if not self._waits:
+            self.flush()
+        elif len(batch.rigs) == 1:
+            self._later(self.flush)
+
+    def look(self) -> None:
+        """Once a tick: decide from who spoke since then whether messages wait for each other."""
+        self._waits = len(self._spoke) >= self.MANY
+        self._spoke.clear()
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what waits."""
+        batch = self._batch
+        if batch.rigs:
+            self._put(batch.SerializeToString())
+            del batch.rigs[:], batch.messages[:]

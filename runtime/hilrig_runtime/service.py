@@ -7,9 +7,9 @@ gives the same bytes to the bus and to the log stream; `latest` keeps the newest
 """
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Final, Generic, NamedTuple, Self, TypeVar
 
 from google.protobuf.message import DecodeError, Message
@@ -21,13 +21,13 @@ from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters, HealthReporter
 from hilrig_runtime.logstream import LogStream
 from hilrig_runtime.presence import Presence
-from hilrig_runtime.rig_batch import BatchSender
+from hilrig_runtime.rig_batch import BatchSender, Gatherer
 from hilrig_schemas import Event, RigBatch, Roster
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
-BATCHES_WAITING: Final = 8
-"""Batches that may wait: one of each of several senders."""
+BATCHES_WAITING: Final = 64
+"""Batches that may wait beyond one of each rig."""
 
 
 class Arrival(NamedTuple):
@@ -68,9 +68,13 @@ class LatestValues:
 
 
 class LatestOfBatches:
-    """The newest message of each rig, out of batches."""
+    """The newest message of each rig, out of batches.
 
-    def __init__(self, clock: Clock, counters: Counters) -> None:
+    `permitted` says of which rigs an instance may speak; empty: of all.
+    """
+
+    def __init__(self, clock: Clock, counters: Counters, permitted: Mapping[str, Collection[str]]) -> None:
+        self._permitted = permitted
         self._by_rig: dict[str, Arrival] = {}
         self._monotonic_ns = clock.monotonic_ns
         self._counters = counters
@@ -79,7 +83,7 @@ class LatestOfBatches:
         """The newest message of `rig`; None: none has come. The same object is returned until the next comes."""
         return self._by_rig.get(rig)
 
-    def on_message(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+    def on_message(self, key: str, payload: bytes) -> None:
         """Keep what a batch holds; called by the bus."""
         arrived_ns = self._monotonic_ns()
         try:
@@ -90,17 +94,33 @@ class LatestOfBatches:
         if len(batch.rigs) != len(batch.messages):
             self._counters.malformed += 1
             return
-        self._by_rig.update(
+        arrivals = (
             (rig, Arrival(message, arrived_ns)) for rig, message in zip(batch.rigs, batch.messages, strict=True)
         )
+        if self._permitted:
+            rigs = self._permitted.get(key.rpartition("/")[2], ())
+            arrivals = ((rig, arrival) for rig, arrival in arrivals if rig in rigs)
+        self._by_rig.update(arrivals)
         self._counters.received += len(batch.messages)
 
 
 class Sender(Generic[MessageT]):
-    """Sends the messages of one rig on one topic, on the bus and on the log stream."""
+    """Sends the messages of one rig on one topic, on the bus and on the log stream.
 
-    def __init__(self, key: str, publisher: Publisher | None, log: LogStream, clock: Clock, counters: Counters) -> None:
+    `first` gets each encoded message before anything else does.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        publisher: Publisher | None,
+        log: LogStream,
+        clock: Clock,
+        counters: Counters,
+        first: Callable[[bytes], None] | None = None,
+    ) -> None:
         self.key = key
+        self._first = first
         self._put = None if publisher is None else publisher.put
         self._append = log.append
         self._wall_ns = clock.wall_ns
@@ -111,6 +131,8 @@ class Sender(Generic[MessageT]):
         """Encode once; publish, and record the same bytes."""
         payload = message.SerializeToString()
         wall_ns = self._wall_ns()
+        if self._first is not None:
+            self._first(payload)
         if self._put is not None:
             self._put(payload)
         self._sequence += 1
@@ -119,8 +141,11 @@ class Sender(Generic[MessageT]):
 
     def repeat(self, message: MessageT) -> None:
         """Publish without recording: a repetition for those who wait to hear that it still holds."""
+        payload = message.SerializeToString()
+        if self._first is not None:
+            self._first(payload)
         if self._put is not None:
-            self._put(message.SerializeToString())
+            self._put(payload)
 
 
 class Service:
@@ -185,11 +210,21 @@ class Service:
             token = self.bus.announce(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 
-    def sender(self, topic: RigTopic[MessageT], rig: str, *, on_bus: bool = True) -> Sender[MessageT]:
-        """An end that sends on a rig's topic; with `on_bus=False` its messages go on the record alone."""
+    def sender(
+        self,
+        topic: RigTopic[MessageT],
+        rig: str,
+        *,
+        on_bus: bool = True,
+        first: Callable[[bytes], None] | None = None,
+    ) -> Sender[MessageT]:
+        """An end that sends on a rig's topic; with `on_bus=False` its messages go on the record alone.
+
+        `first` gets each encoded message before that.
+        """
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic)) if on_bus else None
-        return Sender(key, publisher, self.log, self.clock, self.counters)
+        return Sender(key, publisher, self.log, self.clock, self.counters, first)
 
     def latest(self, topic: RigTopic[MessageT], rig: str = "*") -> LatestValues:
         """The newest messages on a topic, of every rig or of one."""
@@ -201,12 +236,22 @@ class Service:
         )
         return values
 
-    def latest_of_batches(self, topic: ServiceTopic[RigBatch]) -> LatestOfBatches:
-        """The newest messages of each rig, out of the batches of everyone who sends them."""
-        values = LatestOfBatches(self.clock, self.counters)
+    def latest_of_batches(
+        self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})
+    ) -> LatestOfBatches:
+        """The newest messages of each rig, out of the batches of everyone who sends them; see `LatestOfBatches`."""
+        values = LatestOfBatches(self.clock, self.counters, permitted)
         key = topic.key(self.lab.name, "*", "*")
-        self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, BATCHES_WAITING))
+        # A batch may hold one message only: there is room for one of each rig, and some for rigs that are added.
+        waiting = len(self.rigs) + BATCHES_WAITING
+        self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, waiting))
         return values
+
+    def gatherer(self, topic: ServiceTopic[RigBatch], later: Callable[[Callable[[], None]], object]) -> Gatherer:
+        """An end that sends single messages, together where they are many; see `Gatherer`."""
+        key = topic.key(self.lab.name, self.name, self.instance)
+        together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
+        return Gatherer(self.source, together, later)
 
     def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
         """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""

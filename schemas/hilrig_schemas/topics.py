@@ -99,9 +99,11 @@ ROSTER: Final = ServiceTopic("roster", Roster, Traffic.QUERY)
 """Who runs, where, and for which rigs."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
 """The states of a tick together, for the edges; a watcher of one rig takes that rig's `STATE`."""
+COMMANDS: Final = ServiceTopic("commands", RigBatch, Traffic.CONTROL)
+"""Commands as they leave an edge, for the simulation; a watcher of one rig takes that rig's `COMMAND`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
-SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, ROSTER, STATES)  # type: ignore[assignment]
+SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, ROSTER, STATES, COMMANDS)  # type: ignore[assignment]
 RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in RIG_TOPICS if topic.channel}
 
 ALIVE: Final = "alive"

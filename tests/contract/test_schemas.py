@@ -82,6 +82,7 @@ def test_control_is_what_closes_the_loop() -> None:
         "state",
         "states",
         "command",
+        "commands",
     }
 
 

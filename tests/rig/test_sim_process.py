@@ -10,8 +10,8 @@ import pytest
 
 from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas import Event, JointState, RigConfig, TorqueCommand
-from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE
+from hilrig_schemas import Event, JointState, RigBatch, RigConfig, TorqueCommand
+from hilrig_schemas.topics import COMMANDS, CONFIG, EVENT, STATE
 from hilrig_sim.model import RigParameters
 from labs import HILRIG, hilrig, write_lab
 from waiting import eventually
@@ -35,7 +35,7 @@ class SimProcess:
         key = self.lab.name
         self.bus.subscribe(STATE.key(key, "*"), lambda _, payload: self.states.append(STATE.decode(payload)))
         self.bus.subscribe(EVENT.key(key, "*"), lambda _, payload: self.events.append(EVENT.decode(payload)))
-        self._command = self.bus.publisher(COMMAND.key(key, "rig1"), COMMAND.traffic)
+        self._command = self.bus.publisher(COMMANDS.key(key, "edge", "1"), COMMANDS.traffic)
         self._seq = 0
 
     def command(self, *effort: float) -> None:
@@ -50,7 +50,8 @@ class SimProcess:
             basis_step=newest.step,
             basis_incarnation=newest.incarnation,
         )
-        self._command.put(command.SerializeToString())
+        batch = RigBatch(source="edge/1", rigs=["rig1"], messages=[command.SerializeToString()])
+        self._command.put(batch.SerializeToString())
 
     def close(self) -> None:
         self.bus.close()

@@ -53,8 +53,6 @@ def test_a_rig_that_was_added_moves_and_is_recorded() -> None:
     with VirtualRig(LAB) as lab:
         lab.tick(5)
         lab.simulation.add("guest", grown(lab))
-        key = topics.COMMAND.key(lab.lab.name, "guest")
-        lab._commands["guest"] = lab.service.bus.publisher(key, topics.COMMAND.traffic)
         for _ in range(20):
             lab.command((0.7, 0.0, 0.0, 0.0), rig="guest")
             lab.tick()

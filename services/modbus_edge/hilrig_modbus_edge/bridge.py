@@ -35,6 +35,8 @@ TRAFFIC_PERIOD_NS: Final = 200_000_000
 FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 """How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
 
+GATHER_S: Final = 0.0005
+"""For so long commands wait for each other where many rigs are commanded."""
 ANSWER_TIMEOUT_S: Final = 1.0
 
 
@@ -53,7 +55,7 @@ class _Wire:
 
     def __init__(self, edge: "Edge", rig: str) -> None:
         service = edge.service
-        commands = service.sender(topics.COMMAND, rig)
+        commands = service.sender(topics.COMMAND, rig, first=partial(edge.commands.add, rig))
         self.send_command = commands.send
         self.repeat_command = commands.repeat
         self.traffic = service.sender(topics.TRAFFIC, rig)
@@ -121,6 +123,7 @@ class Edge:
     def __init__(self, service: Service) -> None:
         self.service = service
         self._states = service.latest_of_batches(topics.STATES)
+        self.commands = service.gatherer(topics.COMMANDS, self._soon)
         self._seats: dict[str, _Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
         service.counters.rigs = len(service.rigs)
         service.health.rig_reports = self._rig_reports
@@ -285,7 +288,12 @@ class Edge:
                 server.close_idle(now_ns)
             if server.traffic.count and (traffic_due or server.traffic.count >= MOST):
                 self._send_traffic(seat, now_ns)
+        self.commands.look()
         self.service.beat(now_ns)
+
+    @staticmethod
+    def _soon(call: Callable[[], None]) -> None:
+        asyncio.get_running_loop().call_later(GATHER_S, call)
 
     def _rig_reports(self) -> list[RigReport]:
         statuses = [seat.wire.device.lease_status() for seat in self._seats.values()]
@@ -317,6 +325,7 @@ class Edge:
         self.alarm.close()
         for seat in self._seats.values():
             self._shut(seat, "the edge stops")
+        self.commands.flush()
         self.state_sessions()
         self.service.log.flush(self.service.clock.monotonic_ns())
 

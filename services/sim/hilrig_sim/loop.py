@@ -60,7 +60,8 @@ class Simulation:
         self._service = service
         self._plant = Plant(parameters)
         self._warm_up()
-        self._commands = service.latest(topics.COMMAND)
+        tls = lab.bus.tls
+        self._commands = service.latest_of_batches(topics.COMMANDS, {} if tls is None else tls.edges)
         self._step_ns = lab.sim.step_ns
         self._clock = service.clock
         self._counters = service.counters

@@ -1,0 +1,194 @@
+"""A class of rigs as a user runs it: shared out among processes, looked at, more and fewer of them while it runs."""
+
+import json
+import os
+import re
+import signal
+import socket
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from subprocess import PIPE, Popen
+from typing import Any
+
+import pytest
+from pymodbus.client import ModbusTcpClient
+
+from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
+from waiting import eventually
+
+pytestmark = pytest.mark.rig
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
+    config = write_lab(tmp_path_factory.mktemp("lab"), rigs=4, extra="edge.session_grace_ms = 100")
+    with RunningLab(config, "--edges", "2", "--recorders", "2", "--log-format", "json") as running:
+        yield running
+
+
+def top(lab: RunningLab) -> dict[str, Any]:
+    done = hilrig("top", "--json", "--config", lab.config)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def rig_of(lab: RunningLab, name: str) -> dict[str, Any]:
+    return next(rig for rig in top(lab)["rigs"] if rig["rig"] == name)
+
+
+@pytest.fixture
+def controller(lab: RunningLab) -> Iterator[ModbusTcpClient]:
+    """Holds rig 4."""
+    with closing(ModbusTcpClient("127.0.0.1", port=lab.lab.ports["rig4"], timeout=2)) as client:
+        assert client.connect()
+        client.read_holding_registers(4, count=4)
+        assert not client.write_registers(0, [100, 0, 0, 0]).isError()
+        yield client
+
+
+def test_every_rig_is_served_by_one_of_the_edges(lab: RunningLab) -> None:
+    for port in lab.lab.ports.values():
+        with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
+            assert client.connect()
+            assert len(client.read_holding_registers(4, count=4).registers) == 4
+    shown = top(lab)
+    assert [
+        (row["service"], row["instance"], row["rigs"]) for row in shown["services"] if row["service"] != "recorder"
+    ] == [
+        ("edge", "1", 2),
+        ("edge", "2", 2),
+        ("sim", "1", 4),
+    ]
+    assert all(rig["served"] and rig["simulated"] for rig in shown["rigs"])
+
+
+def test_top_shows_who_holds_a_rig_its_loop_and_that_it_is_recorded(
+    lab: RunningLab, controller: ModbusTcpClient
+) -> None:
+    def shown() -> dict[str, Any] | None:
+        for _ in range(5):
+            controller.read_holding_registers(4, count=4)
+            controller.write_registers(0, [100, 0, 0, 0])
+        rig = rig_of(lab, "rig4")
+        return rig if rig["controller"] and rig["recording"] and rig["loop_samples"] else None
+
+    rig = eventually(shown, timeout_s=20)
+    assert rig["controller"].startswith("127.0.0.1:")
+    assert rig["loop_p50_ms"] >= 15
+    table = hilrig("top", "--once", "--config", lab.config).stdout
+    assert re.search(r"rig4\s+127\.0\.0\.1:\d+", table)
+    assert "edge/2" in table
+
+
+def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
+    port = free_ports(1)
+    command = [*HILRIG, "metrics", "--config", str(lab.config), "--listen", f"127.0.0.1:{port}"]
+    with Popen(command, stdout=PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert f":{port}/metrics" in process.stdout.readline()
+
+        def text() -> str:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
+                return str(answer.read().decode())
+
+        eventually(lambda: text().count("hilrig_up{") >= 4, timeout_s=10, every_s=0.2)
+        assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
+        process.terminate()
+        assert process.wait(10) == 0
+    taken = hilrig("metrics", "--config", lab.config, "--listen", f"127.0.0.1:{lab.port}")
+    assert taken.returncode == 3
+    assert "choose another address with --listen" in taken.stderr
+
+
+def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusTcpClient) -> None:
+    done = hilrig("rig", "add", "guest", "--config", lab.config)
+    assert done.returncode == 0, done.stderr
+    port = int(done.stdout.strip().rpartition(":")[2])
+    with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
+        assert client.connect()
+        for _ in range(20):
+            assert not client.write_registers(0, [800, 0, 0, 0]).isError()
+        eventually(lambda: client.read_holding_registers(4, count=1).registers[0] > 100, timeout_s=5)
+        listed = json.loads(hilrig("rig", "list", "--json", "--config", lab.config).stdout)
+        assert [(row["rig"], row["in_file"]) for row in listed][-1] == ("guest", False)
+        assert hilrig("rig", "reset", "guest", "--config", lab.config).returncode == 0
+        assert client.connected
+        assert hilrig("rig", "remove", "guest", "--config", lab.config).returncode == 0
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=2)
+    # The others did not feel it: the connection and the lease of rig 4 are what they were.
+    assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
+
+
+def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: RunningLab) -> None:
+    for arguments, code, text in [
+        (("add", "rig1"), 2, "the lab has a rig called 'rig1' already"),
+        (("add", "no name"), 2, "name: expected"),
+        (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/1 .* can't listen on"),
+        (("remove", "nobody"), 2, "no running service has a rig called 'nobody'"),
+        (("reset", "nobody"), 2, "no edge serves a rig called 'nobody'"),
+    ]:
+        done = hilrig("rig", *arguments, "--config", lab.config)
+        assert done.returncode == code, done.stderr
+        assert re.search(text, done.stderr)
+    listed = json.loads(hilrig("rig", "list", "--json", "--config", lab.config).stdout)
+    assert [row["rig"] for row in listed] == ["rig1", "rig2", "rig3", "rig4"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("sim", "--instance", "2"), "sim/1 on .* serves rig1, rig2, rig3 and 1 more already; a rig has one sim"),
+        (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* serves rig3 already; a rig has one edge"),
+        (("edge", "--instance", "2", "--rigs", "rig3"), "another edge is called '2' already"),
+    ],
+)
+def test_a_second_service_of_a_rig_refuses(lab: RunningLab, arguments: tuple[str, ...], reason: str) -> None:
+    done = hilrig(*arguments, "--config", lab.config)
+    assert done.returncode == 3
+    assert re.search(reason, done.stderr)
+
+
+def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab, controller: ModbusTcpClient) -> None:
+    first = next(
+        pid
+        for pid in lab.service_pids()
+        if b"rig1,rig2" in Path(f"/proc/{pid}/cmdline").read_bytes() and _is(pid, "edge")
+    )
+    os.kill(first, signal.SIGKILL)
+    eventually(lambda: "edge is started again" in lab.output(), timeout_s=10)
+    assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
+
+    def back() -> bool:
+        with closing(ModbusTcpClient("127.0.0.1", port=lab.port, timeout=1)) as client:
+            return client.connect() and not client.read_holding_registers(4, count=4).isError()
+
+    eventually(back, timeout_s=15, every_s=0.1)
+
+
+def test_logs_are_one_json_object_a_line(lab: RunningLab) -> None:
+    lines = [line for line in lab.output().splitlines() if line.startswith("{")]
+    assert lines
+    for line in lines:
+        assert {"time", "level", "service", "instance", "message"} <= set(json.loads(line))
+
+
+def test_a_lab_that_does_not_run_is_said_so(tmp_path: Path) -> None:
+    config = write_lab(tmp_path)
+    for command in (("top", "--json"), ("rig", "list")):
+        done = hilrig(*command, "--config", config)
+        assert done.returncode == 3
+        assert "nothing is heard of lab 'lab': is it running" in done.stderr
+
+
+def test_more_processes_than_rigs_are_refused(tmp_path: Path) -> None:
+    done = hilrig("up", "--edges", "2", "--config", write_lab(tmp_path))
+    assert done.returncode == 2
+    assert "--edges 2: expected 1 to 1, the number of rigs" in done.stderr
+
+
+def _is(pid: int, service: str) -> bool:
+    return service.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")

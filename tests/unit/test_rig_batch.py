@@ -1,0 +1,113 @@
+"""Messages of many rigs together: recorded each under its own key, the newest kept, nobody speaks for another's rig."""
+
+from collections.abc import Callable
+
+from hilrig_runtime.clock import ManualClock
+from hilrig_runtime.config import parse_lab
+from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.rig_batch import Gatherer
+from hilrig_runtime.service import Service
+from hilrig_schemas import LogBatch, RigBatch
+from hilrig_schemas.topics import COMMANDS, LOG, STATE, STATES
+
+LAB = parse_lab("[rigs]\ncount = 3\n")
+
+
+class Heard:
+    """What was put on a key."""
+
+    def __init__(self, hub: MemoryHub, key: str) -> None:
+        self.payloads: list[bytes] = []
+        MemoryBus(hub).subscribe(key, lambda _, payload: self.payloads.append(payload))
+
+    def batches(self) -> list[dict[str, bytes]]:
+        found = [RigBatch.FromString(payload) for payload in self.payloads]
+        return [dict(zip(batch.rigs, batch.messages, strict=True)) for batch in found]
+
+
+def test_a_batch_is_on_the_bus_and_each_message_on_its_own_key_and_on_the_record() -> None:
+    hub = MemoryHub()
+    together, single = Heard(hub, STATES.key("lab", "*", "*")), Heard(hub, STATE.key("lab", "rig2"))
+    log = Heard(hub, LOG.key("lab", "*", "*"))
+    with Service("sim", LAB, MemoryBus(hub), clock=ManualClock()) as service:
+        sender = service.batch_sender(STATES)
+        for rig in ("rig1", "rig2"):
+            service.add_to_batch(sender, STATE, rig)
+        sender.send([b"one", b"two"])
+        service.add_to_batch(sender, STATE, "rig3")
+        sender.remove(0)
+        sender.send([b"four", b"five"])
+        service.log.flush(0)
+        assert service.counters.published == 4
+    assert together.batches() == [{"rig1": b"one", "rig2": b"two"}, {"rig2": b"four", "rig3": b"five"}]
+    assert single.payloads == [b"two", b"four"]
+    batch = LogBatch.FromString(log.payloads[0])
+    entries = zip((key.split("/")[2] for key in batch.keys), batch.sequences, batch.payloads, strict=True)
+    assert list(entries) == [("rig1", 1, b"one"), ("rig2", 1, b"two"), ("rig2", 2, b"four"), ("rig3", 1, b"five")]
+
+
+def test_of_each_rig_the_newest_is_kept_and_rubbish_is_counted() -> None:
+    hub = MemoryHub()
+    with Service("edge", LAB, MemoryBus(hub), clock=ManualClock()) as service:
+        latest = service.latest_of_batches(STATES)
+        put = MemoryBus(hub).publisher(STATES.key("lab", "sim", "1"), STATES.traffic).put
+        put(RigBatch(rigs=["rig1", "rig2"], messages=[b"a", b"b"]).SerializeToString())
+        first = latest.get("rig1")
+        put(RigBatch(rigs=["rig2"], messages=[b"c"]).SerializeToString())
+        put(b"\xff")
+        put(RigBatch(rigs=["rig1"], messages=[]).SerializeToString())
+        assert latest.get("rig1") is first
+        assert latest.get("rig2").payload == b"c"  # type: ignore[union-attr]
+        assert latest.get("rig3") is None
+        assert (service.counters.received, service.counters.malformed) == (3, 2)
+
+
+def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
+    hub = MemoryHub()
+    with Service("sim", LAB, MemoryBus(hub), clock=ManualClock()) as service:
+        latest = service.latest_of_batches(COMMANDS, {"east": ("rig1",), "west": ("rig2",)})
+        for instance, payload in (("east", b"e"), ("stranger", b"s")):
+            batch = RigBatch(rigs=["rig1", "rig2"], messages=[payload, payload])
+            MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", instance), COMMANDS.traffic).put(
+                batch.SerializeToString()
+            )
+        assert latest.get("rig1").payload == b"e"  # type: ignore[union-attr]
+        assert latest.get("rig2") is None
+
+
+def test_where_few_rigs_speak_each_message_leaves_at_once() -> None:
+    hub, waiting = MemoryHub(), list[Callable[[], None]]()
+    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
+    gatherer = Gatherer(
+        "edge/1", MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic), waiting.append
+    )
+    # However often: one controller that writes as fast as it can must not wait.
+    for _ in range(100):
+        gatherer.add("rig1", b"x")
+    gatherer.look()
+    gatherer.add("rig1", b"y")
+    assert len(heard.payloads) == 101
+    assert waiting == []
+
+
+def test_where_many_rigs_speak_those_of_a_short_while_leave_together() -> None:
+    hub, waiting = MemoryHub(), list[Callable[[], None]]()
+    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
+    gatherer = Gatherer(
+        "edge/1", MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic), waiting.append
+    )
+    for number in range(Gatherer.MANY):
+        gatherer.add(f"rig{number}", b"x")
+    gatherer.look()
+    heard.payloads.clear()
+    gatherer.add("rig1", b"a")
+    gatherer.add("rig2", b"b")
+    assert heard.payloads == []
+    assert len(waiting) == 1
+    waiting.pop()()
+    assert heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
+    # Fewer speak again: what waits is sent, and nothing waits any more.
+    gatherer.add("rig1", b"c")
+    gatherer.look()
+    gatherer.add("rig1", b"d")
+    assert [batch["rig1"] for batch in heard.batches()[1:]] == [b"c", b"d"]
