@@ -22,8 +22,8 @@ static const double MOVE_EVERY = 4.0;  /* s in each pose */
 static const double POSE[POSES][JOINTS] = {{30, -45, 50, 20}, {-20, 60, 120, -30}}; /* degrees, degrees, mm, degrees */
 
 /* What one degree (mm) of error, and one degree (mm) a second of speed, is worth; N·m and N. */
-static const double KP[JOINTS] = {0.40, 0.25, 0.03, 0.004};
-static const double KD[JOINTS] = {0.08, 0.05, 0.002, 0.0005};
+static const double KP[JOINTS] = {0.25, 0.25, 0.03, 0.004};
+static const double KD[JOINTS] = {0.04, 0.03, 0.002, 0.0005};
 /* The quill hangs on joint 3, which counts positive downwards: its weight is carried with a force upwards. */
 static const double GRAVITY[JOINTS] = {0, 0, -0.5 * 9.81, 0};
 /* Errors that count no further: the arm does not leap at a far goal. */

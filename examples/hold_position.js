@@ -17,8 +17,8 @@ const POSES = [
 ]; // degrees, degrees, mm, degrees
 
 // What one degree (mm) of error, and one degree (mm) a second of speed, is worth; N·m and N.
-const KP = [0.4, 0.25, 0.03, 0.004];
-const KD = [0.08, 0.05, 0.002, 0.0005];
+const KP = [0.25, 0.25, 0.03, 0.004];
+const KD = [0.04, 0.03, 0.002, 0.0005];
 // The quill hangs on joint 3, which counts positive downwards: its weight is carried with a force upwards.
 const GRAVITY = [0, 0, -0.5 * 9.81, 0];
 // Errors that count no further: the arm does not leap at a far goal.

@@ -18,8 +18,8 @@ POSES = [(30.0, -45.0, 50.0, 20.0), (-20.0, 60.0, 120.0, -30.0)]  # degrees, deg
 MOVE_EVERY = 4.0  # s in each pose
 
 # What one degree (mm) of error, and one degree (mm) a second of speed, is worth; N·m and N.
-KP = (0.40, 0.25, 0.03, 0.004)
-KD = (0.08, 0.05, 0.002, 0.0005)
+KP = (0.25, 0.25, 0.03, 0.004)
+KD = (0.04, 0.03, 0.002, 0.0005)
 # The quill hangs on joint 3, which counts positive downwards: its weight is carried with a force upwards.
 GRAVITY = (0.0, 0.0, -0.5 * 9.81, 0.0)
 # Errors that count no further: the arm does not leap at a far goal.
