@@ -1,0 +1,105 @@
+"""Controllers come and go, well and badly: the edge's handles and memory stay what they were.
+
+Always a few hundred connections; with HILRIG_LONG=1 ten thousand over ten minutes.
+"""
+
+import contextlib
+import os
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from labs import RunningLab, write_lab
+from waiting import eventually
+
+pytestmark = [
+    pytest.mark.rig,
+    pytest.mark.skipif(sys.platform != "linux", reason="counts handles and memory in /proc"),
+]
+
+READ = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
+WRITE = struct.pack(">HHHBBHH", 2, 0, 6, 1, 6, 0, 0)
+NO_MODBUS = b"GET / HTTP/1.1\r\n\r\n"
+MIB = 2**20
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[RunningLab]:
+    with RunningLab(write_lab(tmp_path, extra="edge.session_grace_ms = 100")) as running:
+        yield running
+
+
+def come_and_go(port: int, number: int) -> None:
+    """One connection; every so often one that writes, sends nonsense, half a request, or is torn off."""
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as client:
+        manner = number % 10
+        if manner == 1:
+            client.sendall(NO_MODBUS)
+        elif manner == 2:
+            client.sendall(READ[:7])
+        elif manner == 3:
+            client.sendall(READ)
+            # Reset instead of closed, with an answer on its way.
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            return
+        elif manner == 4:
+            client.sendall(WRITE)
+        else:
+            client.sendall(READ)
+        client.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(ConnectionResetError):
+            while client.recv(300):
+                pass
+
+
+def handles(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def resident(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def churn(lab: RunningLab, connections: int, seconds: float) -> tuple[int, int]:
+    """Handles and bytes that the edge has more after so many connections, after as many to warm up as a tenth."""
+    pid = lab.service_pid("edge")
+    for number in range(max(200, connections // 10)):
+        come_and_go(lab.port, number)
+    before_handles, before_bytes = settled(pid), resident(pid)
+    begin_s = time.monotonic()
+    for number in range(connections):
+        come_and_go(lab.port, number)
+        # Spread over the time: what grows with time alone shows as well.
+        time.sleep(max(0.0, begin_s + (number + 1) * seconds / connections - time.monotonic()))
+    return settled(pid) - before_handles, resident(pid) - before_bytes
+
+
+def settled(pid: int) -> int:
+    """Handles, once two looks agree."""
+    return eventually(lambda: (first := handles(pid)) == (time.sleep(0.1), handles(pid))[1] and first)
+
+
+def test_a_few_hundred_connections_leave_nothing_behind(lab: RunningLab) -> None:
+    more_handles, more_bytes = churn(lab, 600, 0.0)
+    assert more_handles <= 0
+    assert more_bytes < 4 * MIB
+    assert "Traceback" not in lab.output()
+
+
+@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes ten minutes: set HILRIG_LONG=1")
+@pytest.mark.timeout(900)
+def test_ten_thousand_connections_over_ten_minutes_leave_nothing_behind(
+    lab: RunningLab, record_property: Callable[[str, object], None]
+) -> None:
+    more_handles, more_bytes = churn(lab, 10_000, 600.0)
+    record_property("handles", more_handles)
+    record_property("bytes", more_bytes)
+    print(f"10,000 connections over 600 s: {more_handles:+d} handles, {more_bytes / MIB:+.2f} MiB")
+    assert more_handles <= 0
+    assert more_bytes < 2 * MIB
+    assert "Traceback" not in lab.output()
