@@ -227,6 +227,11 @@ def test_a_schedule_is_followed_and_on_the_record(sessions: dict[str, Session]) 
     ]
 
 
+def test_an_impaired_run_is_simulated_again_to_the_last_bit(sessions: dict[str, Session]) -> None:
+    done = hilrig("verify", sessions["lossy"].run.path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_a_recording_can_be_the_trace_of_another_loop(sessions: dict[str, Session], lab_folder: Path) -> None:
     from hilrig_replay.delay_trace import delay_trace
 
