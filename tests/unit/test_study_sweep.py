@@ -229,6 +229,17 @@ def test_the_command_leaves_table_json_pictures_and_a_rerun_file(tmp_path: Path)
     assert RrdFile(out / "study.rrd").rows("/trace/A/error/θ1") == 150
 
 
+def test_a_students_file_can_be_named_on_the_command_line(tmp_path: Path) -> None:
+    path, example = write(tmp_path), ROOT / "examples" / "controllers" / "pd.py"
+    arguments = ["study", str(path), "--controller", str(example), "--out", str(tmp_path / "out"), "--json"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    controllers = json.loads(done.stdout)["controllers"]
+    assert [controller["name"] for controller in controllers] == ["PD", "pd"]
+    assert controllers[1]["theory"] == []
+    assert (tmp_path / "out" / "plane-2.png").exists()
+
+
 def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     path = write(tmp_path)
     for arguments, said in (

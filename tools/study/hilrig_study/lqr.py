@@ -23,7 +23,7 @@ Vector4 = tuple[float, float, float, float]
 POSITION_SCALE: Final = np.array([np.radians(1.0), np.radians(1.0), 1e-3, np.radians(1.0)])
 """An error that weighs 1: 1° or 1 mm."""
 VELOCITY_SCALE: Final = 10 * POSITION_SCALE
-MOST_LATENCY_S: Final = 0.4
+MOST_LATENCY_S: Final = 0.3
 """Loop latencies up to this are compensated; of longer ones, so much."""
 
 

@@ -227,6 +227,11 @@ class StudyConfig(Section):
             raise ValueError(f"{cells:,} runs are more than {MOST_CELLS:,}: take fewer values")
         return self
 
+    def with_files(self, paths: Sequence[Path]) -> "StudyConfig":
+        """The same with more controllers, each out of a Python file and called like it."""
+        more = [ControllerConfig(name=path.stem[:40], kind="file", file=path.resolve()) for path in paths]
+        return self.model_copy(update={"controllers": (*self.controllers, *more)})
+
     def rig(self, step_ms: float | None = None) -> RigParameters:
         """The arm's parameters with this step; it starts where the task does, with nothing around it.
 

@@ -129,7 +129,9 @@ def cells_of(study: StudyConfig) -> NDArray[np.void]:
     if "poll_ms" not in (study.x.what, study.y.what) and study.loop.poll_ms == study.loop.step_ms:
         # A loop that polls once a step goes on doing so.
         cells["poll_ms"] = cells["step_ms"]
-    return cells
+    # Where nothing is drawn, a second run would be the first again.
+    chosen: NDArray[np.void] = cells[(cells["run"] == 0) | ~_constant(study, cells)]
+    return chosen
 
 
 def run_cells(

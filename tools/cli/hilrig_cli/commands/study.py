@@ -17,6 +17,12 @@ def study(
         Path | None, typer.Argument(metavar="STUDY.TOML", help="What is swept (docs/studies.md).", show_default=False)
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("study-out"),
+    controller: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.PY", help="Sweep this controller too: a file with a class Controller.", show_default=False
+        ),
+    ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Run the study's live points over Modbus TCP too, on a lab of its own.")
     ] = False,
@@ -48,7 +54,7 @@ def study(
         return
     if file is None:
         raise InputError("name a study's file, or a recording with --from; examples/studies has one to start from")
-    said = _sweep(file, out, live, console)
+    said = _sweep(file, controller or [], out, live, console)
     if as_json:
         print(json.dumps(said))
     else:
@@ -57,7 +63,7 @@ def study(
         raise typer.Exit(1)
 
 
-def _sweep(file: Path, out: Path, live: bool, console: "Console") -> dict[str, Any]:
+def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: "Console") -> dict[str, Any]:
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_runtime.errors import InputError, OperationError
@@ -67,7 +73,7 @@ def _sweep(file: Path, out: Path, live: bool, console: "Console") -> dict[str, A
     from hilrig_study.study_config import load_study
     from hilrig_study.sweep import sweep
 
-    chosen = load_study(file)
+    chosen = load_study(file).with_files(controllers)
     if live and not chosen.live:
         raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
     try:
