@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from hilrig_replay.latency_plot import save_figure
 from hilrig_replay.palette import INK, RUN_COLORS
+from hilrig_study.gain_theory import GainTheory
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
-from hilrig_study.sweep import GainTheory, SweepResult, cell_at, run_cells
+from hilrig_study.sweep import SweepResult, cell_at, run_cells
 
 Floats = NDArray[np.float64]
 

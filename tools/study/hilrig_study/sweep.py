@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from hilrig_modbus_edge.impairment import Impairment
 from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
-from hilrig_study.controllers import LawController
-from hilrig_study.margins import Margins, linearise_law, margins, spectral_radius
-from hilrig_study.margins import loop_matrix as closed_loop
+from hilrig_study.gain_theory import GainTheory, gain_theory
 from hilrig_study.plants import ArmPlant, LinearArms, StudyPlant
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.timing import LoopTiming, Timeline, poll_count, timeline
@@ -61,22 +59,6 @@ RESULT: Final = np.dtype(
     ]
 )
 """What a run did; units as in `Outcome`."""
-
-
-@dataclass(frozen=True, slots=True)
-class GainTheory:
-    """What theory says of one controller at one gain, step and period."""
-
-    controller: int
-    gain: float
-    step_ms: float
-    poll_ms: float
-    stable_until_ms: float
-    """Largest constant delay that can be added to the command's way before the loop is unstable; -1: it is, without
-    any; inf: more than was looked at."""
-    nominal: Margins | None
-    """At the loop's own latency; None: the controller does not poll once a step."""
-    nominal_latency_ms: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,57 +191,6 @@ def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, t
     return lines
 
 
-def gain_theory(
-    study: StudyConfig, controller: int, gain: float, step_ms: float, poll_ms: float, delays_ms: Sequence[float]
-) -> _Theory | None:
-    """Theory of one controller at one gain, and the spectral radius at each constant added delay; None: it has no law.
-
-    The arm is discretised as the study steps it: by the simulation's integrator, or exactly.
-    """
-    rig, near = study.rig(step_ms), study.near()
-    timing = study.loop.timing(step_ms, poll_ms)
-    config = study.controllers[controller]
-    built = config.build(rig, near, timing.period_ns * 1e-9, np.array([gain])) if config.kind != "file" else None
-    if not isinstance(built, LawController):
-        return None
-    method, substeps = (rig.sim.integrator, rig.sim.substeps) if study.plant == "arm" else ("exact", 1)
-    phi, gamma = near.discretise(timing.step_ns * 1e-9, method, substeps)
-    by_pattern: dict[tuple[int, ...], float] = {}
-
-    def radius(delay_ms: float) -> float:
-        delay_ns = round(delay_ms * 1e6)
-        polls = range(math.lcm(timing.step_ns, timing.period_ns) // timing.period_ns)
-        pattern = tuple(timing.acts(poll, delay_ns) for poll in polls)
-        if pattern not in by_pattern:
-            latency_s = timing.latency_steps(0, delay_ns)[1] * timing.step_ns * 1e-9
-            law = linearise_law(built, near, timing.period_ns * 1e-9, latency_s)
-            by_pattern[pattern] = spectral_radius(closed_loop(phi, gamma, law, timing, 0, delay_ns))
-        return by_pattern[pattern]
-
-    radii = {delay_ms: radius(delay_ms) for delay_ms in delays_ms}
-    unstable = [delay_ms for delay_ms in sorted(radii) if radii[delay_ms] >= 1.0 - 1e-9]
-    # The boundary is a tick's: the last delay before the one from which the command comes a tick later.
-    until = math.inf if not unstable else _last_stable(radius, unstable[0])
-    steps = timing.latency_steps()[1]
-    nominal = None
-    if timing.period_ns == timing.step_ns:
-        law = linearise_law(built, near, timing.period_ns * 1e-9, steps * timing.step_ns * 1e-9)
-        nominal = margins(phi, gamma, law, timing, steps)
-    found = GainTheory(controller, gain, step_ms, poll_ms, until, nominal, steps * timing.step_ns / 1e6)
-    return found, radii
-
-
-def _last_stable(radius: Callable[[float], float], unstable_ms: float) -> float:
-    """Largest stable delay below an unstable one, ms, to 10 µs; -1: there is none."""
-    if radius(0.0) >= 1.0 - 1e-9:
-        return -1.0
-    low, high = 0.0, unstable_ms
-    while high - low > 0.01:
-        middle = (low + high) / 2
-        low, high = (middle, high) if radius(middle) < 1.0 - 1e-9 else (low, middle)
-    return low
-
-
 def sweep(
     study: StudyConfig, folder: Path, tick: Callable[[float], None], *, workers: int | None = None, theory: bool = True
 ) -> SweepResult:
@@ -269,7 +200,7 @@ def sweep(
         study: the study.
         folder: of the study's file: students' files are named from there.
         tick: hears the share of the work that is done.
-        workers: processes; default: one a core. 1 runs in this one.
+        workers: processes; default: one a core.
         theory: whether theory is asked too.
 
     Raises:
