@@ -57,15 +57,22 @@ class BatchSender:
 class Gatherer:
     """Sends messages of single rigs as they come; where many rigs speak, those of a short while together.
 
-    `later` is asked to call a function in that while.
+    `later` is asked to call a function in that while; `urgent` says that even so nothing may wait now.
     """
 
     MANY: Final = 32
     """Rigs that spoke since the last `look`."""
 
-    def __init__(self, source: str, together: Publisher, later: Callable[[Callable[[], None]], object]) -> None:
+    def __init__(
+        self,
+        source: str,
+        together: Publisher,
+        later: Callable[[Callable[[], None]], object],
+        urgent: Callable[[], bool],
+    ) -> None:
         self._put = together.put
         self._later = later
+        self._urgent = urgent
         self._batch = RigBatch(source=source)
         self._spoke: set[str] = set()
         self._waits = False
@@ -76,7 +83,7 @@ class Gatherer:
         batch.rigs.append(rig)
         batch.messages.append(payload)
         self._spoke.add(rig)
-        if not self._waits:
+        if not self._waits or self._urgent():
             self.flush()
         elif len(batch.rigs) == 1:
             self._later(self.flush)

@@ -74,6 +74,8 @@ class LatestOfBatches:
     """
 
     def __init__(self, clock: Clock, counters: Counters, permitted: Mapping[str, Collection[str]]) -> None:
+        self.arrived_ns = 0
+        """When the newest batch came, ns, monotonic clock; 0: none has."""
         self._permitted = permitted
         self._by_rig: dict[str, Arrival] = {}
         self._monotonic_ns = clock.monotonic_ns
@@ -101,6 +103,7 @@ class LatestOfBatches:
             rigs = self._permitted.get(key.rpartition("/")[2], ())
             arrivals = ((rig, arrival) for rig, arrival in arrivals if rig in rigs)
         self._by_rig.update(arrivals)
+        self.arrived_ns = arrived_ns
         self._counters.received += len(batch.messages)
 
 
@@ -247,11 +250,16 @@ class Service:
         self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, waiting))
         return values
 
-    def gatherer(self, topic: ServiceTopic[RigBatch], later: Callable[[Callable[[], None]], object]) -> Gatherer:
+    def gatherer(
+        self,
+        topic: ServiceTopic[RigBatch],
+        later: Callable[[Callable[[], None]], object],
+        urgent: Callable[[], bool],
+    ) -> Gatherer:
         """An end that sends single messages, together where they are many; see `Gatherer`."""
         key = topic.key(self.lab.name, self.name, self.instance)
         together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return Gatherer(self.source, together, later)
+        return Gatherer(self.source, together, later, urgent)
 
     def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
         """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""

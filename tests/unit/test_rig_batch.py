@@ -79,7 +79,10 @@ def test_where_few_rigs_speak_each_message_leaves_at_once() -> None:
     hub, waiting = MemoryHub(), list[Callable[[], None]]()
     heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
     gatherer = Gatherer(
-        "edge/1", MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic), waiting.append
+        "edge/1",
+        MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic),
+        waiting.append,
+        lambda: False,
     )
     # However often: one controller that writes as fast as it can must not wait.
     for _ in range(100):
@@ -94,7 +97,10 @@ def test_where_many_rigs_speak_those_of_a_short_while_leave_together() -> None:
     hub, waiting = MemoryHub(), list[Callable[[], None]]()
     heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
     gatherer = Gatherer(
-        "edge/1", MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic), waiting.append
+        "edge/1",
+        MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic),
+        waiting.append,
+        lambda: False,
     )
     for number in range(Gatherer.MANY):
         gatherer.add(f"rig{number}", b"x")
@@ -111,3 +117,18 @@ def test_where_many_rigs_speak_those_of_a_short_while_leave_together() -> None:
     gatherer.look()
     gatherer.add("rig1", b"d")
     assert [batch["rig1"] for batch in heard.batches()[1:]] == [b"c", b"d"]
+
+
+def test_what_is_urgent_does_not_wait_and_takes_along_what_waits() -> None:
+    hub, waiting, urgent = MemoryHub(), list[Callable[[], None]](), [False]
+    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
+    publisher = MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic)
+    gatherer = Gatherer("edge/1", publisher, waiting.append, lambda: urgent[0])
+    for number in range(Gatherer.MANY):
+        gatherer.add(f"rig{number}", b"x")
+    gatherer.look()
+    heard.payloads.clear()
+    gatherer.add("rig1", b"a")
+    urgent[0] = True
+    gatherer.add("rig2", b"b")
+    assert heard.batches() == [{"rig1": b"a", "rig2": b"b"}]

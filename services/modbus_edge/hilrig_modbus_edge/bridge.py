@@ -35,8 +35,12 @@ TRAFFIC_PERIOD_NS: Final = 200_000_000
 FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 """How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
 
-GATHER_S: Final = 0.0005
-"""For so long commands wait for each other where many rigs are commanded."""
+GATHER_S: Final = 0.002
+"""For so long commands wait for each other where many rigs are commanded, if the next tick is far enough."""
+MANY: Final = 16
+"""Rigs that are looked after at once; more than that in turns, so that no request waits for all of them."""
+MOST_TURNS: Final = 4
+"""In which every rig is looked after once in a tick."""
 ANSWER_TIMEOUT_S: Final = 1.0
 
 
@@ -115,6 +119,7 @@ class _Seat:
         self.server = server
         self.closing = ExitStack()
         self.sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
+        self.traffic_due_ns = 0
 
 
 class Edge:
@@ -123,12 +128,15 @@ class Edge:
     def __init__(self, service: Service) -> None:
         self.service = service
         self._states = service.latest_of_batches(topics.STATES)
-        self.commands = service.gatherer(topics.COMMANDS, self._soon)
+        self.commands = service.gatherer(topics.COMMANDS, self._soon, self._tick_is_near)
         self._seats: dict[str, _Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
+        now_ns = service.clock.monotonic_ns()
+        for number, seat in enumerate(self._seats.values()):
+            # Apart from each other: to encode the requests of all rigs at once would hold the next one up.
+            seat.traffic_due_ns = now_ns + number * TICK_NS
         service.counters.rigs = len(service.rigs)
         service.health.rig_reports = self._rig_reports
         service.addresses = self._address_of
-        self._traffic_due_ns = 0
         self._control: Handle | None = None
         self.alarm: Alarm
 
@@ -273,27 +281,39 @@ class Edge:
             now_ns = monotonic_ns()
             missed = max(0, (now_ns - deadline_ns) // TICK_NS)
             counters.count_tick(Tick(deadline_ns, max(0, now_ns - deadline_ns), missed), TICK_NS)
+            seats = list(self._seats.values())
+            turns = min(MOST_TURNS, 1 + len(seats) // MANY)
+            for turn in range(turns):
+                if turn:
+                    turn_ns = deadline_ns + turn * TICK_NS // turns
+                    await asyncio.sleep(max(0, turn_ns - monotonic_ns()) * 1e-9)
+                self._look_after(seats[turn::turns], monotonic_ns())
+            self.commands.look()
+            service.beat(monotonic_ns())
             deadline_ns += (missed + 1) * TICK_NS
-            self._do_due(now_ns)
 
-    def _do_due(self, now_ns: int) -> None:
-        traffic_due = now_ns >= self._traffic_due_ns
-        if traffic_due:
-            self._traffic_due_ns = now_ns + TRAFFIC_PERIOD_NS
-        for seat in self._seats.values():
+    def _look_after(self, seats: list[_Seat], now_ns: int) -> None:
+        for seat in seats:
             server = seat.server
             server.device.check(now_ns)
             if server.connections:
                 server.device.look()
                 server.close_idle(now_ns)
-            if server.traffic.count and (traffic_due or server.traffic.count >= MOST):
+            if server.traffic.count and (now_ns >= seat.traffic_due_ns or server.traffic.count >= MOST):
+                seat.traffic_due_ns += TRAFFIC_PERIOD_NS * (
+                    1 + max(0, now_ns - seat.traffic_due_ns) // TRAFFIC_PERIOD_NS
+                )
                 self._send_traffic(seat, now_ns)
-        self.commands.look()
-        self.service.beat(now_ns)
 
     @staticmethod
     def _soon(call: Callable[[], None]) -> None:
         asyncio.get_running_loop().call_later(GATHER_S, call)
+
+    def _tick_is_near(self) -> bool:
+        """Whether a command that waits now could miss the simulation's next tick."""
+        step_ns = self.service.lab.sim.step_ns
+        since_ns = self.service.clock.monotonic_ns() - self._states.arrived_ns
+        return since_ns > step_ns - step_ns // 4
 
     def _rig_reports(self) -> list[RigReport]:
         statuses = [seat.wire.device.lease_status() for seat in self._seats.values()]
