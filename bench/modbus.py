@@ -83,8 +83,19 @@ def measure(report: Report, quick: bool) -> None:
     report.bar("whole edge against libmodbus, 2 connections", at_two[WHOLE] / at_two[C_SERVER], ">=", 0.33)
     slow = middle(measured[WHOLE, 2], "read_us", "p99") / middle(measured[C_SERVER, 2], "read_us", "p99")
     report.bar("p99 of a read, whole edge against libmodbus, 2 connections", slow, "<=", 2.0)
+    measure_at_50_hz(report, client, servers, 2.0 if quick else 10.0)
     measure_own_code(report, middle(measured[ALONE, 2], "cpu_us"), middle(measured[WHOLE, 2], "cpu_us"))
     measure_resources(report, client, quick)
+
+
+def measure_at_50_hz(report: Report, client: Path, servers: dict[str, Callable[[int], Any]], seconds: float) -> None:
+    """What a controller at the rig's own rate sees, where nobody is in a hurry."""
+    for name in (C_SERVER, WHOLE):
+        progress(f"{name}, 2 connections at 50 Hz")
+        with servers[name](2) as (port, step, _):
+            figures = ask(client, port, step, 2, seconds, 50.0)
+        for share in ("p50", "p99"):
+            report.add(f"{name}, 2 connections at 50 Hz", f"read {share}", figures["read_us"][share], "µs")
 
 
 def measure_own_code(report: Report, alone_us: float, whole_us: float) -> None:
@@ -139,11 +150,16 @@ def measure_resources(report: Report, client: Path, quick: bool) -> None:
             report.add(case, "memory", resident(pid) / 2**20, "MiB")
         progress(f"{connections} connections")
         subprocess.run([client, "churn", str(port), str(connections)], check=True, stdout=subprocess.DEVNULL)
-        before_bytes = resident(pid)
+        before_bytes, before_handles = resident(pid), handles(pid)
         subprocess.run([client, "churn", str(port), str(connections)], check=True, stdout=subprocess.DEVNULL)
+        # What the last ones left is closed at the loop's next turns.
+        time.sleep(0.5)
         grown = (resident(pid) - before_bytes) / 2**20
+        more_handles = handles(pid) - before_handles
         report.add(f"{connections:,} connections", "memory grown", grown, "MiB")
+        report.add(f"{connections:,} connections", "handles more", more_handles, "count")
         report.bar(f"memory grown over {connections:,} connections", grown, "<=", 1.0, "MiB")
+        report.bar(f"handles more after {connections:,} connections", more_handles, "<=", 0, "count")
 
 
 def ask(client: Path, port: int, step: int, connections: int, seconds: float, rate: float = 0.0) -> Figures:
@@ -330,6 +346,10 @@ def wait_for_end(control: Connection) -> None:
 def cpu_seconds(pid: int) -> float:
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def handles(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
 def resident(pid: int) -> int:

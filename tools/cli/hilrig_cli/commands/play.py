@@ -60,8 +60,8 @@ def _bus(lab: "LabConfig", rig: str) -> "Bus":
                 f"a lab runs here already (bus.first_port {lab.bus.first_port}): stop it first, or play with "
                 "a --config whose bus.first_port is another"
             ) from error
-    bus = ZenohBus(lab.bus, "tool")
-    if bus.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
-        bus.close()
-        raise OperationError(f"rig {rig} runs in lab {lab.name}: play it as another with --rig")
-    return bus
+    with ZenohBus(lab.bus, "tool") as asking:
+        if asking.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
+            raise OperationError(f"rig {rig} runs in lab {lab.name}: play it as another with --rig")
+    # On a secured bus nobody else may say states.
+    return ZenohBus(lab.bus, "sim")
