@@ -37,13 +37,21 @@ SENT = [
     *(f"{service}/event" for service in ("sim", "edge", "recorder")),
     *(f"{topic}/{service}/1" for topic in ("log", "health") for service in ("sim", "edge", "recorder")),
     "states/sim/1",
+    "commands/edge/east",
+    "commands/edge/west",
 ]
 _EVENTS = {key for key in SENT if key.endswith("/event")}
 _LOGS = {key for key in SENT if key.startswith("log/")}
+
+
+def _of_edge(name: str, rig: str) -> set[str]:
+    return {f"{rig}/command", f"{rig}/event", f"{rig}/traffic", f"commands/edge/{name}"}
+
+
 MAY_SEND: dict[str, set[str]] = {
     "sim": {"rig1/state", "rig2/state", "states/sim/1", "log/sim/1", "health/sim/1", *_EVENTS},
-    "east": {"rig1/command", "rig1/event", "rig1/traffic", "edge/event", "log/edge/1", "health/edge/1"},
-    "west": {"rig2/command", "rig2/event", "rig2/traffic", "edge/event", "log/edge/1", "health/edge/1"},
+    "east": {*_of_edge("east", "rig1"), "edge/event", "log/edge/1", "health/edge/1"},
+    "west": {*_of_edge("west", "rig2"), "edge/event", "log/edge/1", "health/edge/1"},
     "recorder": {"log/recorder/1", "health/recorder/1", *_EVENTS},
     "operator": set(),
     "viewer": set(),
@@ -52,7 +60,7 @@ MAY_SEND: dict[str, set[str]] = {
 _HEALTHS = {key for key in SENT if key.startswith("health/")}
 _STATES = {"rig1/state", "rig2/state", "states/sim/1"}
 MAY_READ: dict[str, set[str]] = {
-    "sim": {"rig1/command", "rig2/command", *_HEALTHS},
+    "sim": {"rig1/command", "rig2/command", "commands/edge/east", "commands/edge/west", *_HEALTHS},
     "east": _STATES | _HEALTHS,
     "west": _STATES | _HEALTHS,
     "recorder": _EVENTS | _LOGS | _HEALTHS,

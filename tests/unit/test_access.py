@@ -6,9 +6,13 @@ import pytest
 
 from hilrig_runtime.access import RULES, access_control
 from hilrig_runtime.bus_config import BusTlsConfig
+from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_schemas.topics import all_topics
+from hilrig_runtime.health import Counters
+from hilrig_runtime.service import LatestOfBatches
+from hilrig_schemas import RigBatch
+from hilrig_schemas.topics import COMMANDS, all_topics
 
 TLS = BusTlsConfig(edges={"east": ("rig1", "rig2"), "west": ("rig3",)})
 
@@ -29,6 +33,7 @@ def test_every_topic_has_a_rule_and_every_rule_a_topic() -> None:
 
 
 def test_an_edge_commands_its_own_rigs_only() -> None:
+    assert {key for key in granted("east", "ingress", "put") if "/commands/" in key} == {"hil/lab/commands/edge/east"}
     assert {key for key in granted("east", "ingress", "put") if key.endswith("/command")} == {
         "hil/lab/rig1/command",
         "hil/lab/rig2/command",
@@ -59,6 +64,19 @@ def test_every_rule_belongs_to_one_identity() -> None:
     ids = [rule["id"] for rule in section["rules"]]
     assert len(ids) == len(set(ids))
     assert sorted(ids) == sorted(rule for policy in section["policies"] for rule in policy["rules"])
+
+
+def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
+    def heard(permitted: dict[str, tuple[str, ...]], instance: str) -> set[str]:
+        commands = LatestOfBatches(ManualClock(), Counters(), permitted)
+        batch = RigBatch(rigs=["rig1", "rig3"], messages=[b"one", b"three"])
+        commands.on_message(COMMANDS.key("lab", "edge", instance), batch.SerializeToString())
+        return {rig for rig in ("rig1", "rig3") if commands.get(rig) is not None}
+
+    assert heard(dict(TLS.edges), "east") == {"rig1"}
+    assert heard(dict(TLS.edges), "west") == {"rig3"}
+    assert heard(dict(TLS.edges), "stranger") == set()
+    assert heard({}, "1") == {"rig1", "rig3"}
 
 
 @pytest.mark.parametrize(
