@@ -112,7 +112,7 @@ def test_the_tracking_error_of_a_path_is_the_distance_from_it() -> None:
     assert grade.path is not None
     assert grade.path.length_m == pytest.approx(0.4)
     assert (grade.path.covered, grade.passed) == (1.0, True)
-    assert grade.path.rms_mm == grade.path.largest_mm == pytest.approx(2.0)
+    assert (grade.path.rms_mm, grade.path.largest_mm) == pytest.approx((2.0, 2.0))
     assert grade.path.done_s == pytest.approx(4.0, abs=0.1)
 
 
@@ -127,6 +127,32 @@ def test_a_path_that_is_left_or_cut_short_is_not_followed() -> None:
     assert graded({"path": {"points_mm": SQUARE}}, across).path.done_s is None
     never = graded({"path": {"points_mm": SQUARE}}, half + np.array([0, 0, 0.05])).path
     assert (never.began_s, never.rms_mm) == (None, None)
+
+
+def test_the_tracking_error_ends_where_the_tool_leaves_the_path_for_good() -> None:
+    away = np.linspace([0.3, 0.1, 0.002], [0.3, 0.5, 0.3], 40)
+    way = np.concatenate((along(SQUARE[:3], 0.1, aside_mm=2.0), away))
+    path = graded({"path": {"points_mm": SQUARE}}, way).path
+    assert path is not None
+    assert path.rms_mm == pytest.approx(2.0, abs=0.2)
+    assert path.largest_mm is not None
+    assert path.largest_mm < 6.0
+
+
+def test_a_short_path_may_be_passed_in_a_few_states() -> None:
+    short = [[376, 137, 25], [376, 137, -28]]
+    way = along(short, 0.7)
+    assert len(way) < 6
+    path = graded({"path": {"points_mm": short, "tolerance_mm": 3}}, way).path
+    assert path is not None
+    assert path.done_s is not None
+
+
+def test_nothing_less_than_all_is_a_hundred_per_cent() -> None:
+    poses = [{"name": f"p{number}", "position_mm": [200 + number, 0, 0], "hold_s": 0.02} for number in range(99)]
+    grade = graded({"poses": poses, "path": {"points_mm": SQUARE}}, np.tile([0.2, 0.0, 0.0], (30, 1)))
+    assert grade.percent < 100
+    assert graded({"poses": poses[:1]}, np.tile([0.2, 0.0, 0.0], (30, 1))).percent == 100
 
 
 def test_a_grade_does_not_depend_on_the_pieces_in_which_a_run_is_read() -> None:
@@ -162,7 +188,7 @@ def test_parts_count_when_they_were_let_go_in_time_and_stand_right() -> None:
 def test_what_comes_after_the_time_limit_does_not_count() -> None:
     task = STEP_RESPONSE | {"time_limit_s": 0.5}
     grade = graded(task, second_order(0.7, 5.0, 6.0))
-    assert (grade.score, grade.headline()) == (0.0, "0% of the goals within 0.5 s")
+    assert (grade.score, grade.headline()) == (0.0, "0 of 1 goals within 0.5 s")
 
 
 TASK = """
@@ -190,7 +216,7 @@ def test_a_recording_is_graded_by_the_task_that_it_carries(tmp_path: Path) -> No
     assert (plain["title"], plain["parts"][0]["placed"]) == ("Two corners", False)
     page = report([path]).html
     assert "Two corners" in page
-    assert "50% of the goals" in page
+    assert "1 of 2 goals" in page
     # A teacher's other task, given afterwards.
     lab = tmp_path / "other.toml"
     lab.write_text("[[task.poses]]\nname = 'far'\nposition_mm = [-300, 0, 0]\n")

@@ -29,7 +29,7 @@ def test_every_block_of_the_page_runs(
         "SESSION_START",
         "reads a second",
         "fit: False",
-        "of the goals, ",
+        "% of the task, ",
         "J into the arm",
     ):
         assert words in printed, words

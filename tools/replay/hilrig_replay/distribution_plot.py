@@ -36,7 +36,7 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
     _bars(work, rows, [run.motion.work_j for run in runs])
     label(work, "Work of the drives, J", "", "")
     _boxes(loop, runs)
-    label(loop, "Loop latency, ms (box: quartiles, whiskers: p1, p99)", "", "")
+    label(loop, "Loop latency, ms", "box: quartiles, whiskers: p1 and p99", "")
     names = [run.session for run in runs] if len(runs) <= _NAMED else [str(row + 1) for row in rows]
     goals.set_yticks(rows, names, fontsize=7, color=INK)
     goals.set_ylim(len(runs) - 0.4, -0.6)
@@ -46,7 +46,10 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
 def _bars(axes: Axes, rows: np.ndarray, values: Sequence[float | None]) -> None:
     known = [value for value in values if value is not None]
     axes.barh(rows, [0.0 if value is None else value for value in values], height=0.6, color=RUN_COLORS[0], alpha=0.75)
-    if known:
+    if not known:
+        axes.set_xticks([])
+        axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=INK, fontsize=8)
+    else:
         axes.axvline(float(np.median(known)), color=_MEDIAN, linewidth=0.8, linestyle=(0, (4, 2)))
 
 

@@ -4,6 +4,7 @@ Time counts from the first state on which a command of the controller acted. Not
 wanted, only what the task asks for: errors are distances of the tool from that.
 """
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -72,13 +73,19 @@ class Grade:
         infinite = float("inf")
         return (-self.score, infinite if done_s is None else done_s, infinite if error_mm is None else error_mm)
 
+    @property
+    def percent(self) -> int:
+        """The score in whole per cent, 100 for nothing less than all."""
+        return math.floor(100 * self.score + 1e-9)
+
     def headline(self) -> str:
         """The grade in one sentence."""
         limit = f" of {self.time_limit_s:g} s" if self.time_limit_s else ""
         if self.passed:
             return "passed" if self.done_s is None else f"passed in {self.done_s:.1f} s{limit}"
+        lines = self.lines()
         within = f" within {self.time_limit_s:g} s" if self.time_limit_s else ""
-        return f"{self.score:.0%} of the goals{within}"
+        return f"{sum(reached for _, reached, _ in lines)} of {len(lines)} goals{within}"
 
     def lines(self) -> list[tuple[str, bool, str]]:
         """Goal by goal: which, whether it was reached, and what there is to say of it."""

@@ -21,8 +21,9 @@ CELLS: Final = 1000
 """What is passed is counted in so many pieces of equal length."""
 ROWS: Final = 2000
 """States that are looked at together: bounds the memory."""
-JUMP: Final = 0.05
-"""From one state to the next the tool may advance by this share of the path; more is a short cut, not passed."""
+CORNER: Final = 2.0
+"""From one state to the next the tool advances along the path at most so many times as far as it moves, and by a
+tolerance more: at a corner it may cut a little. What is farther along was not passed, but jumped to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,8 @@ class PathResult:
     done_s: float | None
     """When it was passed to its last point, s; None: it was not."""
     rms_mm: float | None
-    """Distance of the tool from the path while following it, root mean square, mm: the tracking error."""
+    """Distance of the tool from the path while following it, until it left it for good, root mean square, mm: the
+    tracking error."""
     largest_mm: float | None
 
     def sentence(self) -> str:
@@ -51,6 +53,25 @@ class PathResult:
         )
 
 
+@dataclass(slots=True)
+class _Errors:
+    """Distances, summed up; m."""
+
+    squares: float = 0.0
+    count: int = 0
+    largest: float = 0.0
+
+    def add(self, error: float) -> None:
+        self.squares += error * error
+        self.count += 1
+        self.largest = max(self.largest, error)
+
+    def join(self, other: "_Errors") -> None:
+        self.squares += other.squares
+        self.count += other.count
+        self.largest = max(self.largest, other.largest)
+
+
 class PathGoal:
     """Watches the tool along a path."""
 
@@ -62,12 +83,12 @@ class PathGoal:
         self._length = float(self._from_start[-1])
         self._ends = points[0], points[-1]
         self._tolerance = path.tolerance_mm / 1000
-        self._around = int(self._tolerance / self._length * CELLS)
         self._passed = np.zeros(CELLS, np.bool_)
-        self._last_cell: int | None = None
+        self._last: tuple[float, Floats] | None = None
+        """Where the tool was on the path, m along it, and in the world, at the state before; None: it was not."""
         self._began_s: float | None = None
         self._done_s: float | None = None
-        self._squares, self._count, self._largest = 0.0, 0, 0.0
+        self._following, self._away = _Errors(), _Errors()
 
     def add(self, time_s: Floats, tip: Floats) -> None:
         """Take in states: when, shape (n,), and where the tool was, shape (n, 3), m."""
@@ -85,25 +106,32 @@ class PathGoal:
             self._began_s = float(time_s[first])
             time_s, tip = time_s[first:], tip[first:]
         apart, along = self._nearest(tip)
-        cells = np.minimum((along / self._length * CELLS).astype(np.intp), CELLS - 1)
         at_end = np.linalg.norm(tip - self._ends[1], axis=1) <= self._tolerance
-        used = len(tip)
         for row in range(len(tip)):
+            self._away.add(float(apart[row]))
             if apart[row] > self._tolerance:
-                self._last_cell = None
+                self._last = None
                 continue
-            cell = int(cells[row])
-            before = cell if self._last_cell is None or abs(cell - self._last_cell) > JUMP * CELLS else self._last_cell
-            self._passed[max(min(before, cell) - self._around, 0) : max(before, cell) + self._around + 1] = True
-            self._last_cell = cell
+            # What lies between two states on the path was on its way; what comes after the last one was not.
+            self._following.join(self._away)
+            self._away = _Errors()
+            self._pass(float(along[row]), tip[row])
             if at_end[row] and self._passed.mean() >= COVERED:
                 self._done_s = float(time_s[row])
-                used = row + 1
                 break
-        apart = apart[:used]
-        self._squares += float((apart**2).sum())
-        self._count += used
-        self._largest = max(self._largest, float(apart.max()))
+
+    def _pass(self, along: float, tip: Floats) -> None:
+        """The tool is at `along` on the path, m, and passed what is between there and where it was before."""
+        before = along
+        if self._last is not None:
+            last_along, last_tip = self._last
+            moved = float(np.linalg.norm(tip - last_tip))
+            if abs(along - last_along) <= CORNER * moved + self._tolerance:
+                before = last_along
+        low, high = (along_m / self._length * CELLS for along_m in sorted((before, along)))
+        around = self._tolerance / self._length * CELLS
+        self._passed[max(0, math.floor(low - around)) : math.ceil(high + around)] = True
+        self._last = (along, tip)
 
     def _nearest(self, tip: Floats) -> tuple[Floats, Floats]:
         """Distance of the tool from the path, and how far along it the nearest point is, m, shapes (n,)."""
@@ -116,11 +144,12 @@ class PathGoal:
 
     def result(self) -> PathResult:
         """How it went."""
+        following = self._following
         return PathResult(
             length_m=self._length,
             covered=float(self._passed.mean()) if self._done_s is None else 1.0,
             began_s=self._began_s,
             done_s=self._done_s,
-            rms_mm=1000 * math.sqrt(self._squares / self._count) if self._count else None,
-            largest_mm=1000 * self._largest if self._count else None,
+            rms_mm=1000 * math.sqrt(following.squares / following.count) if following.count else None,
+            largest_mm=1000 * following.largest if following.count else None,
         )

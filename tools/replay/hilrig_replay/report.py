@@ -41,7 +41,9 @@ section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
 th:first-child, td:first-child, td.text { text-align: left; }
 td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600; }
-img { max-width: 100%; height: auto; display: block; } li { margin: .25rem 0; }
+img { max-width: 100%; height: auto; display: block; }
+@media (max-width: 44rem) { .scroll img { max-width: none; width: 46rem; } th, td { padding: .25rem .4rem; } }
+ li { margin: .25rem 0; }
 .good { color: #1a7f37; } .bad { color: #b35900; } summary { cursor: pointer; font-weight: 600; }
 @media print { body { max-width: none; } section, details { break-inside: avoid; } }
 """
@@ -138,9 +140,9 @@ def _run(page: _Page) -> str:
 
 def _facts(page: _Page) -> str:
     summary = page.summary
-    facts = [(f"{summary.duration_s:.1f} s", f"length; it ended: {summary.ended or 'not said'}")]
+    facts = [(f"{summary.duration_s:.1f} s", f"length; {summary.ended or 'how it ended is not said'}")]
     if summary.grade is not None:
-        facts.append((f"{summary.grade.score:.0%}", f"task: {summary.grade.headline()}"))
+        facts.append((f"{summary.grade.percent} %", f"of the task: {summary.grade.headline()}"))
     if summary.task is not None:
         error = summary.task.largest_error_mm
         within = "none placed" if error is None else f"within {error:.1f} mm"
@@ -210,7 +212,7 @@ def _events(summary: RunSummary) -> str:
 def _overview(pages: Sequence[_Page]) -> str:
     graded = any(page.summary.grade is not None for page in pages)
     header = ["run", *(("goals", "done, s", "error, mm") if graded else ("parts placed", "placing error, mm"))]
-    header += ["loop p50, ms", "p99, ms", "way, m", "work, J", "saturated", "alarms", "fit"]
+    header += ["loop p50 / p99, ms", "way, m", "work, J", "saturated", "alarms", "fit"]
     rows = []
     for number, page in enumerate(pages, start=1):
         summary, loop = page.summary, page.summary.latency.loop_ms
@@ -218,8 +220,7 @@ def _overview(pages: Sequence[_Page]) -> str:
             [
                 f"{number}. {summary.session}",
                 *(_graded(summary) if graded else _placed(summary)),
-                _or_dash(None if loop is None else loop.p50),
-                _or_dash(None if loop is None else loop.p99),
+                "–" if loop is None else f"{loop.p50:.1f} / {loop.p99:.1f}",
                 f"{summary.motion.tool_path_m:.2f}",
                 f"{summary.motion.work_j:.1f}",
                 f"{max(summary.motion.saturated_share):.1%}",
@@ -242,7 +243,7 @@ def _graded(summary: RunSummary) -> list[str]:
     grade = summary.grade
     if grade is None:
         return ["–"] * 3
-    return [f"{grade.score:.0%}", _or_dash(grade.done_s, 1), _or_dash(grade.error_mm)]
+    return [f"{grade.percent} %", _or_dash(grade.done_s, 1), _or_dash(grade.error_mm)]
 
 
 def _placed(summary: RunSummary) -> list[str]:
@@ -279,4 +280,4 @@ def _picture(figure: Figure, what: str) -> str:
     with BytesIO() as file:
         figure.savefig(file, format="png")
         data = b64encode(file.getvalue()).decode()
-    return f'<img alt="{escape(what, quote=True)}" src="data:image/png;base64,{data}">'
+    return f'<div class="scroll"><img alt="{escape(what, quote=True)}" src="data:image/png;base64,{data}"></div>'
