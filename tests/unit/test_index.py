@@ -6,8 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.records import Metadata
 
 import recordings
+from hilrig_recorder.writer import RunWriter
 from hilrig_replay.index import INDEX_NAME, RECORDING, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
 from labs import hilrig
@@ -171,3 +173,14 @@ def test_the_command_says_in_one_line_that_there_is_no_such_folder(tmp_path: Pat
     assert answer.returncode == 2
     assert answer.stderr.count("\n") == 1
     assert "nowhere" in answer.stderr
+
+
+def test_an_untoward_ending_is_told_with_its_reason(tmp_path: Path) -> None:
+    path = tmp_path / "lab" / "rig1" / "20260101T000000Z-rig1-abcd.mcap"
+    path.parent.mkdir(parents=True)
+    writer = RunWriter(path, metadata=(Metadata("hilrig.session", {"rig": "rig1", "session": path.stem}),))
+    writer.finish(lambda: {"hilrig.summary": {"ended": "disk full", "reason": "No space left on device"}})
+    writer.publish()
+    answer = hilrig("runs", tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    assert "disk full: No space left on device" in " ".join(answer.stdout.split())
