@@ -145,10 +145,10 @@ def test_ten_thousand_files_are_listed_quickly_the_second_time(tmp_path: Path) -
     index.save()
     import time
 
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     assert len(RunIndex(tmp_path).load()) == 10_000
-    # Measured: 0.2 s. A machine that is busy with other tests takes longer.
-    assert time.perf_counter() - begin_s < 3
+    # Measured: 0.2 s of processor time; it is more where caches are shared with a busy neighbour.
+    assert time.process_time() - begin_s < 2
 
 
 def test_the_command_lists_filters_and_sorts(tmp_path: Path) -> None:
