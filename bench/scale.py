@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import running_lab
+from hilrig_cli.supervisor import shared
 from hilrig_replay.latency import measure as latency_of
 from hilrig_replay.run import open_run
 from hilrig_runtime.clock import SYSTEM_CLOCK
@@ -41,7 +42,8 @@ PROMISED = 128
 STEP_MS = 20.0
 RIGS = os.environ.get("HILRIG_BENCH_RIGS", "")
 """Numbers of rigs to try, with commas between them; empty: those above."""
-EDGES = int(os.environ.get("HILRIG_BENCH_EDGES", "1"))
+EDGES = tuple(map(int, os.environ.get("HILRIG_BENCH_EDGES", "1").split(",")))
+"""Numbers of edges that share the rigs, each tried."""
 SETTLE_S = 2.0
 """Sessions begin, files are opened: the first so many seconds of a run are not its steady state."""
 
@@ -69,9 +71,9 @@ def measure(report: Report, quick: bool) -> None:
     build = build_c("scale_load.c", library="")
     counts = tuple(map(int, RIGS.split(","))) if RIGS else COUNTS
     for count in counts:
-        progress(f"{count} rigs")
-        found = carry(build, count, 6.0 if quick else 15.0)
-        add(report, found)
+        for edges in EDGES:
+            progress(f"{count} rigs, {edges} edges")
+            add(report, carry(build, count, edges, 6.0 if quick else 15.0), edges)
     report.say(
         "A loop of one step is read, write and both ways over the bus between two ticks. Phases are spread evenly, so "
         "the 99th percentile is two steps wherever more than 1 % of the phases meet a tick; in ms it is two steps and "
@@ -79,8 +81,8 @@ def measure(report: Report, quick: bool) -> None:
     )
 
 
-def add(report: Report, found: Found) -> None:
-    case = f"{found.rigs} rigs"
+def add(report: Report, found: Found, edges: int) -> None:
+    case = f"{found.rigs} rigs" if edges == 1 else f"{found.rigs} rigs, {edges} edges"
     within = float((found.steps <= 1).mean())
     report.add(case, "loop p50", float(np.percentile(found.loop_ms, 50)), "ms")
     report.add(case, "loop p99", float(np.percentile(found.loop_ms, 99)), "ms")
@@ -107,8 +109,8 @@ def add(report: Report, found: Found) -> None:
         report.bar(f"{case}: recordings of rigs", found.recordings / found.rigs, ">=", 1)
 
 
-def carry(load: Path, count: int, seconds: float) -> Found:
-    """Run a lab of `count` rigs under load; what came of it."""
+def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
+    """Run a lab of `count` rigs on some edges under load; what came of it."""
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
         config = Path(folder) / "lab.toml"
         port, bus_port = free_ports(20_000, count), free_ports(7447, 8)
@@ -117,6 +119,7 @@ def carry(load: Path, count: int, seconds: float) -> Found:
             f"[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = '{folder}'\n[rigs]\ncount = {count}\n"
         )
         lab = load_lab(config)
+        parts = shared([rig.name for rig in lab.rigs], edges=edges)
         healths: dict[str, list[Health]] = {}
 
         def hear(_: str, payload: bytes) -> None:
@@ -124,7 +127,7 @@ def carry(load: Path, count: int, seconds: float) -> Found:
             healths.setdefault(f"{health.service} {health.instance}", []).append(health)
 
         with (
-            running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event()),
+            running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event(), parts),
             ZenohBus(lab.bus, "tool") as bus,
         ):
             bus.subscribe(HEALTH.key(lab.name, "*", "*"), hear)
