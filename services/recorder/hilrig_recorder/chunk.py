@@ -24,6 +24,10 @@ _CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
 """Of a message's record."""
+_NOTE: Final = struct.Struct("<QqQIIB")
+_COUNT: Final = struct.Struct("<HI")
+_NOTES_BYTES: Final = 4096
+"""So many are compressed together."""
 
 
 class ChunkNote(NamedTuple):
@@ -74,40 +78,38 @@ class ChunkNote(NamedTuple):
 
 
 class ChunkNotes:
-    """The notes of all chunks of a file, as differences in seven bits a byte: an hour of them is sixty kilobytes."""
+    """The notes of all chunks of a file, as differences, compressed: an hour of them is sixty kilobytes."""
 
     def __init__(self) -> None:
-        self._packed = bytearray()
+        self._older: list[bytes] = []
+        self._recent = bytearray()
         self._end = self._last_ns = 0
 
     def add(self, note: ChunkNote) -> None:
         """Add the next one."""
-        since_last_ns = note.first_ns - self._last_ns
-        numbers = [
+        gap, since_last_ns, span_ns = (
             note.start - self._end,
-            2 * since_last_ns if since_last_ns >= 0 else -2 * since_last_ns - 1,
+            note.first_ns - self._last_ns,
             note.last_ns - note.first_ns,
-            note.data_size,
-            note.raw_size,
-            len(note.counts),
-        ]
+        )
+        self._recent += _NOTE.pack(gap, since_last_ns, span_ns, note.data_size, note.raw_size, len(note.counts))
         for count in note.counts:
-            numbers += count
-        for number in numbers:
-            while number > 0x7F:
-                self._packed.append(number & 0x7F | 0x80)
-                number >>= 7  # noqa: PLW2901
-            self._packed.append(number)
+            self._recent += _COUNT.pack(*count)
         self._end, self._last_ns = note.end, note.last_ns
+        if len(self._recent) >= _NOTES_BYTES:
+            self._older.append(zlib.compress(self._recent))
+            self._recent.clear()
 
     def __iter__(self) -> Iterator[ChunkNote]:
         """All of them, in the order of the file."""
-        numbers = self._numbers()
-        end = last_ns = 0
-        for gap in numbers:
-            coded_ns, span_ns, data_size, raw_size, channels = (next(numbers) for _ in range(5))
-            counts = tuple((next(numbers), next(numbers)) for _ in range(channels))
-            first_ns = last_ns + (coded_ns >> 1 if coded_ns & 1 == 0 else -(coded_ns + 1 >> 1))
+        packed = b"".join([*map(zlib.decompress, self._older), self._recent])
+        at = end = last_ns = 0
+        while at < len(packed):
+            gap, since_last_ns, span_ns, data_size, raw_size, channels = _NOTE.unpack_from(packed, at)
+            at += _NOTE.size
+            counts = tuple(_COUNT.iter_unpack(packed[at : at + channels * _COUNT.size]))
+            at += channels * _COUNT.size
+            first_ns = last_ns + since_last_ns
             note = ChunkNote(end + gap, first_ns, first_ns + span_ns, data_size, raw_size, counts)
             end, last_ns = note.end, note.last_ns
             yield note
@@ -115,23 +117,20 @@ class ChunkNotes:
     def take_back(self) -> ChunkNote:
         """Remove the newest, and give it back."""
         *kept, newest = self
-        self._packed.clear()
+        self._older.clear()
+        self._recent.clear()
         self._end = self._last_ns = 0
         for note in kept:
             self.add(note)
         return newest
 
     def __bool__(self) -> bool:
-        return bool(self._packed)
+        return bool(self._older or self._recent)
 
-    def _numbers(self) -> Iterator[int]:
-        number = shift = 0
-        for byte in self._packed:
-            number |= (byte & 0x7F) << shift
-            shift += 7
-            if byte <= 0x7F:
-                yield number
-                number = shift = 0
+    @property
+    def size(self) -> int:
+        """What they take in memory, bytes."""
+        return sum(map(len, self._older)) + len(self._recent)
 
 
 def compressor() -> Compress:

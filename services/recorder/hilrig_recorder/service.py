@@ -154,7 +154,9 @@ class Recorder:
         now_ns = self._clock.monotonic_ns()
         if now_ns >= due_ns:
             self._tick(now_ns)
-            due_ns = max(due_ns + TICK_NS, now_ns)
+            # Counted from here: after a long one what has come meanwhile is taken first.
+            now_ns = self._clock.monotonic_ns()
+            due_ns = now_ns + TICK_NS
         arrival = self._intake.take(max(0.0, (due_ns - now_ns) * 1e-9))
         if arrival is not None:
             self._book.accept(arrival, now_ns)

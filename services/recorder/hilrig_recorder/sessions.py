@@ -31,6 +31,8 @@ LINGER_MAX_NS: Final = 10 * SECOND_NS
 """A service that has not passed the end by then is not waited for: its log stream's cache reaches no further back."""
 KEEPER_SILENCE_NS: Final = 30 * SECOND_NS
 """A session whose keeper is silent so long has ended."""
+CLOSINGS: Final = 20
+"""Files closed at a tick: the index of a long recording takes its time, and what comes meanwhile waits."""
 RETRY_NS: Final = 10 * SECOND_NS
 """A session that could not be recorded is tried again after this."""
 _PHASES: Final = 10
@@ -253,13 +255,15 @@ class SessionBook:
                 rig.cut(wall_ns)
                 rig.forget(wall_ns - self._preroll_ns, wall_ns)
         heard = self._sources.last_heard()
+        closings = 0
         for recording in self.recordings:
             if recording.seen is not None and now_ns - recording.opened_ns > SETTLING_NS:
                 # What could come twice has come.
                 recording.seen = None
             if recording.end_wall_ns is None:
                 self._watch_keeper(recording, heard.get(recording.keeper, 0), now_ns)
-            elif self._is_complete(recording, now_ns):
+            elif closings < CLOSINGS and self._is_complete(recording, now_ns):
+                closings += 1
                 self._close(recording, "ended", recording.end_reason)
         for session, until_ns in list(self._over.items()):
             if now_ns > until_ns:
