@@ -2,8 +2,8 @@
 
 A lab of 1 to 256 rigs at a step of 20 ms runs as `hilrig up` starts it. A load generator in C holds a TCP connection to
 each rig and reads and writes once every 20 ms, with phases spread over the period. Latency is what the recordings say;
-processor time and memory are what the services' own health reports say. What is left of the machine is said too, for
-a figure is worth little beside neighbours that took their share.
+processor time and memory are what the services' own health reports say. The load generator asks for the real-time
+policy, for its controllers stand for other machines, which would not wait for this one's processes.
 
 A loop closes within one step when the read, the write and both ways over the bus lie between two ticks. Controllers
 whose phases are spread evenly meet the tick in between with the share (rtt + bus) / step; those take two steps. So the
