@@ -1,5 +1,6 @@
 """Rigs are added and taken away while others run, and the others' motion is the same to the last bit."""
 
+import json
 from collections.abc import Callable
 
 import numpy as np
@@ -94,6 +95,15 @@ class Served(VirtualRig):
         request.configuration_data.text = settings
         (answer,) = self.service.bus.ask(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
         return answer.error or Event.FromString(answer.payload).text
+
+
+def test_a_simulation_says_how_it_steps_when_it_begins() -> None:
+    with Served() as lab:
+        assert lab.kinds() == ["CONFIGURATION"] * 3
+        assert [event.rig for event in lab.events] == ["rig1", "rig2", "rig3"]
+        assert lab.events[0].text == "simulated from now on: step 20 ms, rkf45"
+        said = json.loads(lab.events[0].configuration_data.text)
+        assert said == {"step_ns": 20_000_000, "substeps": 1, "integrator": "rkf45"}
 
 
 def test_over_the_bus_a_rig_is_added_described_and_taken_away() -> None:

@@ -5,7 +5,8 @@ then moves every rig's state into it between two ticks, which does not, so that 
 so holds until the simulation ends: the next one begins with the lab's file again.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -50,6 +51,7 @@ class Membership:
         self._served: dict[str, Handle] = {}
         for rig, parameters in zip(service.rigs, simulation.parameters, strict=True):
             self._serve(rig.name, parameters)
+            self._tell(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
         self._control = service.bus.serve(key, self._answer)
         service.counters.rigs = len(service.rigs)
@@ -68,6 +70,15 @@ class Membership:
         answer = Constant(configuration(self._service, rig, parameters).SerializeToString())
         key = topics.CONFIG.key(self._service.lab.name, rig)
         self._served[rig] = self._service.bus.serve(key, answer)
+
+    def _tell(self, rig: str, parameters: RigParameters) -> None:
+        """Say that a simulation begins, and how it steps; a session that was going on records where it was replaced."""
+        sim = parameters.sim
+        event = Event(kind=Event.CONFIGURATION, severity=Event.INFO, rig=rig)
+        steps = f", {sim.substeps} sub-steps" if sim.substeps > 1 else ""
+        event.text = f"simulated from now on: step {sim.step * 1e3:g} ms, {sim.integrator}{steps}"
+        event.configuration_data.text = json.dumps(asdict(sim))
+        self._service.emit(event)
 
     def _answer(self, payload: bytes) -> bytes:
         try:
