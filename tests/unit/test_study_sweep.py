@@ -207,8 +207,8 @@ def test_the_picture_has_theory_traces_and_dots(tmp_path: Path) -> None:
     assert "rest" in shown[0].outcome
     swept = sweep(study, tmp_path, lambda _: None, workers=1)
     figure = plane_figure(study, swept, 0, shown, [Dot(0, 0.3, True), Dot(40, 0.9, False)])
-    texts = {text.get_text() for text in figure.axes[0].get_legend().get_texts()}
-    assert {"exact: spectral radius 1", "delay margin", "live: comes to rest", "live: does not"} <= texts
+    texts = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"exact: spectral radius 1", "delay margin", "live: as predicted", "live: not as predicted"} <= texts
 
 
 def test_the_command_leaves_table_json_pictures_and_a_rerun_file(tmp_path: Path) -> None:

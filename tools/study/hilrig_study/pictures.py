@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from hilrig_replay.latency_plot import save_figure
@@ -52,7 +53,7 @@ class Dot:
 
     x: float
     y: float
-    settled: bool
+    as_predicted: bool
 
 
 def traces(study: StudyConfig, folder: Path) -> list[Trace]:
@@ -106,12 +107,15 @@ def plane_figure(
         shading="nearest",
         rasterized=True,
     )
-    figure.colorbar(mesh, ax=axes, pad=0.01).set_label("mean of Σ (error / 1° or 1 mm)² + 0.01 Σ effort²", fontsize=8)
+    bar = figure.colorbar(mesh, ax=axes, pad=0.01, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
+    bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    bar.set_label("mean of Σ (error / 1° or 1 mm)² + 0.01 Σ effort²", fontsize=8)
     for axis, config in ((axes.xaxis, study.x), (axes.yaxis, study.y)):
         if config.spacing == "log":
             (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
     theory = [one for one in swept.theory if one.controller == number]
-    _draw_theory(axes, study, theory)
+    predicts = study.controllers[number].kind == "lqr" and study.controllers[number].compensate
+    _draw_theory(axes, study, theory, predicts)
     _draw_radius(axes, study, swept, number)
     for trace in shown:
         axes.annotate(
@@ -123,8 +127,11 @@ def plane_figure(
             color="white",
             bbox={"boxstyle": "circle,pad=0.2", "facecolor": "black", "edgecolor": "white"},
         )
-    for settled, color, label in ((True, "#7CFC00", "live: comes to rest"), (False, "#ff4d4d", "live: does not")):
-        mine = [dot for dot in dots if dot.settled is settled]
+    for as_predicted, color, label in (
+        (True, "#7CFC00", "live: as predicted"),
+        (False, "#ff4d4d", "live: not as predicted"),
+    ):
+        mine = [dot for dot in dots if dot.as_predicted is as_predicted]
         if mine:
             axes.scatter(
                 [dot.x for dot in mine],
@@ -141,7 +148,7 @@ def plane_figure(
     axes.set_ylabel(study.y.label, color=INK)
     axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=INK)
     axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
-    axes.legend(loc="upper right", fontsize=7.5, framealpha=0.9, facecolor="#cfcfcf")
+    figure.legend(loc="outside lower left", ncols=3, fontsize=8, facecolor="#cfcfcf")
     return figure
 
 
@@ -155,7 +162,7 @@ def _ends(axis: AxisConfig) -> tuple[float, float]:
     return float(points.min()) - half, float(points.max()) + half
 
 
-def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory]) -> None:
+def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], predicts: bool) -> None:
     """Boundaries over the gain, where one axis is the gain and the other a time that is added."""
     what = (study.x.what, study.y.what)
     if "gain" not in what or not theory:
@@ -164,19 +171,19 @@ def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory]) -
     gain = np.array([one.gain for one in theory])
     order = np.argsort(gain)
     lines: list[tuple[str, str, str, list[float]]] = []
+    # One that predicts over the latency that it measures bears less of what it does not know of.
+    unknown = " of delay that is not measured" if predicts else ""
     if other == "delay_ms":
         lines.append(("exact: spectral radius 1", BOUNDARY, "-", [one.stable_until_ms for one in theory]))
-        lines.append(("delay margin", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
+        lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
     if other in ("delay_ms", "jitter_ms"):
-        lines.append(
-            ("jitter margin (any order of delays)", JITTER_MARGIN, ":", [_margin_ms(one, "jitter") for one in theory])
-        )
+        lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(one, "jitter") for one in theory]))
     most = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
     for label, color, style, values_ms in lines:
         values = np.array(values_ms)[order]
         # What lies beyond the plane is drawn at its edge, so that lines do not end without a word.
         values = np.where(values < 0, np.nan, np.minimum(values, 2 * most))
-        if np.isnan(values).all():
+        if not (values <= most).any():
             continue
         across, up = (values, gain[order]) if other == what[0] else (gain[order], values)
         axes.plot(across, up, color=color, linestyle=style, linewidth=1.8, label=label)

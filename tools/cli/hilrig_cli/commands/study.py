@@ -95,7 +95,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         pictures = []
         for number in range(len(chosen.controllers)):
             name = chosen.controllers[number].name
-            dots = [Dot(p["x"], p["y"], p["live"]["settled"]) for p in measured if p["controller"] == name]
+            dots = [Dot(p["x"], p["y"], p["as_predicted"]) for p in measured if p["controller"] == name]
             figure = plane_figure(chosen, swept, number, shown, dots)
             pictures += save_pictures(figure, out / f"plane-{number + 1}")
         save_study_rrd(chosen, swept, shown, out / "study.rrd")
