@@ -148,7 +148,8 @@ def plane_figure(
     axes.set_ylabel(study.y.label, color=INK)
     axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=INK)
     axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
-    figure.legend(loc="outside lower left", ncols=3, fontsize=8, facecolor="#cfcfcf")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")
     return figure
 
 
@@ -172,7 +173,7 @@ def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], p
     order = np.argsort(gain)
     lines: list[tuple[str, str, str, list[float]]] = []
     # One that predicts over the latency that it measures bears less of what it does not know of.
-    unknown = " of delay that is not measured" if predicts else ""
+    unknown = ", if not measured" if predicts else ""
     if other == "delay_ms":
         lines.append(("exact: spectral radius 1", BOUNDARY, "-", [one.stable_until_ms for one in theory]))
         lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
