@@ -8,7 +8,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilrig_recorder.durable import part_path
+from hilrig_recorder.durable import PART_SUFFIX, part_path
 from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
 from hilrig_runtime.errors import InputError
 
@@ -25,13 +25,15 @@ class NextPart:
 
 
 def next_part(folder: Path, session: str) -> NextPart:
-    """The first file of a session that is not there yet, whole or unfinished."""
-    number, previous = 1, None
-    while True:
-        path = folder / file_name(session, number)
-        if not path.exists() and not part_path(path).exists():
-            return NextPart(path, number, previous)
-        number, previous = number + 1, path
+    """The file after the last of a session, whole or unfinished; the first may be deleted already."""
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except OSError:
+        # Not there yet; what else may be wrong with it shows when the file is opened.
+        names = []
+    number = max((_number(name, session) for name in names), default=0)
+    previous = folder / file_name(session, number) if number else None
+    return NextPart(folder / file_name(session, number + 1), number + 1, previous)
 
 
 def tail_of_session(folder: Path, session: str, number: int) -> Tail:
@@ -50,6 +52,15 @@ def tail_of_session(folder: Path, session: str, number: int) -> Tail:
 def file_name(session: str, number: int) -> str:
     """Name of a session's file; `number` counts from 1."""
     return f"{session}.mcap" if number == 1 else f"{session}.{number}.mcap"
+
+
+def _number(name: str, session: str) -> int:
+    """Which file of a session is called so; 0: none."""
+    stem = name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
+    if stem == session:
+        return 1
+    number = stem.removeprefix(f"{session}.")
+    return int(number) if number.isdecimal() and number != stem else 0
 
 
 def _tail(path: Path) -> Tail:

@@ -1,0 +1,38 @@
+"""The files of one session: each number once, whatever became of those before."""
+
+from pathlib import Path
+
+import pytest
+
+from hilrig_recorder.parts import next_part
+
+SESSION = "20260101T000000Z-rig1-abcd"
+
+
+@pytest.mark.parametrize(
+    ("there", "number", "previous"),
+    [
+        ([], 1, None),
+        (["mcap"], 2, "mcap"),
+        (["mcap.part"], 2, "mcap"),
+        (["mcap", "2.mcap", "3.mcap.part"], 4, "3.mcap"),
+        # The first were deleted by the rules of keeping, while the session goes on.
+        (["9.mcap", "10.mcap"], 11, "10.mcap"),
+        (["mcap", "2.recovered.mcap", "mcap.verified", "2.mcap.recovering"], 2, "mcap"),
+    ],
+)
+def test_a_session_goes_on_behind_its_last_file(
+    tmp_path: Path, there: list[str], number: int, previous: str | None
+) -> None:
+    for name in there:
+        (tmp_path / f"{SESSION}.{name}").touch()
+    (tmp_path / "20260101T000000Z-rig1-other.7.mcap").touch()
+    (tmp_path / "7.mcap").touch()
+    part = next_part(tmp_path, SESSION)
+    assert part.number == number
+    assert part.path.name == (f"{SESSION}.mcap" if number == 1 else f"{SESSION}.{number}.mcap")
+    assert (part.previous and part.previous.name) == (previous and f"{SESSION}.{previous}")
+
+
+def test_a_rig_without_a_folder_begins_with_the_first(tmp_path: Path) -> None:
+    assert next_part(tmp_path / "rig1", SESSION).number == 1
