@@ -8,6 +8,7 @@ numbers on one core and on many.
 import math
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
@@ -272,9 +273,14 @@ def _theory_of(study: StudyConfig, asked: _Asked, delays_ms: Sequence[float]) ->
     return gain_theory(study, controller, gain, step_ms, poll_ms, delays_ms)
 
 
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 @contextmanager
 def _executor(workers: int | None, tasks: int) -> Iterator[Executor]:
     count = min(workers or os.cpu_count() or 1, tasks)
     # Spawned, never forked: a process of threads that is forked may hang.
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as executor:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
         yield executor
