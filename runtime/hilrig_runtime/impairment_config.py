@@ -303,6 +303,11 @@ class ImpairmentConfig(ImpairmentSetting):
     schedule: tuple[ScheduledImpairment, ...] = ()
     """Settings that follow in the course of a session: { at_s = 30, preset = "vpn" }."""
 
+    def describe(self) -> str:
+        """In words, for people; "none" where the loop is as it is."""
+        words = [self.ways.describe(), *(f"at {entry.at_s:g} s {entry.ways.describe()}" for entry in self.schedule)]
+        return ", then ".join(words)
+
     @model_validator(mode="after")
     def _schedule_goes_on(self) -> "ImpairmentConfig":
         for before, after in zip(self.schedule, self.schedule[1:], strict=False):

@@ -67,6 +67,17 @@ def test_a_rig_can_have_its_own() -> None:
     assert [lab.impairment_of(rig).preset for rig in lab.rigs] == ["mobile", "none"]
 
 
+def test_a_lab_says_in_words_what_is_done_to_its_loops() -> None:
+    assert ImpairmentConfig().describe() == "none"
+    config = ImpairmentConfig.model_validate(
+        {"command": "constant:5", "schedule": [{"at_s": 2.5, "state": "uniform:1,2"}, {"at_s": 9}]}
+    )
+    assert config.describe() == (
+        "state way none; command way constant delay 5 ms, then at 2.5 s state way uniform low 1 ms, high 2 ms; "
+        "command way none, then at 9 s none"
+    )
+
+
 def test_a_setting_goes_through_json_unchanged() -> None:
     for preset in PRESETS:
         config = ImpairmentConfig.model_validate(

@@ -39,7 +39,9 @@ def up(
         if not stopping.is_set():
             for rig in lab.rigs:
                 addresses = ", ".join(f"{kind} at {address}" for kind, address in lab.addresses(rig.name).items())
-                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms")
+                impairment = lab.impairment_of(rig).describe()
+                impaired = "" if impairment == "none" else f", impaired: {impairment}"
+                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{impaired}")
             print(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
             print("running; Ctrl-C ends it", flush=True)
         viewer = None
