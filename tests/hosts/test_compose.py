@@ -165,6 +165,7 @@ def containers(tmp_path: Path) -> Iterator[Containers]:
 
 
 @pytest.mark.hosts
+@pytest.mark.timeout(300)
 def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(containers: Containers) -> None:
     network, folder = containers.network, containers.folder
 
@@ -178,9 +179,9 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
         return (before, after) if after != before else None
 
     for edge, port in (("east", 5020), ("west", 5023)):
-        before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=40, every_s=0.2)
+        before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=90, every_s=0.2)
         assert after > before
-    assert all(eventually(lambda name=name: containers.is_well(name)) for name in SERVICES)
+    assert all(eventually(lambda name=name: containers.is_well(name), timeout_s=30) for name in SERVICES)
 
     stranger = [sys.executable, "-c", STRANGER % (folder / "router/ca.pem")]
     assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "not let in\n"
