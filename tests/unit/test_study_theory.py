@@ -175,21 +175,22 @@ def test_any_pattern_of_polls_grows_as_its_matrix_says(
 
 
 @pytest.mark.parametrize("pose", POSES)
-@pytest.mark.parametrize("gain", [0.6, 0.7])
+@pytest.mark.parametrize("gain", [0.55, 0.6])
 def test_the_delay_margin_is_where_the_spectral_radius_passes_one(
     pose: tuple[float, float, float, float], gain: float
 ) -> None:
-    """At a step of 1 ms, the frequency domain and the eigenvalues agree within 2 % of the margin."""
-    step_s, step_ns = 1e-3, 1_000_000
+    """At a step of 2 ms, the frequency domain and the eigenvalues agree within 2 % of the margin."""
+    step_s, step_ns = 2e-3, 2_000_000
     plant = linearise(ARM, pose)
     phi, gamma = plant.discretise(step_s)
     law = linearise_law(pd(gain, step_s), plant, step_s)
     timing = LoopTiming(step_ns, step_ns, 0, step_ns // 2, 0)
     margin = margins(phi, gamma, law, timing, 1)
     assert margin.stable
-    assert 0.05 < margin.delay_margin_s < 0.2
+    assert 0.12 < margin.delay_margin_s < 0.3
     added = round(margin.delay_margin_s / step_s)
-    tolerance = math.ceil(0.02 * added)
+    tolerance = 1
+    assert tolerance <= 0.02 * added
     assert is_stable(phi, gamma, law, timing, command_delay_ns=(added - tolerance) * step_ns)
     assert not is_stable(phi, gamma, law, timing, command_delay_ns=(added + tolerance) * step_ns)
 
