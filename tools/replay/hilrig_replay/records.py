@@ -62,15 +62,19 @@ class Decoder:
     """Collects messages of a rig, from a file or from the bus, and gives them away as records."""
 
     def __init__(self, names: Names, timebase: Timebase) -> None:
+        self._names = names
         self._timebase = timebase
         self._states, self._commands, self._traffic = Table(STATE), Table(COMMAND), Table(TRAFFIC)
         self._parts = Table(PART)
         self._events: list[tuple[Any, ...]] = []
-        self._decoders: dict[str, Decode] = {
-            "state": state_decoder(self._states, self._parts, names),
-            "command": command_decoder(self._commands, names),
+        self._decoders = self._fresh()
+
+    def _fresh(self) -> dict[str, Decode]:
+        return {
+            "state": state_decoder(self._states, self._parts, self._names),
+            "command": command_decoder(self._commands, self._names),
             "event": lambda payload, *_: self._events.append(_event_row(payload)),
-            "traffic": traffic_decoder(self._traffic, names),
+            "traffic": traffic_decoder(self._traffic, self._names),
         }
 
     def add(self, topic: str, payload: bytes, sequence: int, log_ns: int) -> None:
@@ -87,6 +91,8 @@ class Decoder:
         self._events.clear()
         records = Records(self._states.take(), self._commands.take(), events, self._traffic.take(), self._parts.take())
         self._timebase.note(records.states)
+        # A message that is parsed into again and again gives nothing back: its memory grows with what it was given.
+        self._decoders = self._fresh()
         return records
 
 
