@@ -24,27 +24,27 @@ class BatchSender:
         self._log = log
         self._wall_ns = clock.wall_ns
         self._counters = counters
-        self._batch = RigBatch(source=source)
+        self._source = source
+        self._rigs: list[str] = []
         self._keys: list[str] = []
         self._puts: list[Callable[[bytes], None]] = []
         self._sequences: list[int] = []
 
     def add(self, rig: str, key: str, publisher: Publisher) -> None:
         """Send for one more rig, behind the others; its own messages go on `key` too, through `publisher`."""
-        self._batch.rigs.append(rig)
+        self._rigs.append(rig)
         self._keys.append(key)
         self._puts.append(publisher.put)
         self._sequences.append(0)
 
     def remove(self, index: int) -> None:
         """Send no more for a rig; those behind it move up."""
-        del self._batch.rigs[index], self._keys[index], self._puts[index], self._sequences[index]
+        del self._rigs[index], self._keys[index], self._puts[index], self._sequences[index]
 
     def send(self, payloads: Sequence[bytes]) -> None:
         """Publish and record the encoded messages of all rigs, in the order in which the rigs were added."""
-        batch = self._batch
-        del batch.messages[:]
-        batch.messages.extend(payloads)
+        # Anew each time: what a protobuf message has once held it keeps until it is gone itself.
+        batch = RigBatch(source=self._source, rigs=self._rigs, messages=payloads)
         wall_ns = self._wall_ns()
         self._put_together(batch.SerializeToString())
         for put, payload in zip(self._puts, payloads, strict=True):
@@ -73,19 +73,20 @@ class Gatherer:
         self._put = together.put
         self._later = later
         self._urgent = urgent
-        self._batch = RigBatch(source=source)
+        self._source = source
+        self._rigs: list[str] = []
+        self._messages: list[bytes] = []
         self._spoke: set[str] = set()
         self._waits = False
 
     def add(self, rig: str, payload: bytes) -> None:
         """Send an encoded message of a rig."""
-        batch = self._batch
-        batch.rigs.append(rig)
-        batch.messages.append(payload)
+        self._rigs.append(rig)
+        self._messages.append(payload)
         self._spoke.add(rig)
         if not self._waits or self._urgent():
             self.flush()
-        elif len(batch.rigs) == 1:
+        elif len(self._rigs) == 1:
             self._later(self.flush)
 
     def look(self) -> None:
@@ -96,7 +97,7 @@ class Gatherer:
 
     def flush(self) -> None:
         """Send what waits."""
-        batch = self._batch
-        if batch.rigs:
-            self._put(batch.SerializeToString())
-            del batch.rigs[:], batch.messages[:]
+        if self._rigs:
+            self._put(RigBatch(source=self._source, rigs=self._rigs, messages=self._messages).SerializeToString())
+            self._rigs.clear()
+            self._messages.clear()

@@ -4,11 +4,13 @@ from collections.abc import Callable
 
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import parse_lab
+from hilrig_runtime.health import resident_bytes
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.rig_batch import Gatherer
 from hilrig_runtime.service import Service
 from hilrig_schemas import LogBatch, RigBatch
 from hilrig_schemas.topics import COMMANDS, LOG, STATE, STATES
+from virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 
@@ -132,3 +134,21 @@ def test_what_is_urgent_does_not_wait_and_takes_along_what_waits() -> None:
     urgent[0] = True
     gatherer.add("rig2", b"b")
     assert heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
+
+
+def test_sending_for_long_takes_no_memory() -> None:
+    with VirtualRig(parse_lab("[rigs]\ncount = 32\n")) as lab:
+        lab.service.log.extend = list  # type: ignore[assignment, method-assign]
+
+        def work(steps: int) -> None:
+            for step in range(steps):
+                lab.command((0.1, 0.0, 0.0, 0.0), session="20260101T000000Z-rig1-abcd", magnet=step % 50 > 25)
+                lab.tick()
+                lab.states.clear()
+            lab.events.clear()
+
+        work(200)
+        before = resident_bytes()
+        work(1000)
+        # A batch that is used again for all steps would take 7 MB.
+        assert resident_bytes() - before < 2_000_000

@@ -14,7 +14,7 @@ from hilrig_runtime.rate import Rate, Tick
 from hilrig_runtime.realtime import freeze_garbage
 from hilrig_runtime.service import Service
 from hilrig_runtime.turns import Turns
-from hilrig_schemas import JointState, RigReport, topics
+from hilrig_schemas import JointState, PartState, RigReport, topics
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.configured import rig_parameters
 from hilrig_sim.membership import Membership
@@ -190,7 +190,6 @@ class _Rig:
         self.move_to(index, plant)
         self._loops_us: list[int] = []
         self._has_commanded = False
-        self._has_parts = False
         self._parts_due_ns = 0
 
     def move_to(self, index: int, plant: Plant) -> None:
@@ -204,7 +203,9 @@ class _Rig:
         """Complete the state with what seldom changes, and encode it."""
         state, follower, world, index = self.state, self.follower, self._world, self.index
         if follower.changed:
-            state.session = follower.session
+            # A string that is set anew takes memory until the message is gone, also where it is the same.
+            if state.session != follower.session:
+                state.session = follower.session
             state.effort[:] = follower.effort
             state.magnet = follower.magnet
             state.command_seq = follower.seq
@@ -221,13 +222,10 @@ class _Rig:
             state.command_arrived_ns = state.basis_step = state.loop_latency_ns = 0
             self._has_commanded = False
         state.limit_flags = self._plant.limit_flags[index]
-        if self._part_names:
-            if world.moving[index] or sampled_ns >= self._parts_due_ns:
-                self._parts_due_ns = sampled_ns + ALL_PARTS_PERIOD_NS
-                self._state_parts()
-            elif self._has_parts:
-                del state.parts[:]
-                self._has_parts = False
+        if self._part_names and (world.moving[index] or sampled_ns >= self._parts_due_ns):
+            self._parts_due_ns = sampled_ns + ALL_PARTS_PERIOD_NS
+            parts = self._encoded_parts()
+            return state.SerializeToString() + parts
         return state.SerializeToString()
 
     def report(self) -> RigReport:
@@ -235,11 +233,12 @@ class _Rig:
         loops_us, self._loops_us = self._loops_us, []
         return RigReport(rig=self.name, loop_us=loops_us, safe=self.follower.safe)
 
-    def _state_parts(self) -> None:
-        state, world, index = self.state, self._world, self.index
-        held = int(world.held[index])
-        state.held_part = self._part_names[held] if held != NONE else ""
-        del state.parts[:]
+    def _encoded_parts(self) -> bytes:
+        """The parts, encoded so that they join the state's other bytes; what the magnet holds goes into the state.
+
+        A message that is used again keeps the memory of every part that was ever added to it; this one is not.
+        """
+        world, index = self._world, self.index
         poses = zip(
             self._part_names,
             world.x[:, index].tolist(),
@@ -248,6 +247,9 @@ class _Rig:
             world.yaw[:, index].tolist(),
             strict=False,
         )
-        for name, x, y, z, yaw in poses:
-            state.parts.add(name=name, x=x, y=y, z=z, yaw=yaw)
-        self._has_parts = True
+        parts = [PartState(name=name, x=x, y=y, z=z, yaw=yaw) for name, x, y, z, yaw in poses]
+        held = int(world.held[index])
+        held_part = self._part_names[held] if held != NONE else ""
+        if self.state.held_part != held_part:
+            self.state.held_part = held_part
+        return JointState(parts=parts).SerializeToString()
