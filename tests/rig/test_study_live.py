@@ -43,12 +43,13 @@ controller = "mine"
 """
 
 
+@pytest.mark.timeout(300)
 def test_live_points_do_what_virtual_time_says(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(STUDY)
     example = Path(__file__).parents[2] / "examples" / "controllers" / "pd.py"
     (tmp_path / "mine.py").write_text(example.read_text().replace("KP = (23.0, 14.0", "KP = (11.0, 7.0"))
     out = tmp_path / "out"
-    done = hilrig("study", tmp_path / "study.toml", "--live", "--out", out, "--json", timeout_s=100)
+    done = hilrig("study", tmp_path / "study.toml", "--live", "--out", out, "--json", timeout_s=180)
     assert done.returncode in (0, 1), done.stderr
     points = json.loads(done.stdout)["live"]
     assert [(point["controller"], point["x"], point["y"]) for point in points] == [
