@@ -107,9 +107,10 @@ class RunningLab:
 
     def __enter__(self) -> Self:
         with self.log.open("w") as log:
-            command = [*HILRIG, "up", "--config", str(self.config), *self.options]
+            # It ends with the tests, also where these are killed.
+            command = [*HILRIG, "up", "--stop-with-parent", "--config", str(self.config), *self.options]
             self.process = subprocess.Popen(
-                command, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
             )
 
         def up() -> bool:

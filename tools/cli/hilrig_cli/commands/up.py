@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hilrig_cli.commands.services import LogFormat
+from hilrig_cli.commands.services import LogFormat, StopWithParent
 from hilrig_cli.options import Config
 
 
@@ -17,6 +17,7 @@ def up(
     recorders: Annotated[int, typer.Option(help="Recorders that share the rigs.")] = 1,
     log_format: LogFormat = "text",
     view: Annotated[bool, typer.Option("--view", help="Open the live view of the first rig in rerun.")] = False,
+    stop_with_parent: StopWithParent = False,
 ) -> None:
     """Start simulation, Modbus edge and recorder here, print each rig's Modbus address, and run until Ctrl-C.
 
@@ -25,11 +26,13 @@ def up(
     from hilrig_cli.lab import POLL_S, running_lab
     from hilrig_cli.supervisor import own_process_group, shared
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.lifecycle import stop_on_signals
+    from hilrig_runtime.lifecycle import stop_on_signals, stop_with_stdin
 
     lab = load_lab(config)
     stopping = threading.Event()
     stop_on_signals(stopping)
+    if stop_with_parent:
+        stop_with_stdin(stopping)
 
     def say(line: str) -> None:
         print(f"hilrig: {line}", file=sys.stderr, flush=True)
