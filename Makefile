@@ -30,10 +30,12 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-# Real time is tested alone, one test after the other; what has no clock uses both cores.
+# What judges real time runs alone, one test after the other; the rest uses both cores.
 test: .venv/dev system check ## everything that CI runs
 	$(BIN)/pytest -n 2 tests/unit tests/contract
-	$(BIN)/pytest tests/rig tests/hosts tests/faults
+	$(BIN)/pytest -n 2 --dist loadfile -m "not alone" tests/rig
+	$(BIN)/pytest -m alone tests/rig
+	$(BIN)/pytest tests/hosts tests/faults
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .

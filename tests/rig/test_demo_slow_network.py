@@ -21,7 +21,7 @@ from hilrig_replay.run import open_run
 from labs import RunningLab, write_lab
 from waiting import eventually
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 ROOT = Path(__file__).parents[2]
 RUNS = 3 if os.environ.get("HILRIG_LONG") else 1

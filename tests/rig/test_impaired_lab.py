@@ -24,7 +24,7 @@ from hilrig_runtime.impairment_config import WayImpairment
 from labs import RunningLab, free_ports, hilrig, write_lab
 from waiting import eventually
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 SECONDS = 9.0
 STEP_MS = 10.0

@@ -7,7 +7,7 @@ import pytest
 
 from labs import hilrig
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 
 def processes_that_burn() -> list[str]:

@@ -18,7 +18,7 @@ from pymodbus.client import ModbusTcpClient
 from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
 from waiting import eventually
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 
 @pytest.fixture(scope="module")

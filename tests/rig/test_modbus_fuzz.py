@@ -19,7 +19,7 @@ from edge_rig import HEADER
 from labs import RunningLab, write_lab
 from waiting import eventually
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 FRAMES = int(os.environ.get("HILRIG_FUZZ_FRAMES", "200000"))
 SEED = int(os.environ.get("HILRIG_FUZZ_SEED", random.SystemRandom().randrange(2**32)))

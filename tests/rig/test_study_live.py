@@ -7,7 +7,7 @@ import pytest
 
 from labs import hilrig
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 STUDY = """
 title = "Virtual and live"

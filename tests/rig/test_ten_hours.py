@@ -17,6 +17,7 @@ from labs import HILRIG
 from recordings import MS, Made, Script, make, write
 
 pytestmark = [
+    pytest.mark.alone,
     pytest.mark.rig,
     pytest.mark.timeout(1200),
     pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes: set HILRIG_LONG"),
