@@ -183,8 +183,14 @@ def test_injected_on_the_states_way_is_what_was_asked_for(sessions: dict[str, Se
     session = sessions["state-way"]
     assert_stages_add_up(session)
     assert session.report.samples > 250
-    found = stats.kstest(session.injected_ms, stats.uniform(1, 5).cdf)
-    assert found.pvalue > 0.01, found
+    table = session.report.table
+    drawn, _ = Impairment(WayImpairment.model_validate("uniform:1,6"), way_seed(SEED, "state-way", "state")).draw(3000)
+    steps = table["basis_step"].astype(int)
+    assert np.isin(table["injected"], drawn).all()
+    # Where the machine stalls, states are overtaken before they show, the late ones first: what is left is biased.
+    if len(steps) > 0.98 * (steps[-1] - steps[0]):
+        found = stats.kstest(session.injected_ms, stats.uniform(1, 5).cdf)
+        assert found.pvalue > 0.01, found
 
 
 @pytest.mark.parametrize("rig", [*COMMAND_RIGS, "trace"])
