@@ -30,13 +30,12 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-# What judges real time runs alone, one test after the other; the rest uses both cores. Where a machine's host takes its
-# processors away for a moment, a test of real processes can fail for it: those that failed run once more, alone.
-AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
+# What judges real time runs alone, one test after the other; the rest uses both cores. Where the host of a virtual machine
+# takes its processors away for a moment, a judgement of real time fails for it: only those are made once more.
 test: .venv/dev system check ## everything that CI runs
 	$(BIN)/pytest -n 2 tests/unit tests/contract
-	$(BIN)/pytest -n 2 --dist loadfile -m "not alone" tests/rig tests/hosts tests/faults || $(AGAIN) -m "not alone" tests/rig tests/hosts tests/faults
-	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig
+	$(BIN)/pytest -n 2 --dist loadfile -m "not alone" tests/rig tests/hosts tests/faults
+	$(BIN)/pytest -m alone tests/rig || $(BIN)/pytest --last-failed --last-failed-no-failures none -m alone tests/rig
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .

@@ -9,7 +9,6 @@ server that libmodbus makes. Latency is what `hilrig latency` finds in the recor
 import json
 import multiprocessing
 import multiprocessing.connection
-import os
 import statistics
 import subprocess
 import sys
@@ -23,6 +22,7 @@ import harness
 from harness import Report, build_c, percentile, progress
 
 from hilrig_cli.demo import free_ports
+from hilrig_cli.jitter import stolen_s
 from hilrig_cli.lab import running_lab
 from hilrig_runtime.config import BusConfig, load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
@@ -56,9 +56,9 @@ def measure(report: Report, quick: bool) -> None:
             len(runs_of_step) < 2 * runs and sorted(share for share, _, _ in runs_of_step)[runs - 1] > QUIET_SHARE
         ):
             progress(f"the rig at a step of {step_ms:g} ms, run {len(runs_of_step) + 1}")
-            before, begin = stolen_s(), time.monotonic()
+            before, begin = stolen_s() or 0.0, time.monotonic()
             latency, figures = rig_loop(client, step_ms, seconds)
-            runs_of_step.append(((stolen_s() - before) / (time.monotonic() - begin), latency, figures))
+            runs_of_step.append((((stolen_s() or 0.0) - before) / (time.monotonic() - begin), latency, figures))
         quietest = sorted(runs_of_step, key=lambda run: run[0])[:runs]
         report.add(f"rig, {step_ms:g} ms", "runs made", len(runs_of_step), "count")
         report.add(f"rig, {step_ms:g} ms", "runs counted", len(quietest), "count")
@@ -92,14 +92,6 @@ def add_loop(report: Report, step_ms: float, measured: list[tuple[dict[str, Any]
     else:
         report.bar("1 ms step: loop p50 in steps", loop["p50"] / step_ms, "<=", 1.05)
         report.bar("1 ms step: loop p99 in steps", loop["p99"] / step_ms, "<=", 2.0)
-
-
-def stolen_s() -> float:
-    """Processor time that the host has taken from this virtual machine since its start, s; 0 where it is not told."""
-    stat = Path("/proc/stat")
-    if not stat.exists():
-        return 0.0
-    return int(stat.read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
 def median(runs: list[dict[str, Any]], group: str, key: str) -> float:

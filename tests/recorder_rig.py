@@ -95,8 +95,8 @@ class Senders:
             Service("sim", lab, ZenohBus(lab.bus, "sim"), stopping=self.stopping) as sim,
             Service("edge", lab, ZenohBus(lab.bus, "edge"), stopping=self.stopping) as edge,
         ):
-            states = {rig: sim.sender(STATE, rig, on_bus=False) for rig in self.rigs}
-            commands = {rig: edge.sender(COMMAND, rig, on_bus=False) for rig in self.rigs}
+            states = {rig: sim.sender(STATE, rig) for rig in self.rigs}
+            commands = {rig: edge.sender(COMMAND, rig) for rig in self.rigs}
             for rig in self.rigs:
                 config = RigConfig(rig=rig, incarnation=sim.incarnation, step_ns=20_000_000, urdf="<robot/>")
                 sim.bus.serve(CONFIG.key(lab.name, rig), lambda _, config=config: config.SerializeToString())

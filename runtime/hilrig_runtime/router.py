@@ -8,7 +8,7 @@ import zenoh
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.lifecycle import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
-from hilrig_runtime.zenoh_config import ROUTER, router_config
+from hilrig_runtime.zenoh_config import ROUTER, router_config, system_reason
 from hilrig_schemas.topics import alive_key
 
 
@@ -44,10 +44,9 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        # zenoh's text holds paths of its own sources; the system's reason stands before its error number.
-        reason = str(error).partition(" (os error")[0].rpartition(": ")[2].lstrip("[")
         raise OperationError(
-            f"the router can't listen on {endpoint} ({reason}): end what listens there, or choose another --listen"
+            f"the router can't listen on {endpoint} ({system_reason(error)}): end what listens there, "
+            "or choose another --listen"
         ) from error
     with closing(session), session.liveliness().declare_token(alive_key(lab.name, ROUTER, "1")):
         print(f"router of lab {lab.name!r} at {endpoint}", flush=True)

@@ -1,9 +1,9 @@
 """One object that owns a process's life: its bus, log stream, health and the wish to stop.
 
 A service is a function `run(service)` that calls `service.ready()` once it does its work, and returns when
-`service.stopping` is set; everything that it declared is
-closed afterwards, in reverse order. Sending and receiving go through typed ends made here: `sender` encodes once and
-gives the same bytes to the bus and to the log stream; `latest` keeps the newest value of each rig.
+`service.stopping` is set; everything that it declared is closed afterwards, in reverse order. Sending and receiving go
+through typed ends made here: `sender` encodes once and gives the same bytes to the bus and to the log stream,
+`batch_sender` and `gatherer` do so for many rigs together; `latest_of_batches` keeps the newest value of each rig.
 """
 
 import threading
@@ -23,7 +23,7 @@ from hilrig_runtime.logstream import LogStream
 from hilrig_runtime.presence import Presence
 from hilrig_runtime.rig_batch import BatchSender, Gatherer
 from hilrig_schemas import Event, RigBatch, Roster
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, parse_rig_key
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 BATCHES_WAITING: Final = 64
@@ -38,33 +38,6 @@ class Arrival(NamedTuple):
     """Monotonic clock of this process, ns."""
     injected_ns: int = 0
     """For how long it was held up on purpose after that, ns."""
-
-
-class LatestValues:
-    """The newest message of each rig on one topic: older ones are of no use to control."""
-
-    def __init__(self, clock: Clock, counters: Counters) -> None:
-        self._by_rig: dict[str, Arrival] = {}
-        self._rig_of_key: dict[str, str] = {}
-        self._monotonic_ns = clock.monotonic_ns
-        self._counters = counters
-
-    def get(self, rig: str) -> Arrival | None:
-        """The newest message of `rig`; None: none has come. The same object is returned until the next comes."""
-        return self._by_rig.get(rig)
-
-    def rigs(self) -> list[str]:
-        """Rigs of which something has come."""
-        return list(self._by_rig)
-
-    def on_message(self, key: str, payload: bytes) -> None:
-        """Keep a message; called by the bus."""
-        arrived_ns = self._monotonic_ns()
-        rig = self._rig_of_key.get(key)
-        if rig is None:
-            rig = self._rig_of_key[key] = parse_rig_key(key).rig
-        self._by_rig[rig] = Arrival(payload, arrived_ns)
-        self._counters.received += 1
 
 
 class LatestOfBatches:
@@ -116,7 +89,7 @@ class Sender(Generic[MessageT]):
     def __init__(
         self,
         key: str,
-        publisher: Publisher | None,
+        publisher: Publisher,
         log: LogStream,
         clock: Clock,
         counters: Counters,
@@ -124,7 +97,7 @@ class Sender(Generic[MessageT]):
     ) -> None:
         self.key = key
         self._first = first
-        self._put = None if publisher is None else publisher.put
+        self._put = publisher.put
         self._append = log.append
         self._wall_ns = clock.wall_ns
         self._counters = counters
@@ -136,8 +109,7 @@ class Sender(Generic[MessageT]):
         wall_ns = self._wall_ns()
         if self._first is not None:
             self._first(payload)
-        if self._put is not None:
-            self._put(payload)
+        self._put(payload)
         self._sequence += 1
         self._counters.published += 1
         self._append(self.key, self._sequence, wall_ns, payload)
@@ -147,8 +119,7 @@ class Sender(Generic[MessageT]):
         payload = message.SerializeToString()
         if self._first is not None:
             self._first(payload)
-        if self._put is not None:
-            self._put(payload)
+        self._put(payload)
 
 
 class Service:
@@ -218,26 +189,12 @@ class Service:
         topic: RigTopic[MessageT],
         rig: str,
         *,
-        on_bus: bool = True,
         first: Callable[[bytes], None] | None = None,
     ) -> Sender[MessageT]:
-        """An end that sends on a rig's topic; with `on_bus=False` its messages go on the record alone.
-
-        `first` gets each encoded message before that.
-        """
+        """An end that sends on a rig's topic; `first` gets each encoded message before that."""
         key = topic.key(self.lab.name, rig)
-        publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic)) if on_bus else None
+        publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
         return Sender(key, publisher, self.log, self.clock, self.counters, first)
-
-    def latest(self, topic: RigTopic[MessageT], rig: str = "*") -> LatestValues:
-        """The newest messages on a topic, of every rig or of one."""
-        values = LatestValues(self.clock, self.counters)
-        # Room for one message of each rig: what waits is never older than a step.
-        waiting = len(self.rigs) if rig == "*" else 1
-        self._closing.enter_context(
-            self.bus.subscribe_newest(topic.key(self.lab.name, rig), values.on_message, waiting)
-        )
-        return values
 
     def latest_of_batches(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})

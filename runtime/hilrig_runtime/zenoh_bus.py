@@ -11,7 +11,7 @@ import zenoh.ext
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.zenoh_config import FIRST_INSTANCE, MESH_ORDER, mesh_endpoint, zenoh_config
+from hilrig_runtime.zenoh_config import FIRST_INSTANCE, MESH_ORDER, mesh_endpoint, system_reason, zenoh_config
 from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
 from hilrig_schemas.topics import Traffic
 
@@ -205,9 +205,7 @@ def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
         return f"no zenoh router answers at {bus.router} (bus.router in lab.toml){certificate}"
     if service not in MESH_ORDER:
         return f"can't join the bus: {error}"
-    # zenoh's text holds paths of its own sources; the system's reason stands before its error number.
-    reason = str(error).partition(" (os error")[0].rpartition(": ")[2].lstrip("[")
     return (
-        f"can't listen on {mesh_endpoint(bus, service)} for the bus ({reason}): is another hilrig running here? "
-        "End it, or choose another bus.first_port in lab.toml"
+        f"can't listen on {mesh_endpoint(bus, service)} for the bus ({system_reason(error)}): "
+        "is another hilrig running here? End it, or choose another bus.first_port in lab.toml"
     )

@@ -142,3 +142,11 @@ def _made(settings: dict[str, Any]) -> zenoh.Config:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def system_reason(error: Exception) -> str:
+    """Why the system refused what zenoh asked of it, in its own words.
+
+    zenoh's text holds paths of its own sources; the system's reason stands before its error number.
+    """
+    return str(error).partition(" (os error")[0].rpartition(": ")[2].lstrip("[")

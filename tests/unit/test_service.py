@@ -4,8 +4,8 @@ from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, Health, JointState, LogBatch
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, STATE, alive_key
+from hilrig_schemas import Event, Health, JointState, LogBatch, RigBatch
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, STATE, STATES, alive_key
 
 
 def make_service(hub: MemoryHub, clock: ManualClock, name: str = "sim") -> Service:
@@ -43,12 +43,13 @@ def test_a_repetition_is_heard_but_not_recorded() -> None:
 def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:
     hub, clock = MemoryHub(), ManualClock()
     with make_service(hub, clock, "edge") as edge, make_service(hub, clock, "sim") as sim:
-        latest = edge.latest(STATE)
+        latest = edge.latest_of_batches(STATES)
         assert latest.get("rig1") is None
-        sender = sim.sender(STATE, "rig1")
+        sender = sim.batch_sender(STATES)
+        sim.add_to_batch(sender, STATE, "rig1")
         for step in (1, 2):
             clock.advance(1_000)
-            sender.send(JointState(step=step))
+            sender.send([JointState(step=step).SerializeToString()])
         arrival = latest.get("rig1")
         assert arrival is not None
         assert STATE.decode(arrival.payload).step == 2
@@ -69,7 +70,7 @@ def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> N
     hub = MemoryHub()
     witness = MemoryBus(hub)
     service = make_service(hub, ManualClock())
-    latest = service.latest(STATE)
+    latest = service.latest_of_batches(STATES)
     assert witness.alive(alive_key("lab", "*", "*")) == []
     service.ready()
     service.ready()
@@ -77,7 +78,8 @@ def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> N
     service.close()
     service.close()
     assert witness.alive(alive_key("lab", "*", "*")) == []
-    witness.publisher(STATE.key("lab", "rig1"), STATE.traffic).put(b"")
+    late = RigBatch(rigs=["rig1"], messages=[b""]).SerializeToString()
+    witness.publisher(STATES.key("lab", "sim", "1"), STATES.traffic).put(late)
     assert latest.get("rig1") is None
     assert hub.subscribers == []
 
