@@ -58,6 +58,9 @@ class Answer:
 class Bus(Handle):
     """A connection to the bus; closing it takes back everything that was declared on it."""
 
+    settling_s: float = 0.0
+    """For how long after it was opened some who are there may not be linked yet, s."""
+
     @abstractmethod
     def publisher(self, key: str, traffic: Traffic) -> Publisher:
         """Declare that this process sends on `key`."""

@@ -8,6 +8,7 @@ same answers tell how far the hosts' wall clocks are apart; nothing depends on t
 
 import platform
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,7 +23,10 @@ from hilrig_schemas import Roster
 from hilrig_schemas.topics import ROSTER, alive_key
 
 ASK_PERIOD_S: Final = 10.0
+ASK_AGAIN_S: Final = 0.1
 ASK_TIMEOUT_S: Final = 0.5
+CLAIM_TIMEOUT_S: Final = 3.0
+"""For one that is there and slow to answer; who has answered is not waited for."""
 NAMED: Final = 3
 """Rigs that a refusal names before it says "and … more"."""
 
@@ -118,6 +122,11 @@ class Presence:
         if self._claimed:
             return
         reason = self._look()
+        asked_s = 0.0
+        while not reason and asked_s < self._bus.settling_s:
+            time.sleep(ASK_AGAIN_S)
+            asked_s += ASK_AGAIN_S
+            reason = self._look()
         if reason:
             raise OperationError(reason)
         self._claimed = True
@@ -147,7 +156,7 @@ class Presence:
 
     def _look(self) -> str:
         asked_ns = self._clock.wall_ns()
-        others = rosters(self._bus, self._lab)
+        others = rosters(self._bus, self._lab, timeout_s=CLAIM_TIMEOUT_S)
         self.clock_offset = worst_offset(others, self._own.incarnation, asked_ns, self._clock.wall_ns())
         return conflict(self._roster(), others)
 

@@ -11,11 +11,20 @@ import zenoh.ext
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.zenoh_config import FIRST_INSTANCE, MESH_ORDER, mesh_endpoint, system_reason, zenoh_config
+from hilrig_runtime.zenoh_config import (
+    FIRST_INSTANCE,
+    MESH_ORDER,
+    finds_others_by_gossip,
+    mesh_endpoint,
+    system_reason,
+    zenoh_config,
+)
 from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
 from hilrig_schemas.topics import Traffic
 
 _HEARTBEAT_S: Final = 0.25
+_GOSSIP_S: Final = 1.0
+"""Ample: gossip takes some 50 ms where nothing else runs."""
 _PRIORITIES: Final = {
     Traffic.CONTROL: zenoh.Priority.REAL_TIME,
     Traffic.RECORDING: zenoh.Priority.DATA_LOW,
@@ -89,6 +98,8 @@ class ZenohBus(Bus):
 
     def __init__(self, bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> None:
         self._express = bus.express
+        if finds_others_by_gossip(bus, service, instance):
+            self.settling_s = _GOSSIP_S
         try:
             self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
         except zenoh.ZError as error:

@@ -28,6 +28,11 @@ def mesh_endpoint(bus: BusConfig, service: str) -> str:
     return f"{_protocol(bus)}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
 
 
+def finds_others_by_gossip(bus: BusConfig, service: str, instance: str) -> bool:
+    """Whether an instance of `service` is linked with some of its neighbours only when others have told of them."""
+    return bus.topology == "mesh" and service in MESH_ORDER and instance != FIRST_INSTANCE
+
+
 def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> zenoh.Config:
     """The zenoh configuration of an instance of `service`: one of `MESH_ORDER`, or any other name for a tool.
 

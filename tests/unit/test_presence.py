@@ -1,5 +1,7 @@
 """One service a rig: of two the elder goes on and the other ends with the reason; hosts' clocks are compared."""
 
+import threading
+
 import pytest
 
 from hilrig_runtime.clock import ManualClock
@@ -70,6 +72,20 @@ def test_the_second_of_two_refuses_before_it_is_there() -> None:
         with service(hub, "2", ("rig1",), 2_000) as other, pytest.raises(OperationError, match=r"edge/1 on .* serves"):
             other.ready()
         assert MemoryBus(hub).alive(alive_key(LAB.name, "edge", "*")) == [alive_key(LAB.name, "edge", "1")]
+
+
+def test_an_elder_that_is_linked_a_moment_later_is_found_before_a_word_is_said() -> None:
+    hub = MemoryHub()
+    bus = MemoryBus(hub)
+    bus.settling_s = 2.0
+    later = Service("edge", LAB, bus, instance="2", rigs=("rig1",), clock=ManualClock(wall_ns=2_000))
+    elders: list[Service] = []
+    timer = threading.Timer(0.15, lambda: elders.append(service(hub, "1", ("rig1",), 1_000)))
+    timer.start()
+    with later, pytest.raises(OperationError, match=r"edge/1 on .* serves rig1"):
+        later.ready()
+    timer.join()
+    elders[0].close()
 
 
 def test_one_that_is_found_later_to_be_the_younger_ends_with_the_reason() -> None:

@@ -119,6 +119,8 @@ class _Seat:
         self.server = server
         self.closing = ExitStack()
         self.sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
+        self.address = ""
+        """Where it listens, for people."""
         self.traffic_due_ns = 0
 
 
@@ -187,15 +189,16 @@ class Edge:
         if edge.tls is not None and tls_port is not None:
             listening = seat.closing.enter_context(bind(rig, edge.host, tls_port, "edge.tls.first_port"))
             seat.sockets.append((listening, TlsPolicy(edge.tls)))
+        seat.address = ", ".join(f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in seat.sockets)
 
     async def _listen(self, seat: _Seat) -> None:
         for listening, policy in seat.sockets:
             await seat.server.listen(listening, policy)
 
     def _address_of(self, rig: str) -> str:
+        # Kept, not asked of the sockets: the roster is answered on a thread of the bus, also while the edge closes.
         seat = self._seats.get(rig)
-        host = self.service.lab.edge.host
-        return ", ".join(f"{host}:{listening.getsockname()[1]}" for listening, _ in seat.sockets) if seat else ""
+        return seat.address if seat else ""
 
     def state_sessions(self) -> None:
         """Tell the log stream which sessions are open."""
