@@ -14,6 +14,7 @@ FLOORS = {
     "recorder": "services/recorder/hilrig_recorder",
     "replay": "tools/replay/hilrig_replay",
     "study": "tools/study/hilrig_study",
+    "console": "tools/console/hilrig_console",
 }
 
 

@@ -6,7 +6,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
-from hilrig_cli.lab_view import LabView, ServiceView
+from hilrig_console.lab_view import LabView, ServiceView
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (

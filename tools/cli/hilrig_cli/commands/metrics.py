@@ -18,8 +18,8 @@ def metrics(
 
     One process for the whole lab; the services only send the reports that they send anyway.
     """
-    from hilrig_cli.lab_watch import LabWatch
     from hilrig_cli.prometheus import metrics_server, text_of
+    from hilrig_console.lab_watch import LabWatch
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.errors import InputError, OperationError
     from hilrig_runtime.lifecycle import stop_on_signals

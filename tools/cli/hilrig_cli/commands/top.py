@@ -12,7 +12,7 @@ from hilrig_cli.options import AsJson, Config
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from hilrig_cli.lab_view import LabView, RigView
+    from hilrig_console.lab_view import LabView
 
 REFRESH_S = 0.5
 
@@ -29,7 +29,7 @@ def top(
     from rich.console import Console
     from rich.live import Live
 
-    from hilrig_cli.lab_watch import LabWatch
+    from hilrig_console.lab_watch import LabWatch
     from hilrig_runtime.config import load_lab
 
     lab = load_lab(config)
@@ -90,17 +90,5 @@ def picture(view: "LabView", now_s: float, height: int | None) -> "Group":
     for rig in rigs[:room]:
         figures = [f"{value:.1f}" if (value := rig.loop_ms(share)) is not None else "–" for share in (0.5, 0.99)]
         recorded = "yes" if rig.recording else ""
-        table.add_row(rig.rig, rig.controller or "nobody", *figures, str(len(rig.loops_us)), recorded, _state(rig))
+        table.add_row(rig.rig, rig.controller or "nobody", *figures, str(len(rig.loops_us)), recorded, rig.state)
     return Group(services, table, *troubles)
-
-
-def _state(rig: "RigView") -> str:
-    if not rig.served:
-        return "no edge"
-    if not rig.simulated:
-        return "no simulation"
-    if rig.watchdog_tripped:
-        return "watchdog tripped"
-    if rig.safe:
-        return "no command"
-    return "in use" if rig.controller else "free"

@@ -1,4 +1,4 @@
-"""How a lab is, out of its services' health reports: what `hilrig top` shows and `hilrig metrics` serves.
+"""How a lab is, out of its services' health reports: what `hilrig top`, `metrics` and `console` show.
 
 Each service reports once a second what it knows: the simulation the loop latencies of each rig, the edge who holds it,
 the recorder which rigs it writes. Here they come together. Pure: reports and time are passed in.
@@ -14,6 +14,8 @@ WINDOW_S: Final = 10.0
 """Percentiles of the loop latency are over so long."""
 SILENT_S: Final = 3.5
 """A service that was not heard for so long is shown as silent, and what it said of its rigs is forgotten."""
+FORGOTTEN_S: Final = 600.0
+"""A service that was silent for so long is not spoken of any more: it was taken away, or is called otherwise now."""
 
 
 @dataclass(slots=True)
@@ -45,6 +47,10 @@ class RigView:
     recording: bool = False
     simulated: bool = False
     served: bool = False
+    lateness_p99_ns: int = 0
+    """Of the simulation's ticks in the last second, ns."""
+    overruns: int = 0
+    """Ticks of the simulation that began more than a step late, since its start."""
     loops_us: list[int] = field(default_factory=list)
     """Loop latencies within the window, µs, in order of size."""
 
@@ -52,6 +58,19 @@ class RigView:
         """A percentile of the loop latency, ms; None: no command took effect within the window."""
         loops = self.loops_us
         return loops[round(share * (len(loops) - 1))] / 1e3 if loops else None
+
+    @property
+    def state(self) -> str:
+        """What matters most of it, in two words."""
+        if not self.served:
+            return "no edge"
+        if not self.simulated:
+            return "no simulation"
+        if self.watchdog_tripped:
+            return "watchdog tripped"
+        if not self.controller:
+            return "free"
+        return "no command" if self.safe else "in use"
 
 
 class LabView:
@@ -64,6 +83,7 @@ class LabView:
 
     def hear(self, health: Health, now_s: float) -> None:
         """Take a report that came at `now_s`."""
+        self._forget(now_s)
         view = ServiceView(health, now_s)
         before = self._services.get(view.name)
         if before is not None and before.health.incarnation == health.incarnation:
@@ -74,6 +94,12 @@ class LabView:
         for report in health.rig_reports:
             if report.loop_us:
                 self._loops.setdefault(report.rig, deque()).append((now_s, tuple(report.loop_us)))
+
+    def _forget(self, now_s: float) -> None:
+        for name in [name for name, view in self._services.items() if now_s - view.heard_s > FORGOTTEN_S]:
+            del self._services[name]
+        for rig in [rig for rig, loops in self._loops.items() if not loops or now_s - loops[-1][0] > WINDOW_S]:
+            del self._loops[rig]
 
     def services(self) -> list[ServiceView]:
         """Every service that was heard, by name."""
@@ -93,6 +119,8 @@ class LabView:
                 view = found.setdefault(report.rig, RigView(report.rig))
                 if service.health.service == "sim":
                     view.simulated, view.safe = True, report.safe
+                    view.lateness_p99_ns = service.health.lateness_p99_ns
+                    view.overruns = service.health.overruns
                 elif service.health.service == "edge":
                     view.served = True
                     view.controller, view.session = report.controller, report.session
@@ -157,6 +185,7 @@ def _service_row(service: ServiceView, silent: bool) -> dict[str, Any]:
 def _rig_row(rig: RigView) -> dict[str, Any]:
     return {
         "rig": rig.rig,
+        "state": rig.state,
         "simulated": rig.simulated,
         "served": rig.served,
         "controller": rig.controller,
@@ -168,4 +197,6 @@ def _rig_row(rig: RigView) -> dict[str, Any]:
         "loop_p50_ms": rig.loop_ms(0.5),
         "loop_p99_ms": rig.loop_ms(0.99),
         "loop_samples": len(rig.loops_us),
+        "lateness_p99_ms": rig.lateness_p99_ns / 1e6,
+        "overruns": rig.overruns,
     }
