@@ -6,8 +6,8 @@ from contextlib import closing
 import zenoh
 
 from hilrig_runtime.config import LabConfig
+from hilrig_runtime.ending import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.lifecycle import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
 from hilrig_runtime.zenoh_config import ROUTER, router_config, system_reason
 from hilrig_schemas.topics import alive_key
 

@@ -15,7 +15,8 @@ SERVICE = """
 import sys, threading, time
 from hilrig_runtime.config import BusConfig, LabConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.lifecycle import run_main, run_service
+from hilrig_runtime.ending import run_main
+from hilrig_runtime.lifecycle import run_service
 
 def orderly(service):
     service.ready()

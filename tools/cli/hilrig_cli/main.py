@@ -37,7 +37,7 @@ from hilrig_cli.commands import (
     up,
     verify,
 )
-from hilrig_runtime.lifecycle import run_main
+from hilrig_runtime.ending import run_main
 
 app = typer.Typer(
     name="hilrig",

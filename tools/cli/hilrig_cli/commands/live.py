@@ -28,8 +28,8 @@ def live(
     from hilrig_replay.viewer import browser_address, free_port, running_viewer
     from hilrig_runtime.clock import SYSTEM_CLOCK
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.ending import stop_on_signals
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.lifecycle import stop_on_signals
     from hilrig_runtime.zenoh_bus import ZenohBus
 
     if save is not None and web:

@@ -21,8 +21,8 @@ def metrics(
     from hilrig_cli.prometheus import metrics_server, text_of
     from hilrig_console.lab_watch import LabWatch
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.ending import stop_on_signals
     from hilrig_runtime.errors import InputError, OperationError
-    from hilrig_runtime.lifecycle import stop_on_signals
 
     lab = load_lab(config)
     host, colon, port = listen.rpartition(":")

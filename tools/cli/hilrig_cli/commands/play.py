@@ -28,8 +28,8 @@ def play(
     from hilrig_replay.run import open_run
     from hilrig_runtime.clock import SYSTEM_CLOCK
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.ending import stop_on_signals
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.lifecycle import stop_on_signals
     from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
 
     lab = load_lab(config)

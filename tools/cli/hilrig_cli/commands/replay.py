@@ -24,8 +24,8 @@ def replay(
     from hilrig_replay.rerun_view import save_rrd
     from hilrig_replay.run import open_run
     from hilrig_replay.viewer import browser_address, free_port, running_viewer, wait_for_end
+    from hilrig_runtime.ending import stop_on_signals
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.lifecycle import stop_on_signals
 
     if save is not None and web:
         raise InputError("--save writes a file and --web serves a browser: choose one")

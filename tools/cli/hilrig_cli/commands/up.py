@@ -26,7 +26,7 @@ def up(
     from hilrig_cli.lab import POLL_S, running_lab
     from hilrig_cli.supervisor import own_process_group, shared
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.lifecycle import stop_on_signals, stop_with_stdin
+    from hilrig_runtime.ending import stop_on_signals, stop_with_stdin
 
     lab = load_lab(config)
     stopping = threading.Event()

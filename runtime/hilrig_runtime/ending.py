@@ -1,0 +1,75 @@
+"""How a process ends: signals, the parent's death, exit codes, and a way out when closing hangs.
+
+The first signal sets the wish to stop and the loop ends itself; a second one forces. A service started by
+`hilrig up` also ends when its parent is gone, which it learns from the end of its standard input. Every command ends
+this way, so that this module imports nothing that takes time.
+"""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Final
+
+from hilrig_runtime.errors import HilrigError
+
+CLOSE_TIMEOUT_S: Final = 2.0
+"""A process that has not closed by then ends all the same."""
+
+
+def stop_on_signals(stopping: threading.Event) -> None:
+    """Set `stopping` on the first SIGINT or SIGTERM; end the process on the second."""
+
+    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        if stopping.is_set():
+            os._exit(128 + number)
+        stopping.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", None)):
+        if number is not None:
+            signal.signal(number, on_signal)
+
+
+def stop_with_stdin(stopping: threading.Event) -> None:
+    """Set `stopping` when standard input ends: the parent held its other end, and is gone."""
+
+    def watch() -> None:
+        try:
+            while os.read(0, 4096):
+                pass
+        except OSError:
+            pass
+        stopping.set()
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
+
+
+def end_when_closing_hangs(stopping: threading.Event, timeout_s: float) -> None:
+    """End the process `timeout_s` after `stopping` was set, if it is still there: a hung session ignores signals."""
+
+    def watch() -> None:
+        stopping.wait()
+        # A daemon thread: it ends with the process when closing goes well.
+        threading.Event().wait(timeout_s)
+        print("hilrig: closing took too long; ended without", file=sys.stderr)
+        os._exit(3)
+
+    threading.Thread(target=watch, name="close-guard", daemon=True).start()
+
+
+def run_main(main: Callable[[], int | None]) -> int:
+    """Run a command; turn what a person should read into one line on standard error, and an exit code."""
+    try:
+        return main() or 0
+    except HilrigError as error:
+        for line in str(error).splitlines():
+            print(f"hilrig: error: {line}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has seen enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
