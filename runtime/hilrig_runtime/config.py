@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, IPvAnyNetwork, PrivateAttr, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.scene_config import SceneConfig
-from hilrig_runtime.sections import Name, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_runtime.sections import Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
@@ -154,7 +154,7 @@ class RigSettings(Section):
     name: Name = "rig1"
     port: Port | None = None
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
-    allow: tuple[IPvAnyNetwork, ...] = ()
+    allow: tuple[Network, ...] = ()
     """Networks whose hosts may connect, as "192.168.7.0/24"; none named: all."""
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None
@@ -175,7 +175,7 @@ class RigsTable(Section):
     count: Annotated[int, Field(ge=1, le=MOST_RIGS)] = 1
     """How many there are; they are called <prefix>1, <prefix>2, …"""
     prefix: Name = "rig"
-    allow: tuple[IPvAnyNetwork, ...] = ()
+    allow: tuple[Network, ...] = ()
     """As of a single rig, for all of them."""
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None

@@ -3,10 +3,13 @@
 Made from the models of `config`, so that it can't say anything else than they do.
 """
 
+import ast
+import inspect
 import json
 import textwrap
 import types
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -24,6 +27,7 @@ def lab_template() -> str:
 
 
 def _lines(section: Section, path: tuple[str, ...], *, explained: bool = True) -> Iterator[str]:
+    meanings = _meanings(type(section))
     tables: list[tuple[str, Any]] = []
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
@@ -31,12 +35,12 @@ def _lines(section: Section, path: tuple[str, ...], *, explained: bool = True) -
             tables.append((name, value))
             continue
         if explained:
-            yield from _explanation(field)
+            yield from _explanation(field, meanings.get(name, ""))
         yield f"# {name} =" if value is None else f"{name} = {_literal(value)}"
     for name, value in tables:
         field = type(section).model_fields[name]
         yield ""
-        yield from _explanation(field)
+        yield from _explanation(field, meanings.get(name, ""))
         here = (*path, name)
         if isinstance(value, Section):
             yield from _about(type(value))
@@ -55,8 +59,20 @@ def _about(model: type[Section]) -> Iterator[str]:
     yield from _comment((model.__doc__ or "").strip().split("\n\n")[0])
 
 
-def _explanation(field: FieldInfo) -> Iterator[str]:
-    text = field.description or ""
+def _meanings(model: type[Section]) -> dict[str, str]:
+    """What stands below each key in the model's source; read here, for every process of a lab imports the models."""
+    found = {}
+    for one in (one for one in reversed(model.__mro__) if issubclass(one, Section)):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+        assert isinstance(definition, ast.ClassDef)
+        for key, below in pairwise(definition.body):
+            match key, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = text
+    return found
+
+
+def _explanation(field: FieldInfo, text: str) -> Iterator[str]:
     choices = _choices(field.annotation)
     if choices:
         text = f"{text} One of {', '.join(choices)}.".strip()
