@@ -55,13 +55,13 @@ class BatchSender:
 
 
 class Gatherer:
-    """Sends messages of single rigs as they come; where many rigs speak, those of a short while together.
+    """Sends messages of single rigs as they come; where there are many, those of a short while together.
 
     `later` is asked to call a function in that while; `urgent` says that even so nothing may wait now.
     """
 
     MANY: Final = 32
-    """Rigs that spoke since the last `look`."""
+    """Messages since the last `look`."""
 
     def __init__(
         self,
@@ -76,23 +76,23 @@ class Gatherer:
         self._source = source
         self._rigs: list[str] = []
         self._messages: list[bytes] = []
-        self._spoke: set[str] = set()
+        self._count = 0
         self._waits = False
 
     def add(self, rig: str, payload: bytes) -> None:
         """Send an encoded message of a rig."""
         self._rigs.append(rig)
         self._messages.append(payload)
-        self._spoke.add(rig)
+        self._count += 1
         if not self._waits or self._urgent():
             self.flush()
         elif len(self._rigs) == 1:
             self._later(self.flush)
 
     def look(self) -> None:
-        """Once a tick: decide from who spoke since then whether messages wait for each other."""
-        self._waits = len(self._spoke) >= self.MANY
-        self._spoke.clear()
+        """Once a tick: decide from how many messages there were since then whether they wait for each other."""
+        self._waits = self._count >= self.MANY
+        self._count = 0
         self.flush()
 
     def flush(self) -> None:

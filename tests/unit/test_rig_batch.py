@@ -1,6 +1,7 @@
 """Messages of many rigs together: recorded each under its own key, the newest kept, nobody speaks for another's rig."""
 
 from collections.abc import Callable
+from functools import partial
 
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import parse_lab
@@ -77,63 +78,71 @@ def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
         assert latest.get("rig2") is None
 
 
-def test_where_few_rigs_speak_each_message_leaves_at_once() -> None:
-    hub, waiting = MemoryHub(), list[Callable[[], None]]()
-    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
-    gatherer = Gatherer(
-        "edge/1",
-        MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic),
-        waiting.append,
-        lambda: False,
-    )
-    # However often: one controller that writes as fast as it can must not wait.
-    for _ in range(100):
-        gatherer.add("rig1", b"x")
-    gatherer.look()
-    gatherer.add("rig1", b"y")
-    assert len(heard.payloads) == 101
-    assert waiting == []
+class Gathering:
+    """A gatherer, what it sends, and what it asks to be called later."""
+
+    def __init__(self) -> None:
+        hub = MemoryHub()
+        self.heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
+        self.waiting: list[Callable[[], None]] = []
+        self.urgent = False
+        publisher = MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic)
+        self.gatherer = Gatherer("edge/1", publisher, self.waiting.append, lambda: self.urgent)
+        self.rigs = {f"rig{number}": partial(self.gatherer.add, f"rig{number}") for number in range(Gatherer.MANY)}
+
+    def speak_often(self) -> None:
+        for send in self.rigs.values():
+            send(b"x")
+        self.gatherer.look()
+        self.heard.payloads.clear()
 
 
-def test_where_many_rigs_speak_those_of_a_short_while_leave_together() -> None:
-    hub, waiting = MemoryHub(), list[Callable[[], None]]()
-    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
-    gatherer = Gatherer(
-        "edge/1",
-        MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic),
-        waiting.append,
-        lambda: False,
-    )
-    for number in range(Gatherer.MANY):
-        gatherer.add(f"rig{number}", b"x")
-    gatherer.look()
-    heard.payloads.clear()
-    gatherer.add("rig1", b"a")
-    gatherer.add("rig2", b"b")
-    assert heard.payloads == []
-    assert len(waiting) == 1
-    waiting.pop()()
-    assert heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
-    # Fewer speak again: what waits is sent, and nothing waits any more.
-    gatherer.add("rig1", b"c")
-    gatherer.look()
-    gatherer.add("rig1", b"d")
-    assert [batch["rig1"] for batch in heard.batches()[1:]] == [b"c", b"d"]
+def test_where_there_are_few_each_message_leaves_at_once() -> None:
+    one = Gathering()
+    for _ in range(3):
+        for _ in range(Gatherer.MANY - 1):
+            one.rigs["rig1"](b"x")
+        one.gatherer.look()
+    assert len(one.heard.payloads) == 3 * (Gatherer.MANY - 1)
+    assert one.waiting == []
+
+
+def test_where_there_are_many_those_of_a_short_while_leave_together() -> None:
+    many = Gathering()
+    many.speak_often()
+    many.rigs["rig1"](b"a")
+    many.rigs["rig2"](b"b")
+    assert many.heard.payloads == []
+    assert len(many.waiting) == 1
+    many.waiting.pop()()
+    assert many.heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
+    # There are fewer again: what waits is sent, and nothing waits any more.
+    many.rigs["rig1"](b"c")
+    many.gatherer.look()
+    many.rigs["rig1"](b"d")
+    assert [batch["rig1"] for batch in many.heard.batches()[1:]] == [b"c", b"d"]
+
+
+def test_of_one_controller_that_writes_very_often_every_command_leaves_in_its_order() -> None:
+    fast = Gathering()
+    for _ in range(Gatherer.MANY):
+        fast.rigs["rig1"](b"x")
+    fast.gatherer.look()
+    fast.heard.payloads.clear()
+    for payload in (b"a", b"b", b"c"):
+        fast.rigs["rig1"](payload)
+    fast.waiting.pop()()
+    (batch,) = map(RigBatch.FromString, fast.heard.payloads)
+    assert (list(batch.rigs), list(batch.messages)) == (["rig1"] * 3, [b"a", b"b", b"c"])
 
 
 def test_what_is_urgent_does_not_wait_and_takes_along_what_waits() -> None:
-    hub, waiting, urgent = MemoryHub(), list[Callable[[], None]](), [False]
-    heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
-    publisher = MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic)
-    gatherer = Gatherer("edge/1", publisher, waiting.append, lambda: urgent[0])
-    for number in range(Gatherer.MANY):
-        gatherer.add(f"rig{number}", b"x")
-    gatherer.look()
-    heard.payloads.clear()
-    gatherer.add("rig1", b"a")
-    urgent[0] = True
-    gatherer.add("rig2", b"b")
-    assert heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
+    many = Gathering()
+    many.speak_often()
+    many.rigs["rig1"](b"a")
+    many.urgent = True
+    many.rigs["rig2"](b"b")
+    assert many.heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
 
 
 def test_sending_for_long_takes_no_memory() -> None:
