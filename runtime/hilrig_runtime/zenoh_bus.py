@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import zenoh
-import zenoh.ext
 
 from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
@@ -19,10 +18,9 @@ from hilrig_runtime.zenoh_config import (
     system_reason,
     zenoh_config,
 )
-from hilrig_runtime.zenoh_recording import CACHE_SAMPLES, CompleteStream
+from hilrig_runtime.zenoh_recording import CompleteStream, declare_recording_publisher
 from hilrig_schemas.topics import Traffic
 
-_HEARTBEAT_S: Final = 0.25
 _GOSSIP_S: Final = 1.0
 """Ample: gossip takes some 50 ms where nothing else runs."""
 _PRIORITIES: Final = {
@@ -115,21 +113,7 @@ class ZenohBus(Bus):
     def publisher(self, key: str, traffic: Traffic) -> Publisher:
         """See `Bus.publisher`."""
         if traffic is Traffic.RECORDING:
-            return _ZenohPublisher(
-                zenoh.ext.declare_advanced_publisher(
-                    self.session,
-                    key,
-                    # Dropped rather than waited for: the control path must not feel a slow recorder, and the cache
-                    # gives back what was dropped.
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    priority=_PRIORITIES[traffic],
-                    cache=zenoh.ext.CacheConfig(CACHE_SAMPLES),
-                    sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                        heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S
-                    ),
-                    publisher_detection=True,
-                )
-            )
+            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic]))
         return _ZenohPublisher(
             self.session.declare_publisher(
                 key,

@@ -1,26 +1,59 @@
-"""A complete stream out of zenoh's advanced subscriber: what a publisher sent before its first live message too.
+"""A complete stream out of zenoh's advanced publishers: live samples, and what is missing out of their caches.
 
-The advanced subscriber recovers gaps, and fetches the history of the publishers that it finds. Two things escape it.
-When a publisher's first live sample overtakes that history, as it does when a link comes up under load, the history
-is taken for old and dropped. And a gap is asked for once: when that question or its answers are lost, on a link that
-has just come back, the gap is given up. So here the sample behind a gap is held, with all that follow it, until the
-source's own cache has said what went before; what it does not say at once is asked for again.
+zenoh's advanced subscriber would ask for all that is missing at once, and while a cache answers, its publisher's next
+put waits: a recorder that came back to a class of rigs held the simulation up until it had taken in seconds of batches.
+It asks for a gap only once, too, and takes the history of a publisher for old whose first live sample overtakes it. So
+this subscribes to plain samples, and a thread of its own fetches what is missing in small pieces, one after the other,
+until all is there or can't be had any more.
 """
 
+import logging
 import threading
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass
 from typing import Any, Final
 
 import zenoh
 import zenoh.ext
 
 from hilrig_runtime.bus import Handle, OnLoss, OnMessage
+from hilrig_runtime.in_order import InOrder
 
 CACHE_SAMPLES: Final = 500
 """What a publisher can repeat: 10 s at 50 batches a second."""
-_RECALL_TIMEOUT_S: Final = 2.0
-_RECALLS: Final = 3
-"""How often a gap is asked for before it is given up."""
+PIECE_BYTES: Final = 256 * 1024
+"""Of samples asked for at once: little enough to lie in the buffers between two processes."""
+_PAUSE_S: Final = 0.002
+"""Between two pieces, so that what is live goes on."""
+_OVERTAKEN_S: Final = 0.1
+"""A heartbeat may come before the sample that it tells of."""
+_ASK_TIMEOUT_S: Final = 1.0
+_ASK_AGAIN_S: Final = 0.25
+_GIVE_UP_S: Final = 10.0
+"""After so long without an answer the cache, at its usual rate, no longer has what is missing."""
+_HEARTBEAT_S: Final = 0.25
+
+logger = logging.getLogger(__name__)
+
+
+def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority) -> Any:
+    """A publisher with a cache. It never waits: what a slow reader has no room for is dropped, and can be repeated."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=priority,
+        cache=zenoh.ext.CacheConfig(
+            CACHE_SAMPLES,
+            # The cache is locked while it answers: it must not wait for a reader that is held up. Who misses an answer
+            # asks again.
+            replies_config=zenoh.ext.RepliesConfig(
+                congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.BACKGROUND, express=False
+            ),
+        ),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+        publisher_detection=True,
+    )
 
 
 @dataclass(slots=True)
@@ -29,16 +62,21 @@ class _Source:
 
     cache: str
     """Where its cache is asked."""
-    next: int | None = None
-    """Number of the sample that is due; None: nothing of it was delivered yet."""
-    held: list[zenoh.Sample] | None = None
-    """Samples behind a gap, while it is asked for."""
-    found: dict[int, zenoh.Sample] = field(default_factory=dict)
-    recalls: int = 0
+    samples: InOrder[zenoh.Sample]
+    size: int = PIECE_BYTES
+    """Of its newest sample, bytes."""
+    is_new: bool = True
+    """It is not known yet what it sent before."""
+    ask_at_s: float = 0.0
+    """When to ask next, if something is missing; monotonic clock."""
+    since_s: float = 0.0
+    """Since when something is missing and nothing came of it."""
+    is_behind: bool = False
+    """Something is missing."""
 
 
 class CompleteStream(Handle):
-    """Subscribes to the advanced publishers on `key_expr`; messages of each come in order and without a gap.
+    """Subscribes to the recording publishers on `key_expr`; messages of each come in order and without a gap.
 
     `on_loss` hears how many messages of a publisher could not be recovered.
     """
@@ -47,21 +85,30 @@ class CompleteStream(Handle):
         self._session = session
         self._on_message = on_message
         self._on_loss = on_loss
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
+        self._closing = False
         self._sources: dict[str, _Source] = {}
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            session,
-            key_expr,
-            self._on_sample,
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=CACHE_SAMPLES),
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        self._declared: list[Any] = [subscriber]
+        self._thread = threading.Thread(target=self._fetch, name="fetching", daemon=True)
+        self._thread.start()
+        publishers = f"{key_expr}/@adv/pub/*/*/*"
+        self._declared: list[Any] = [
+            session.declare_subscriber(key_expr, self._on_sample),
+            session.declare_subscriber(publishers, self._on_heartbeat),
+            session.liveliness().declare_subscriber(publishers, self._on_token, history=True),
+        ]
 
     def close(self) -> None:
-        """See `Handle.close`."""
+        """See `Handle.close`; what waited behind a gap is delivered."""
         while self._declared:
             self._declared.pop().undeclare()
+        with self._changed:
+            if not self._closing:
+                self._closing = True
+                self._changed.notify()
+                for source in self._sources.values():
+                    source.samples.finish()
+
+    # -- what comes -------------------------------------------------------------------------------------------------
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         info = sample.source_info
@@ -69,78 +116,118 @@ class CompleteStream(Handle):
             self._deliver(sample)
             return
         identity = f"{info.source_id.zid}/{info.source_id.eid}"
-        with self._lock:
-            source = self._sources.get(identity)
-            if source is None:
-                source = self._sources[identity] = _Source(f"{sample.key_expr}/@adv/pub/{identity}/*")
-            if source.held is not None:
-                source.held.append(sample)
-                return
-            self._take(source, [sample])
-            gap = source.held is not None
-        if gap:
-            self._recall(source)
+        with self._changed:
+            source = self._source(f"{sample.key_expr}/@adv/pub/{identity}/*")
+            source.size = max(1, len(sample.payload))
+            source.is_new = False
+            source.samples.take(int(info.source_sn), sample)
+            self._look(source)
 
-    def _take(self, source: _Source, samples: list[zenoh.Sample]) -> None:
-        """Deliver samples up to the first gap; what stands behind it is held. The lock is held."""
-        for at, sample in enumerate(samples):
-            number = _number(sample)
-            due = 0 if source.next is None else source.next
-            if number > due:
-                source.held = samples[at:]
-                return
-            if number == due:
-                self._deliver(sample)
-                source.next = number + 1
+    def _on_heartbeat(self, sample: zenoh.Sample) -> None:
+        with self._changed:
+            source = self._source(_cache_of(sample))
+            source.samples.announce(int.from_bytes(sample.payload.to_bytes(), "little"))
+            self._look(source, _OVERTAKEN_S)
 
-    def _recall(self, source: _Source) -> None:
-        """Ask a publisher's cache for what it sent before the first sample that is held."""
-        assert source.held is not None
-        first = 0 if source.next is None else source.next
-        last = _number(source.held[0]) - 1
-        source.recalls += 1
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            with self._changed:
+                # Also after an outage: what was sent last may be what is missing.
+                source = self._source(_cache_of(sample))
+                source.is_new = True
+                self._look(source)
 
-        def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None and reply.ok.source_info is not None and first <= _number(reply.ok) <= last:
-                source.found[_number(reply.ok)] = reply.ok
+    def _source(self, cache: str) -> _Source:
+        source = self._sources.get(cache)
+        if source is None:
+            samples: InOrder[zenoh.Sample] = InOrder(self._deliver, self._on_loss, CACHE_SAMPLES)
+            source = self._sources[cache] = _Source(cache, samples)
+        return source
 
-        def on_all() -> None:
-            with self._lock:
-                self._settle(source, first, last)
-                again = source.held is not None
-            if again and self._declared:
-                self._recall(source)
-
-        self._session.get(
-            f"{source.cache}?_max={CACHE_SAMPLES};_sn={first}..{last}",
-            zenoh.handlers.Callback(on_reply, on_all),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            timeout=_RECALL_TIMEOUT_S,
-        )
-
-    def _settle(self, source: _Source, first: int, last: int) -> None:
-        """Deliver what the cache said, and what was held behind the gap, unless the gap is to be asked for again."""
-        found = sorted(source.found)
-        # What a source sent before it was first heard may be older than its cache reaches: that is no loss.
-        begin = first if source.next is not None else (found[0] if found else last + 1)
-        missing = last + 1 - begin - len(found)
-        if missing and source.recalls < _RECALLS:
-            return
-        for number in found:
-            self._deliver(source.found[number])
-        source.found.clear()
-        source.recalls = 0
-        source.next = last + 1
-        if missing:
-            self._on_loss(missing)
-        held, source.held = source.held or [], None
-        self._take(source, held)
+    def _look(self, source: _Source, wait_s: float = 0.0) -> None:
+        """See whether something is missing; if so, it is asked for after a while."""
+        was_behind, source.is_behind = source.is_behind, source.is_new or bool(source.samples.missing(1))
+        if source.is_behind and not was_behind:
+            source.since_s = time.monotonic()
+            source.ask_at_s = source.since_s + wait_s
+            self._changed.notify()
 
     def _deliver(self, sample: Any) -> None:
         self._on_message(str(sample.key_expr), sample.payload.to_bytes())
 
+    # -- what is fetched --------------------------------------------------------------------------------------------
 
-def _number(sample: Any) -> int:
-    return int(sample.source_info.source_sn)
+    def _fetch(self) -> None:
+        while True:
+            with self._changed:
+                source = self._next()
+                if source is None:
+                    return
+                question = f"{source.cache}?{_wanted(source)}"
+            got = self._ask(source, question)
+            with self._changed:
+                self._judge(source, got)
+            time.sleep(_PAUSE_S)
+
+    def _next(self) -> _Source | None:
+        """Wait for the source that is to be asked next, something of which is missing; None: the stream is closed."""
+        while not self._closing:
+            behind = [source for source in self._sources.values() if source.is_behind]
+            first = min(behind, key=lambda source: source.ask_at_s, default=None)
+            wait_s = None if first is None else first.ask_at_s - time.monotonic()
+            if wait_s is not None and wait_s <= 0:
+                return first
+            self._changed.wait(wait_s)
+        return None
+
+    def _ask(self, source: _Source, question: str) -> int:
+        """Ask a source's cache; gives how many samples it had that are new."""
+        got = 0
+        try:
+            replies = self._session.get(
+                question,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=_ASK_TIMEOUT_S,
+            )
+            for reply in replies:
+                sample = reply.ok
+                if sample is None or sample.source_info is None:
+                    continue
+                with self._changed:
+                    if self._closing:
+                        break
+                    got += source.samples.take(int(sample.source_info.source_sn), sample)
+                    source.size = max(1, len(sample.payload))
+                    source.is_new = False
+        except zenoh.ZError as error:
+            logger.debug("%s can't be asked: %s", question, error)
+        return got
+
+    def _judge(self, source: _Source, got: int) -> None:
+        """Ask on at once where something came of it, after a while where nothing did, and one day not at all."""
+        now_s = time.monotonic()
+        if got:
+            source.since_s = now_s
+            source.ask_at_s = now_s
+        else:
+            source.ask_at_s = now_s + _ASK_AGAIN_S
+        if now_s - source.since_s > _GIVE_UP_S:
+            source.samples.give_up()
+            source.is_new = False
+            source.since_s = now_s
+        self._look(source)
+
+
+def _wanted(source: _Source) -> str:
+    """What to ask a cache for: the next piece, or of a source that is new its newest sample, to know what there is."""
+    if source.is_new:
+        return "_max=1"
+    numbers = source.samples.missing(max(1, PIECE_BYTES // source.size))
+    return f"_max={len(numbers)};_sn={numbers.start}..{numbers.stop - 1}"
+
+
+def _cache_of(sample: zenoh.Sample) -> str:
+    """Where the cache of the publisher is asked whose token or heartbeat this is."""
+    return f"{str(sample.key_expr).rpartition('/')[0]}/*"
