@@ -4,6 +4,9 @@ A C controller on libmodbus polls as fast as it can against the whole lab (simul
 processes, as `hilrig up` starts them), at steps of 20, 5 and 1 ms. In the same run, on the same machine: a message
 that goes from one Python process to another over zenoh and back, and the same C controller against the least Modbus
 server that libmodbus makes. Latency is what `hilrig latency` finds in the recording.
+
+What recording costs is measured in one lab that runs on while its recorder comes and goes, in turns. Latency is then
+what the states themselves say, as a witness on the bus hears them.
 """
 
 import json
@@ -15,6 +18,7 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +28,17 @@ from harness import Report, build_c, percentile, progress
 from hilrig_cli.demo import free_ports
 from hilrig_cli.jitter import stolen_s
 from hilrig_cli.lab import running_lab
-from hilrig_runtime.config import BusConfig, load_lab
+from hilrig_cli.supervisor import WHOLE_LAB, Supervisor
+from hilrig_runtime.config import BusConfig, LabConfig, load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas.topics import STATE, Traffic
+from hilrig_schemas import JointState
+from hilrig_schemas.topics import STATE, Traffic, alive_key
 
 QUESTION = "How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?"
-STEPS_MS = (20.0, 5.0, 1.0)
+RUN_S = {20.0: 20.0, 5.0: 12.0, 1.0: 12.0}
+"""How long a run takes at each step, ms: a thousand samples or more."""
+WINDOW_S = {20.0: 7.0, 5.0: 5.0}
+"""How long each turn with or without a recorder takes."""
 QUIET_SHARE = 0.002
 """Of one processor, taken away by the host on average, that a run may have had."""
 
@@ -37,7 +46,7 @@ QUIET_SHARE = 0.002
 def measure(report: Report, quick: bool) -> None:
     client = build_c("loop_client.c")
     echo = build_c("modbus_echo_server.c")
-    runs, seconds = (1, 5.0) if quick else (3, 20.0)
+    runs = 1 if quick else 3
 
     progress("bare Modbus round trip")
     bare_modbus = [modbus_round_trip(client, echo, 2.0) for _ in range(runs)]
@@ -48,7 +57,7 @@ def measure(report: Report, quick: bool) -> None:
     report.add("bare zenoh, 50 Hz", "round trip p50", zenoh_p50, "µs")
     report.add("bare zenoh, 50 Hz", "round trip p99", zenoh_p99, "µs")
 
-    for step_ms in STEPS_MS:
+    for step_ms, seconds in RUN_S.items():
         runs_of_step: list[tuple[float, dict[str, Any], dict[str, Any]]] = []
         # On a virtual machine the host may take the processors away for tens of milliseconds: such a run says nothing
         # of the rig, so up to as many again are made, and the quietest count. How much was taken is reported.
@@ -57,7 +66,7 @@ def measure(report: Report, quick: bool) -> None:
         ):
             progress(f"the rig at a step of {step_ms:g} ms, run {len(runs_of_step) + 1}")
             before, begin = stolen_s() or 0.0, time.monotonic()
-            latency, figures = rig_loop(client, step_ms, seconds)
+            latency, figures = rig_loop(client, step_ms, 5.0 if quick else seconds)
             runs_of_step.append((((stolen_s() or 0.0) - before) / (time.monotonic() - begin), latency, figures))
         quietest = sorted(runs_of_step, key=lambda run: run[0])[:runs]
         report.add(f"rig, {step_ms:g} ms", "runs made", len(runs_of_step), "count")
@@ -65,10 +74,13 @@ def measure(report: Report, quick: bool) -> None:
         report.add(f"rig, {step_ms:g} ms", "taken away by the host", max(run[0] for run in quietest), "processors")
         measured = [(latency, figures) for _, latency, figures in quietest]
         add_loop(report, step_ms, measured)
-        if step_ms == STEPS_MS[0]:
+        if step_ms == 20:
             reads = [client_figures for _, client_figures in measured]
             ours = report.add("rig, 20 ms", "Modbus read p50", median(reads, "read_us", "p50"), "µs")
             report.add("rig, 20 ms", "Modbus read against bare Modbus", ours / read_p50, "ratio")
+    for step_ms, seconds in WINDOW_S.items():
+        progress(f"with and without a recorder, at a step of {step_ms:g} ms")
+        add_cost_of_recording(report, step_ms, recorder_comes_and_goes(client, step_ms, 1 if quick else 4, seconds))
 
 
 def add_loop(report: Report, step_ms: float, measured: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
@@ -101,19 +113,95 @@ def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
 def rig_loop(client: Path, step_ms: float, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Latency report of one session against the whole lab, and the controller's own figures."""
     with tempfile.TemporaryDirectory() as folder:
-        config = Path(folder) / "lab.toml"
-        port, bus_port = free_ports(5020), free_ports(7447, 3)
-        config.write_text(
-            f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
-            f'[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = "{folder}"\n'
-        )
-        lab = load_lab(config)
-        with running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event()):
+        lab, config, port = write_lab(Path(folder), step_ms)
+        with running_lab(lab, config, say, threading.Event()):
             figures = run_client(client, port, seconds)
         (recording,) = Path(folder).rglob("*.mcap")
         command = [sys.executable, "-m", "hilrig_cli", "latency", str(recording), "--json"]
         output = subprocess.run(command, check=False, stdout=subprocess.PIPE, timeout=120).stdout
         return json.loads(output), figures
+
+
+def write_lab(folder: Path, step_ms: float) -> tuple[LabConfig, Path, int]:
+    """A lab of one rig, its file, and the rig's port."""
+    config = folder / "lab.toml"
+    port, bus_port = free_ports(5020), free_ports(7447, 3)
+    config.write_text(
+        f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
+        f'[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = "{folder}"\n'
+    )
+    return load_lab(config), config, port
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A turn of the controller."""
+
+    loop_ms: list[float]
+    """Loop latency of each command that took effect."""
+    cycles_per_s: float
+    stolen: float
+    """Taken away by the host, processors."""
+
+
+def recorder_comes_and_goes(client: Path, step_ms: float, pairs: int, seconds: float) -> list[tuple[Window, Window]]:
+    """Turns without and with a recorder, in pairs, in one lab that runs on."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        lab, config, port = write_lab(Path(folder), step_ms)
+        others = tuple(part for part in WHOLE_LAB if part.service != "recorder")
+        recorder = tuple(part for part in WHOLE_LAB if part.service == "recorder")
+        with (
+            running_lab(lab, config, say, threading.Event(), others),
+            ZenohBus(lab.bus, "tool") as bus,
+        ):
+            heard: list[bytes] = []
+            bus.subscribe(STATE.key(lab.name, lab.rigs[0].name), lambda _, payload: heard.append(payload))
+
+            def turn() -> Window:
+                heard.clear()
+                before, begin = stolen_s() or 0.0, time.monotonic()
+                figures = run_client(client, port, seconds)
+                stolen = ((stolen_s() or 0.0) - before) / (time.monotonic() - begin)
+                states = map(JointState.FromString, heard.copy())
+                loop_ms = [state.loop_latency_ns / 1e6 for state in states if state.basis_step]
+                return Window(loop_ms, figures["cycles_per_s"], stolen)
+
+            for pair in range(pairs):
+                without = turn() if pair % 2 == 0 else None
+                with Supervisor(config, say, recorder) as supervisor:
+                    supervisor.start()
+                    while not bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.5):
+                        supervisor.poll()
+                    # What it missed before it came it has fetched by then.
+                    time.sleep(1.0)
+                    recorded = turn()
+                found.append((without or turn(), recorded))
+    return found
+
+
+def add_cost_of_recording(report: Report, step_ms: float, pairs: list[tuple[Window, Window]]) -> None:
+    case = f"recorder off and on, {step_ms:g} ms"
+    report.add(case, "pairs of turns", len(pairs), "count")
+    for number, name in enumerate(("off", "on")):
+        windows = [pair[number] for pair in pairs]
+        pooled = [latency for window in windows for latency in window.loop_ms]
+        report.add(case, f"samples, {name}", len(pooled), "count")
+        report.add(case, f"loop p50, {name}", percentile(pooled, 0.5), "ms")
+        report.add(case, f"loop p99, {name}", percentile(pooled, 0.99), "ms")
+        report.add(case, f"Modbus cycles, {name}", statistics.median(window.cycles_per_s for window in windows), "1/s")
+        report.add(
+            case, f"taken away by the host, {name}", statistics.mean(one.stolen for one in windows), "processors"
+        )
+    cycles = statistics.median(on.cycles_per_s / off.cycles_per_s for off, on in pairs)
+    report.add(case, "Modbus cycles, on over off, median of pairs", cycles, "ratio")
+    # Of each pair, as the two are neighbours in time: what else the machine does is the same then.
+    ratio = statistics.median(percentile(on.loop_ms, 0.99) / percentile(off.loop_ms, 0.99) for off, on in pairs)
+    report.bar(f"{step_ms:g} ms step: loop p99 with a recorder over without", ratio, "<=", 1.1)
+
+
+def say(line: str) -> None:
+    print(line, file=sys.stderr)
 
 
 def run_client(client: Path, port: int, seconds: float) -> dict[str, Any]:
