@@ -12,6 +12,7 @@ from hilrig_cli.commands import (
     certs,
     check,
     compare,
+    console,
     demo,
     doctor,
     export,
@@ -55,6 +56,7 @@ REVIEW = "Review what was recorded"
 app.command(rich_help_panel=RUN)(up.up)
 app.command(rich_help_panel=RUN)(demo.demo)
 app.command(rich_help_panel=RUN)(live.live)
+app.command(rich_help_panel=RUN)(console.console)
 app.command(rich_help_panel=RUN)(top.top)
 app.command(rich_help_panel=RUN)(metrics.metrics)
 app.command(rich_help_panel=RUN)(check.check)

@@ -66,10 +66,10 @@ class RigView:
             return "no edge"
         if not self.simulated:
             return "no simulation"
-        if self.watchdog_tripped:
-            return "watchdog tripped"
         if not self.controller:
             return "free"
+        if self.watchdog_tripped:
+            return "watchdog tripped"
         return "no command" if self.safe else "in use"
 
 

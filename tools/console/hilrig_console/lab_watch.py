@@ -26,8 +26,8 @@ class LabWatch:
         self.view = LabView(tuple(rig.name for rig in lab.rigs))
         self.lock = threading.Lock()
         self._heard: dict[str, int] = {}
-        self.bus = ZenohBus(lab.bus, "tool")
-        self.bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._hear)
+        self._bus = ZenohBus(lab.bus, "tool")
+        self._bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._hear)
 
     def wait(self) -> None:
         """Wait until every service that is there was heard twice, so that its share of a processor is known.
@@ -37,7 +37,7 @@ class LabWatch:
         """
         deadline_s = time.monotonic() + FIRST_REPORTS_S
         while time.monotonic() < deadline_s:
-            expected = {f"{roster.service}/{roster.instance}" for roster in rosters(self.bus, self.lab.name)}
+            expected = {f"{roster.service}/{roster.instance}" for roster in rosters(self._bus, self.lab.name)}
             with self.lock:
                 if expected and all(self._heard.get(name, 0) > 1 for name in expected):
                     return
@@ -64,4 +64,4 @@ class LabWatch:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.bus.close()
+        self._bus.close()

@@ -1,0 +1,89 @@
+"""`hilrig console`: the lab in a browser."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilrig_cli.options import Config
+
+
+def console(
+    config: Config = None,
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to answer; :8050 alone is every address of this host.")
+    ] = "127.0.0.1:8050",
+    password_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Its first line is the password. Without: none on loopback, elsewhere a new one that is printed.",
+            show_default=False,
+        ),
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="PEM", help="Answer by HTTPS with this certificate.", show_default=False)
+    ] = None,
+    key: Annotated[Path | None, typer.Option(metavar="PEM", help="The certificate's key.", show_default=False)] = None,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="Name by which browsers call this host, beside its own; may be given again."),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only ask whether the console at --listen is well, as health checks do.")
+    ] = False,
+) -> None:
+    """Show the lab to browsers until Ctrl-C: every rig live, services, events, recordings with their reports.
+
+    It only looks: nothing on the bus and nothing of a rig can be changed by it.
+    """
+    import platform
+    import secrets
+    import threading
+
+    from hilrig_console.guard import Guard, own_names
+    from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
+    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.ending import end_when_closing_hangs, stop_on_signals
+    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.realtime import yield_to_others
+
+    if (certificate is None) != (key is None):
+        raise InputError("--certificate and --key belong together: give both")
+    tls = None if certificate is None or key is None else TlsFiles(certificate, key)
+    address = Address.of(listen)
+    if check:
+        ask_health(address, tls)
+        return
+    lab = load_lab(config)
+    password = _password(password_file) if password_file is not None else ""
+    invented = not password and not address.is_private
+    if invented:
+        password = secrets.token_urlsafe(12)
+    names = own_names([platform.node(), address.host, *(name or [])])
+    yield_to_others()
+    stopping = threading.Event()
+    stop_on_signals(stopping)
+    end_when_closing_hangs(stopping, 8.0)
+    with ConsoleServer(lab, address, Guard(password, names), tls) as server:
+        print(f"console of lab {lab.name}: {server.url}", flush=True)
+        if invented:
+            print(f"password: {password} (any user name)", flush=True)
+        if tls is None and not address.is_private:
+            print("hilrig: without --certificate and --key the password can be overheard", file=sys.stderr, flush=True)
+        stopping.wait()
+
+
+def _password(file: Path) -> str:
+    from hilrig_console.guard import SHORTEST_PASSWORD
+    from hilrig_runtime.errors import InputError
+
+    try:
+        password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no text"
+        raise InputError(f"--password-file: {file} can't be read: {reason}") from error
+    if len(password) < SHORTEST_PASSWORD:
+        raise InputError(f"--password-file: {file}: its first line must have at least {SHORTEST_PASSWORD} characters")
+    return password

@@ -1,0 +1,79 @@
+"""The newest pose of each rig out of the batches of states that a simulation sends. Pure: batches and time come in.
+
+Most states leave the parts out, so every state is looked at, not only a rig's newest.
+"""
+
+from typing import Any, Final
+
+from google.protobuf.message import DecodeError
+
+from hilrig_console.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
+from hilrig_console.lab_view import SILENT_S
+from hilrig_runtime.errors import InputError
+from hilrig_schemas import JointState, RigBatch, RigConfig
+from hilrig_sim.model import ArmParameters, RigParameters
+
+_STATE: Final = JointState.FromString
+
+
+class _Rig:
+    def __init__(self) -> None:
+        self.incarnation = 0
+        self.heard_s = 0.0
+        self.pose: Pose | None = None
+        self.parts: list[list[int]] = []
+        self.arm: ArmParameters | None = None
+        self.scene = -1
+        self.asked_for = 0
+
+
+class Poses:
+    """What is drawn of each rig."""
+
+    def __init__(self) -> None:
+        self._rigs: dict[str, _Rig] = {}
+        self.scenes: list[Scene] = []
+        """What stands still, each once however many rigs have it."""
+
+    def hear(self, payload: bytes, now_s: float) -> None:
+        """Take an encoded batch of states that came at `now_s`; what can't be decoded is left out."""
+        try:
+            batch = RigBatch.FromString(payload)
+            for name, message in zip(batch.rigs, batch.messages, strict=False):
+                state = _STATE(message)
+                rig = self._rigs.setdefault(name, _Rig())
+                rig.incarnation, rig.heard_s = state.incarnation, now_s
+                if rig.arm is not None and len(state.position) == 4:
+                    rig.pose = pose_of(rig.arm, state)
+                if state.parts:
+                    rig.parts = parts_of(state)
+        except DecodeError:
+            return
+
+    def unknown(self) -> list[str]:
+        """Rigs of which it is not known yet what they look like, or no longer: their simulation started anew."""
+        return [name for name, rig in self._rigs.items() if rig.asked_for != rig.incarnation]
+
+    def learn(self, name: str, config: RigConfig | None) -> None:
+        """Take a rig's answer to what it is; None: it gave none."""
+        rig = self._rigs.get(name)
+        if rig is None or config is None:
+            return
+        # Once a run of its simulation, also where the answer is of no use.
+        rig.asked_for = rig.incarnation
+        try:
+            parameters = RigParameters.from_json(config.parameters_json)
+        except InputError:
+            return
+        scene = scene_of(parameters)
+        if scene not in self.scenes:
+            self.scenes.append(scene)
+        rig.arm, rig.scene = parameters.arm, self.scenes.index(scene)
+
+    def drawn(self, now_s: float) -> dict[str, list[Any]]:
+        """Of each rig that was heard lately: number of its scene, pose, places of its parts."""
+        for name in [name for name, rig in self._rigs.items() if now_s - rig.heard_s > SILENT_S]:
+            del self._rigs[name]
+        return {
+            name: [rig.scene, rig.pose, rig.parts] for name, rig in self._rigs.items() if rig.pose and rig.scene >= 0
+        }
