@@ -13,6 +13,7 @@ from hilrig_runtime.bus import Publisher
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.presence import ClockOffset
 from hilrig_runtime.rate import Tick
+from hilrig_runtime.realtime import realtime_priority
 from hilrig_schemas import Health, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
@@ -66,6 +67,7 @@ class HealthReporter:
             "incarnation": incarnation,
             "host": platform.node(),
             "software_version": version("hilrig"),
+            "realtime_priority": realtime_priority(),
         }
         self._clock = clock
         self._start_ns = clock.monotonic_ns()

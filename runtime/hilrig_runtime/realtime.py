@@ -45,6 +45,14 @@ def go_realtime(priority: int) -> bool:
     return True
 
 
+def realtime_priority() -> int:
+    """Priority of this thread under the real-time policy; 0: it is under the ordinary one."""
+    if sys.platform != "linux":
+        return 0
+    # Under the ordinary policies it is 0.
+    return os.sched_getparam(0).sched_priority
+
+
 def prefer_latency() -> None:
     """Ask for punctual wake-ups for this thread and for those that it starts from now on; no right is needed."""
     # A callback thread shares the interpreter with the loop: hand over ten times as often as by default.

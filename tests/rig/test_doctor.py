@@ -33,6 +33,8 @@ def test_a_lab_that_runs_is_well(lab: RunningLab) -> None:
     assert json.loads(done.stdout)["well"] is True
     assert "2 of 2 Modbus ports served by hilrig" in found["ports"][0]["text"]
     assert all(name in found["services"][0]["text"] for name in ("sim/1", "edge/1", "recorder/1"))
+    assert len(found["real-time"]) in (1, 2)
+    assert "edge/1" in "".join(finding["text"] for finding in found["real-time"])
     assert found["versions"][0]["level"] == found["time"][0]["level"] == "good"
     table = hilrig("doctor", "--config", lab.config, cwd=lab.config.parent)
     assert table.returncode == 0

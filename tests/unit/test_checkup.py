@@ -13,6 +13,7 @@ from hilrig_cli.checkup import Finding, Level, host, services
 from hilrig_cli.checkup.certificates import check_certificates
 from hilrig_modbus_edge.certificates import Identity, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.config import LabConfig, parse_lab
+from hilrig_runtime.realtime import realtime_priority
 from hilrig_schemas import Health
 
 NAMES = ["router", "sim", "edge", "recorder", "operator", "viewer"]
@@ -215,6 +216,36 @@ def test_a_service_that_is_missing_silent_or_in_trouble_is_named() -> None:
     troubled.healths["recorder/1"][0].trouble = "the disk is full"
     assert "recorder/1: the disk is full" in only_wrong(services.check_services(lab, troubled))
     assert by_level(services.check_services(lab, heard()))[Level.NOTICE] == ["nothing of lab 'lab' runs"]
+
+
+def test_a_service_that_the_system_did_not_grant_real_time_is_noticed_with_what_to_mend() -> None:
+    lab = parse_lab("")
+    [granted] = services.check_realtime(lab, heard(*ALL, realtime_priority=1))
+    assert (granted.level, granted.text) == (Level.GOOD, "granted to edge/1 (priority 1), sim/1 (priority 1)")
+    refused = heard("sim/1", "edge/1", realtime_priority=2)
+    refused.healths["edge/1"][0].realtime_priority = 0
+    refused.healths["edge/1"][0].host = "left"
+    [finding] = services.check_realtime(lab, refused)
+    assert finding.level is Level.NOTICE
+    assert "edge/1 on left was not granted" in finding.text
+    assert "rtprio 2" in finding.mend
+    [unwanted] = services.check_realtime(parse_lab("realtime = false"), refused)
+    assert unwanted.level is Level.GOOD
+    assert "not asked for" in unwanted.text
+
+
+@pytest.mark.parametrize("granted", [True, False])
+def test_before_a_lab_runs_this_host_is_asked_for_real_time(granted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(services, "go_realtime", lambda _: granted)
+    [finding] = services.check_realtime(parse_lab(""), heard())
+    assert finding.level is (Level.GOOD if granted else Level.NOTICE)
+    assert "this host" in finding.text
+
+
+def test_the_trial_leaves_this_thread_as_it_was() -> None:
+    before = realtime_priority()
+    list(services.check_realtime(parse_lab(""), heard()))
+    assert realtime_priority() == before
 
 
 def test_another_version_is_wrong_where_it_is_not_compatible() -> None:

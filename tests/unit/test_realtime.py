@@ -57,7 +57,7 @@ def _asked_for_realtime(connection: Connection) -> None:
     thread = threading.Thread(target=lambda: policies.append(os.sched_getscheduler(0)))
     thread.start()
     thread.join()
-    connection.send((granted, policies))
+    connection.send((granted, policies, realtime.realtime_priority()))
 
 
 def _asked_without_the_right(connection: Connection) -> None:
@@ -77,11 +77,12 @@ def test_the_real_time_policy_holds_for_all_threads_where_it_is_granted(target: 
     process = multiprocessing.get_context("spawn").Process(target=target, args=(theirs,))
     process.start()
     assert ours.poll(20)
-    granted, policies = ours.recv()
+    granted, policies, priority = ours.recv()
     process.join(10)
     if target is _asked_without_the_right:
         assert not granted
     assert policies == [os.SCHED_FIFO if granted else os.SCHED_OTHER] * 2
+    assert priority == (1 if granted else 0)
 
 
 def _stepped_back(connection: Connection) -> None:

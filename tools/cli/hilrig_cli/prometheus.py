@@ -20,6 +20,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("lateness_p50_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_p50_ns", 1e-9),
     ("lateness_p99_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_p99_ns", 1e-9),
     ("lateness_max_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_max_ns", 1e-9),
+    ("realtime_priority", "gauge", "Of the real-time policy; 0: the ordinary policy.", "realtime_priority", 1),
     ("received_per_second", "gauge", "Messages received.", "received_hz", 1),
     ("published_per_second", "gauge", "Messages published.", "published_hz", 1),
     ("lost_transport_total", "counter", "Messages missing from what others sent.", "lost_transport", 1),

@@ -3,12 +3,13 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from threading import Lock
+from threading import Lock, Thread
 
 from hilrig_cli.checkup import Finding, good, notice, wrong
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import HilrigError
+from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH, alive_key
@@ -18,6 +19,10 @@ LISTENING_S = 2.5
 """Each service says once a second how it is."""
 CLOCK_NOTICE_S = 1.0
 CLOCK_WRONG_S = 60.0
+_GRANT = (
+    'on Linux write "<user> - rtprio 2" into /etc/security/limits.conf and log in anew, or LimitRTPRIO=2 into the '
+    "unit, or ulimits: {rtprio: 2} for the container; then start the services again"
+)
 
 
 @dataclass(slots=True)
@@ -105,6 +110,33 @@ def check_services(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
             yield notice("services", f"{name}: {lost} messages lost since it started", "see the sizing in the docs")
 
 
+def check_realtime(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
+    """What closes the loop runs under the real-time policy; where nothing runs yet: whether this host grants it."""
+    if not lab.realtime:
+        yield good("real-time", "not asked for (realtime = false): other programs may hold the loop up")
+        return
+    reports = [health for health, _ in heard.healths.values() if health.service in REALTIME_PRIORITIES]
+    if not reports:
+        if _is_granted_here():
+            yield good("real-time", "this host grants the policy")
+        else:
+            yield notice(
+                "real-time", "this host does not grant the policy: other programs may hold the loop up", _GRANT
+            )
+        return
+    ordinary = [health for health in reports if not health.realtime_priority]
+    for health in ordinary:
+        host = f" on {health.host}" if health.host else ""
+        yield notice(
+            "real-time",
+            f"{health.service}/{health.instance}{host} was not granted the policy: other programs may hold it up",
+            _GRANT,
+        )
+    if not ordinary:
+        names = (f"{health.service}/{health.instance} (priority {health.realtime_priority})" for health in reports)
+        yield good("real-time", f"granted to {', '.join(sorted(names))}")
+
+
 def check_versions(healths: Iterable[Health], own: str) -> Iterator[Finding]:
     """All services are of the version that this command is of."""
     versions: dict[str, list[str]] = {}
@@ -145,6 +177,15 @@ def check_clocks(reports: Sequence[tuple[Health, int]]) -> Iterator[Finding]:
         f"the clock of {name} is {abs(offset_s):.1f} s {ahead} this host's; it dates recordings",
         "synchronise the hosts' clocks (NTP); latencies do not depend on them",
     )
+
+
+def _is_granted_here() -> bool:
+    """Whether this user may go real-time on this host: tried, on a thread that ends with the trial."""
+    granted: list[bool] = []
+    trial = Thread(target=lambda: granted.append(go_realtime(max(REALTIME_PRIORITIES.values()))))
+    trial.start()
+    trial.join()
+    return granted == [True]
 
 
 def _series(version: str) -> tuple[str, ...]:

@@ -61,6 +61,7 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
     of_bus, heard = on_bus.check_bus(lab)
     findings += of_bus
     findings += on_bus.check_services(lab, heard)
+    findings += on_bus.check_realtime(lab, heard)
     findings += on_bus.check_versions((health for health, _ in heard.healths.values()), version("hilrig"))
     findings += on_bus.check_clocks(list(heard.healths.values()))
     if lab.bus.tls is not None or lab.edge.tls is not None:
