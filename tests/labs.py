@@ -1,12 +1,16 @@
 """A whole lab for a test: `hilrig up` as a user starts it, on ports that are free, in a folder of its own."""
 
+import functools
+import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
 
@@ -33,9 +37,37 @@ def free_ports(count: int) -> int:
 def hilrig(
     *arguments: str | Path, cwd: Path | None = None, timeout_s: float = 120.0
 ) -> subprocess.CompletedProcess[str]:
-    """Run a `hilrig` command to its end."""
-    command = [*HILRIG, *map(str, arguments)]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s, cwd=cwd)
+    """Run a `hilrig` command to its end, in a process of its own that was spared Python's start and imports.
+
+    That commands start from nothing too is shown by tests/rig/test_documentation.py.
+    """
+    words = list(map(str, arguments))
+    with TemporaryDirectory() as folder:
+        out, err = (Path(folder) / name for name in ("out", "err"))
+        for path in (out, err):
+            path.touch()
+        server = _command_server()
+        assert server.stdin is not None
+        assert server.stdout is not None
+        job = {"words": words, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
+        server.stdin.write(json.dumps({**job, "out": str(out), "err": str(err)}) + "\n")
+        server.stdin.flush()
+        pid = int(server.stdout.readline())
+        killer = threading.Timer(timeout_s, os.kill, (pid, signal.SIGKILL))
+        killer.start()
+        code = int(server.stdout.readline())
+        late = not killer.is_alive()
+        killer.cancel()
+        if late:
+            raise subprocess.TimeoutExpired(words, timeout_s, out.read_text(), err.read_text())
+        return subprocess.CompletedProcess(words, code, out.read_text(), err.read_text())
+
+
+@functools.cache
+def _command_server() -> "subprocess.Popen[str]":
+    """One for all commands of this process; it ends with us, for then its standard input does."""
+    command = [sys.executable, str(Path(__file__).with_name("command_server.py"))]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:

@@ -18,7 +18,7 @@ from pymodbus.client import ModbusTcpClient
 from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
 from waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = pytest.mark.rig
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +94,12 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
                 return str(answer.read().decode())
 
-        eventually(lambda: text().count("hilrig_up{") >= 4, timeout_s=10, every_s=0.2)
-        assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
-        process.terminate()
+        try:
+            # Each service says once a second how it is: simulation, two edges and two recorders.
+            eventually(lambda: text().count("hilrig_up{") == 5, timeout_s=10, every_s=0.2)
+            assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
+        finally:
+            process.terminate()
         assert process.wait(10) == 0
     taken = hilrig("metrics", "--config", lab.config, "--listen", f"127.0.0.1:{lab.port}")
     assert taken.returncode == 3
