@@ -15,8 +15,6 @@ READERS = (
     ("verify", "{file}"),
 )
 
-pytestmark = pytest.mark.alone
-
 
 def one_line(stderr: str) -> str:
     assert "Traceback" not in stderr, stderr

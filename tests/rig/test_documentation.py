@@ -18,7 +18,7 @@ import pytest
 from labs import HILRIG, RunningLab, hilrig, write_lab
 from waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = pytest.mark.rig
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

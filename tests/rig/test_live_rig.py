@@ -12,7 +12,7 @@ from labs import HILRIG, RunningLab, hilrig, write_lab
 from rrd_files import RrdFile
 from waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = pytest.mark.rig
 
 
 @contextmanager

@@ -18,7 +18,6 @@ from labs import RunningLab, write_lab
 from waiting import eventually
 
 pytestmark = [
-    pytest.mark.alone,
     pytest.mark.rig,
     pytest.mark.skipif(sys.platform != "linux", reason="counts handles and memory in /proc"),
 ]
