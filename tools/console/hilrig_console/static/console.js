@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig, as a card and as a row
 
 const FIGURES = [
-  ["loop", "loop p50 / p99, ms", "big wide"], ["late", "tick p99, ms", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop p50 / p99", "big wide"], ["late", "tick p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "recorded as", "wide"],
 ];
 
@@ -156,10 +156,10 @@ class Rig {
       mark(pill, this.level);
     }
     mark(this.card, this.level);
-    say(this.figures.loop, `${p50} / ${p99}`);
+    say(this.figures.loop, rig.loop_samples ? `${p50} / ${p99} ms` : "–");
     say(this.figures.controller, rig.controller || "nobody");
     say(this.figures.address, rig.address || "–");
-    say(this.figures.late, late);
+    say(this.figures.late, rig.simulated ? `${late} ms` : late);
     say(this.figures.overruns, rig.simulated ? String(rig.overruns) : "–");
     const watchdog = rig.served ? rig.watchdog_tripped ? "tripped" : "armed" : "–";
     say(this.figures.watchdog, watchdog);
@@ -237,7 +237,7 @@ function showServices(services) {
   table.tBodies[0].replaceChildren(...services.map((service) => {
     const cells = [service.host, service.rigs, service.cpu_percent.toFixed(0), service.memory_mib.toFixed(0),
       service.lateness_p99_ms.toFixed(2), service.overruns, service.lost_transport + service.lost_recorder,
-      service.clock_peer ? `${service.clock_offset_ms >= 0 ? "+" : "−"}${Math.abs(service.clock_offset_ms).toFixed(1)}` : "–"];
+      service.clock_peer ? `${service.clock_offset_ms < 0 ? "−" : "+"}${Math.abs(service.clock_offset_ms).toFixed(1)} ± ${service.clock_uncertainty_ms.toFixed(1)}` : "–"];
     const row = made("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
       made("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
     row.append(...cells.map((cell, number) => made("td", number ? {class: "n"} : {}, String(cell))));
