@@ -10,7 +10,9 @@ How it works, from the outside in:
 - a plan of moves from pose to pose (inverse kinematics gives the joints);
 - each move follows an S-curve (quintic polynomial), so that acceleration never jumps;
 - torque = what the model says the motion needs (inertia, friction, gravity with what the magnet holds)
-         + PD on the error, which has to clean up only what the model got wrong.
+         + PD on the error, which has to clean up only what the model got wrong;
+- the magnet is switched when the arm is seen to rest where it should be. A curve's time says where it ought to be: on a
+  computer or a network that was held up for a moment, it isn't.
 """
 
 import argparse
@@ -41,23 +43,29 @@ LARGEST_EFFORT = 32.767  # what the registers can say
 SPEED = np.array([4.5, 4.5, 0.70, 9.0])
 ACCELERATION = np.array([20.0, 20.0, 9.0, 50.0])
 
-# Feedback: with stiffness w(B + wM) and damping 2wM, an error vanishes at the rates w and w + friction/inertia.
-RATE = 4.0
+# Feedback: with stiffness w(B + wM) and damping 2wM, an error vanishes at the rates w and w + friction/inertia. The
+# later efforts act, the smaller must w be.
+LARGEST_RATE = 6.0
+RATE_TIMES_LATENCY = 0.22
 ERROR_FILTER_S = 0.03
 STALE_S = 0.025  # positions that stay the same for so long are new ones all the same
 LEAD_S = 0.02  # an effort acts that much later than it is written: until the rig's next step, and half of it
 SHORT_CYCLE_S = 0.030  # a controller that is slower than that moves the arm more slowly
 CYCLE_LEAD = 1.25  # of a cycle beyond the usual period: three quarters on the way, half of one acting
+FAST = 0.5  # (rad/s)²: a motion that shows how late the arm is
 LAG_SHARE = 0.15  # of what is seen of the lag is learnt at a time
 LARGEST_LAG_S = 0.25
+HELD_UP_S = 0.045  # new positions that take longer than two steps of the rig were held up
 
 PERIOD_S = 0.010
 RIG_STEP_S = 0.020
 CLEARANCE_Z = 0.025  # height of the tip while it travels: what it carries passes over everything
 HOVER = 0.001  # distance at which parts are taken and set down
-SETTLED = np.array([math.radians(0.05), math.radians(0.05), 0.0008, math.radians(1.0)])
-SETTLE_S = 0.04
-SETTLE_TIMEOUT_S = 2.0
+# Where a pose on the way counts as passed, and where the magnet may be switched: near enough, and at rest (per second).
+PASSED = np.array([math.radians(4.0), math.radians(4.0), 0.006, math.radians(10.0)])
+IN_PLACE = np.array([math.radians(0.05), math.radians(0.05), 0.0008, math.radians(1.0)])
+AT_REST = np.array([math.radians(1.0), math.radians(1.0), 0.010, math.radians(10.0)])
+REST_S = 0.04  # so long: two steps of the rig
 GRIP_S = 0.10
 
 HOME = np.array([0.0, 0.0, L1 - CLEARANCE_Z, 0.0])
@@ -192,7 +200,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Stage:
-    """Go to the goal; switch the magnet there, once it is reached exactly, and give it time."""
+    """Go to the goal; one that `switches` the magnet does so once the arm rests there, however long that takes."""
 
     text: str
     goal: np.ndarray
@@ -232,21 +240,30 @@ class Controller:
         self._move: Move | None = None
         self._began_s = 0.0
         self._switched_s: float | None = None
-        self._near_s = 0.0
+        self._on_its_curve = True
+        self._resting_s = 0.0
         self._held_mass = 0.0
         self._seen: np.ndarray | None = None
         self._seen_s = 0.0
         self._error = np.zeros(4)
         self._error_rate = np.zeros(4)
+        self._speed = np.zeros(4)
         self._last_s = self._cycle_s = 0.0
         self.usual_cycle_s = PERIOD_S
         """From one update to the next, as a rule."""
         self.magnet = False
         self.placed = 0
+        self.doing = ""
+        """The stage that it is at; empty: the work is done, or has not begun."""
         self.done = False
         self.largest_error = np.zeros(4)
         self.lag_s = LEAD_S
         """How late the arm is seen to follow: the loop's latency, learnt while it moves."""
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of the parts that it has not placed."""
+        return [part.name for part in self._task.parts[self.placed :]]
 
     def update(self, now_s: float, joints: np.ndarray) -> np.ndarray:
         """Efforts for positions read at `now_s`: N·m, N·m, N, N·m from rad, rad, m, rad."""
@@ -259,13 +276,14 @@ class Controller:
             self._stages = plan(self._task, joints)
             self._stage = next(self._stages)
             self._begin(now_s, joints)
+        self._compare(now_s, joints)
         self._advance(now_s, joints)
         assert self._move is not None
         # What is asked for acts a little later.
         coming, speed, acceleration = self._move.at(now_s - self._began_s + lead_s)
         feedforward, matrix = efforts_for(coming, speed, acceleration, self._held_mass)
-        self._compare(now_s, joints)
-        feedback = RATE * (FRICTION * self._error + matrix @ (RATE * self._error + 2 * self._error_rate))
+        rate = min(LARGEST_RATE, RATE_TIMES_LATENCY / max(lead_s, self.lag_s))
+        feedback = rate * (FRICTION * self._error + matrix @ (rate * self._error + 2 * self._error_rate))
         return np.clip(feedforward + feedback, -LARGEST_EFFORT, LARGEST_EFFORT)
 
     def _compare(self, now_s: float, joints: np.ndarray) -> None:
@@ -276,51 +294,66 @@ class Controller:
         """
         assert self._move is not None
         since_s = now_s - self._seen_s
-        if self._seen is not None and np.array_equal(joints, self._seen) and since_s < STALE_S:
-            return
-        self._seen, self._seen_s = joints, now_s
         then, speed, _ = self._move.at(now_s - self._began_s - self.lag_s)
-        error = then - joints
-        # A filtered difference quotient: right on a ramp, however seldom positions come.
-        share = 1.0 - math.exp(-since_s / ERROR_FILTER_S)
-        self._error_rate += share * ((error - self._error) / max(since_s, 1e-3) - self._error_rate)
-        self._error = error
-        self.largest_error = np.maximum(self.largest_error, np.abs(self._error))
-        # An error along the motion is a delay: on a curve that is right, the arm is only late.
         fast = float(speed[:2] @ speed[:2])
-        if fast > 0.5:
-            late_s = float(self._error[:2] @ speed[:2]) / fast
+        same = self._seen is not None and np.array_equal(joints, self._seen)
+        if same and (since_s < STALE_S or fast > FAST):
+            return
+        error = then - joints
+        # An error along the motion is a delay: on a curve that is right, the arm is only late.
+        late_s = float(error[:2] @ speed[:2]) / fast if fast > FAST else 0.0
+        if since_s > max(HELD_UP_S, 2 * self.usual_cycle_s):
+            # The rig or this program was held up for a moment: the curve waits for the arm.
+            self._began_s += min(max(0.0, late_s), since_s)
+            error = self._move.at(now_s - self._began_s - self.lag_s)[0] - joints
+            self._on_its_curve = False
+        elif self._on_its_curve:
             self.lag_s = min(max(self.lag_s + LAG_SHARE * late_s, 0.0), LARGEST_LAG_S)
+        # Filtered difference quotients: right on a ramp, however seldom positions come.
+        share = (1.0 - math.exp(-since_s / ERROR_FILTER_S)) / max(since_s, 1e-3)
+        if self._seen is not None:
+            self._speed += share * (joints - self._seen - self._speed * since_s)
+            self._error_rate += share * (error - self._error - self._error_rate * since_s)
+        self._seen, self._seen_s, self._error = joints, now_s, error
+        self.largest_error = np.maximum(self.largest_error, np.abs(error))
 
     def _begin(self, now_s: float, start: np.ndarray) -> None:
         # An effort stands for a cycle: the longer that is, the slower a motion it can follow.
         self._move = Move(start, self._stage.goal, max(1.0, self.usual_cycle_s / SHORT_CYCLE_S))
         self._began_s = now_s
         self._switched_s = None
-        self._say(self._stage.text)
+        self._on_its_curve = True
+        self.doing = self._stage.text
+        self._say(self.doing)
 
     def _advance(self, now_s: float, joints: np.ndarray) -> None:
+        """Go on to the next stage when the arm is seen to be where this one ends; the clock alone decides nothing."""
         stage, move = self._stage, self._move
         assert move is not None
-        over_s = now_s - self._began_s - move.duration
-        if self.done or over_s < 0:
+        if self.done or now_s - self._began_s < move.duration:
             return
-        if stage.switches and self._switched_s is None:
-            self._near_s = self._near_s + self._cycle_s if np.all(np.abs(joints - stage.goal) < SETTLED) else 0.0
-            settled = self._near_s >= max(SETTLE_S, 1.5 * self.usual_cycle_s)
-            if settled or over_s > SETTLE_TIMEOUT_S * max(1.0, self.usual_cycle_s / SHORT_CYCLE_S):
+        away = np.abs(joints - stage.goal)
+        if not stage.switches:
+            if np.all(away < PASSED):
+                self._go_on(now_s)
+        elif self._switched_s is None:
+            resting = np.all(away < IN_PLACE) and np.all(np.abs(self._speed) < AT_REST)
+            # However long a cycle took, it has seen the arm once.
+            self._resting_s = self._resting_s + min(self._cycle_s, self.usual_cycle_s) if resting else 0.0
+            if self._resting_s >= max(REST_S, 1.5 * self.usual_cycle_s):
                 self._switched_s = now_s
                 self.magnet, self._held_mass = stage.magnet, stage.held_mass
-            return
-        if stage.switches and now_s - self._switched_s < GRIP_S:
-            return
-        self.placed = stage.placed
+        elif now_s - self._switched_s >= GRIP_S:
+            self._go_on(now_s)
+
+    def _go_on(self, now_s: float) -> None:
+        self.placed = max(self.placed, self._stage.placed)
         following = next(self._stages, None)
         if following is None:
-            self.done = True
+            self.done, self.doing = True, ""
         else:
-            self._stage = following
-            self._begin(now_s, stage.goal)
+            goal, self._stage = self._stage.goal, following
+            self._begin(now_s, goal)
 
 
 # --- The registers ---------------------------------------------------------------------------------------------------
@@ -330,7 +363,7 @@ class Rig:
     """The rig as the paper's registers show it."""
 
     def __init__(self, host: str, port: int) -> None:
-        self._client = ModbusTcpClient(host, port=port, timeout=1.0, retries=0)
+        self._client = ModbusTcpClient(host, port=port, timeout=3.0, retries=0)
         if not self._client.connect():
             raise ConnectionError(f"no rig answers at {host}:{port}")
 
@@ -381,10 +414,12 @@ def registers_of(efforts: np.ndarray) -> list[int]:
     return [int(value) for value in np.rint(efforts * 1000).astype(np.int16).view(np.uint16)]
 
 
-def control(rig: Rig, controller: Controller, duration_s: float, once: bool = False) -> dict:
+def control(
+    rig: Rig, controller: Controller, duration_s: float, overtime_s: float = 0.0, *, once: bool = False
+) -> dict:
     """Close the loop every `PERIOD_S`, or as often as the network allows, for `duration_s`; says how it went.
 
-    With `once` it ends when the work is done, where that is earlier.
+    Where the work is not done by then it may take `overtime_s` more; with `once` it ends as soon as the work is done.
     """
     began_s = time.monotonic()
     joints, request_s = rig.read(), time.monotonic() - began_s
@@ -399,7 +434,7 @@ def control(rig: Rig, controller: Controller, duration_s: float, once: bool = Fa
     period_s = RIG_STEP_S if slow else PERIOD_S
     controller.usual_cycle_s = max(period_s, request_s)
     deadline_s, cycles, magnet, done_s = time.monotonic(), 0, False, None
-    while (now_s := time.monotonic()) - began_s < duration_s:
+    while (now_s := time.monotonic()) - began_s < duration_s + (0.0 if controller.done else overtime_s):
         if not slow:
             joints = rig.read()
         efforts = controller.update(now_s, joints)
@@ -420,6 +455,8 @@ def control(rig: Rig, controller: Controller, duration_s: float, once: bool = Fa
         time.sleep(max(0.0, deadline_s - time.monotonic()))
     return {
         "placed": controller.placed,
+        "missing": controller.missing,
+        "doing": controller.doing,
         "done_s": done_s,
         "duration_s": time.monotonic() - began_s,
         "cycles": cycles,
@@ -431,12 +468,23 @@ def control(rig: Rig, controller: Controller, duration_s: float, once: bool = Fa
     }
 
 
+def sentence(result: dict) -> str:
+    """How it went, for people."""
+    said = f"{result['placed']} of {result['parts']} parts placed"
+    if result["done_s"] is not None:
+        said += f" in {result['done_s']:.1f} s"
+    elif result["missing"]:
+        said += f", not {', '.join(result['missing'])}: the time was over at {result['doing']!r}"
+    return f"{said}; {result['cycles_per_s']:.0f} cycles a second"
+
+
 def main() -> int:
     """Run it; exit code 0: every part is placed, 1: not all, 2: the task is wrong, 3: no rig."""
     parser = argparse.ArgumentParser(description="Pick every part and place it in the tray.")
     parser.add_argument("--host", default="127.0.0.1", help="address of the rig")
     parser.add_argument("--port", type=int, default=5020, help="Modbus TCP port of the rig")
     parser.add_argument("--duration", type=float, default=20.0, help="seconds to run")
+    parser.add_argument("--overtime", type=float, default=0.0, help="seconds more, if the work is not done by then")
     parser.add_argument("--once", action="store_true", help="end when the work is done")
     parser.add_argument("--scene", type=Path, help="lab.toml whose [scene] is the task; default: hilrig's own scene")
     parser.add_argument("--json", action="store_true", help="one JSON object at the end, on standard output")
@@ -457,7 +505,7 @@ def main() -> int:
     try:
         rig = Rig(options.host, options.port)
         try:
-            result = control(rig, controller, options.duration, options.once)
+            result = control(rig, controller, options.duration, options.overtime, once=options.once)
         finally:
             rig.close()
     except (ConnectionError, ModbusException) as error:
@@ -470,8 +518,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(result))
     else:
-        done = "" if result["done_s"] is None else f" in {result['done_s']:.1f} s"
-        print(f"{result['placed']} of {goal} parts placed{done}; {result['cycles_per_s']:.0f} cycles a second")
+        print(sentence(result))
     return 0 if result["placed"] == goal else 1
 
 

@@ -147,12 +147,14 @@ def work(rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_de
 class FarRig:
     """A rig at the end of a slow network, in virtual time, for a controller that asks and waits for each answer.
 
-    It stands in for the example's `Rig` and for its `time`: only asking and sleeping let time pass.
+    It stands in for the example's `Rig` and for its `time`: only asking and sleeping let time pass. On one way in
+    `1 / stalls` somebody is held up for 50 to 100 ms: the controller, the rig, or both.
     """
 
-    def __init__(self, rig: VirtualRig, one_way_ms: float, seed: int) -> None:
+    def __init__(self, rig: VirtualRig, one_way_ms: float, seed: int, *, stalls: float = 0.0) -> None:
         self._rig = rig
         self._one_way_ms = one_way_ms
+        self._stalls = stalls
         self._random = np.random.default_rng(seed)
         self._step_ms = rig.lab.sim.step_ms
         self._now_ms = self._next_ms = 0.0
@@ -167,6 +169,16 @@ class FarRig:
 
     def _way(self) -> None:
         self._pass(self._one_way_ms + 0.1 + self._random.exponential(0.5))
+        if self._random.random() < self._stalls:
+            held_up_ms = float(self._random.uniform(50, 100))
+            rig, controller = ((True, False), (False, True), (True, True))[self._random.integers(3)]
+            if rig:
+                # Its ticks that were due are not made up for.
+                missed = int(np.ceil(held_up_ms / self._step_ms))
+                self._rig.clock.advance(round(missed * self._step_ms * 1e6))
+                self._next_ms += missed * self._step_ms
+            if controller:
+                self._pass(held_up_ms)
 
     def _command(self) -> None:
         self._rig.command(self._effort, magnet=self._magnet)

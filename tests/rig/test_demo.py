@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.rig, pytest.mark.alone]
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("demo")
-    done = hilrig("demo", "--duration", "14", "--out", out / "out", "--json", cwd=out)
+    done = hilrig("demo", "--out", out / "out", "--json", cwd=out)
     assert done.returncode == 0, done.stderr
     return out / "out", json.loads(done.stdout)
 
@@ -62,6 +62,7 @@ def test_the_recording_is_verified_and_every_part_stands_in_the_tray(demo: tuple
     assert said["verify"]["exact"]
     assert said["task"]["placed"] == len(said["task"]["parts"]) == 4
     assert said["task"]["largest_error_mm"] < 2.0
+    assert (said["task"]["missing"], said["task"]["why"], said["controller"]["missing"]) == ([], "", [])
 
 
 def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_decoder(

@@ -26,6 +26,9 @@ from hilrig_schemas import PartState
 from hilrig_sim.model import RigParameters
 
 CONTROLLER: Final = "pick_and_place.py"
+DURATION_S: Final = 20.0
+OVERTIME_S: Final = 20.0
+"""What the controller may take beyond that where nobody said how long it is to run, to finish its work, s."""
 CONTROLLER_GRACE_S: Final = 15.0
 """What the controller may take beyond its duration, to start and to end, s."""
 LAB: Final = """# The lab of `hilrig demo`: one rig with the defaults, on ports that were free.
@@ -52,9 +55,20 @@ class DemoRun:
     controller: dict[str, Any]
     """What the controller said at its end; empty: it ended badly."""
 
+    @property
+    def why_unfinished(self) -> str:
+        """Why the controller did not do all of its work, by its own account; empty: it did."""
+        if "done_s" not in self.controller:
+            return "the controller ended badly"
+        if self.controller["done_s"] is not None or not self.controller["missing"]:
+            return ""
+        return f"its {self.controller['duration_s']:.0f} s were over at {self.controller['doing']!r}"
 
-def run_demo(duration_s: float, out: Path, say: Callable[[str], None], tick: Callable[[float], None]) -> DemoRun:
-    """Run the lab with the example controller for `duration_s`; `tick` hears the share of it that has passed.
+
+def run_demo(duration_s: float | None, out: Path, say: Callable[[str], None], tick: Callable[[float], None]) -> DemoRun:
+    """Run the lab with the example controller; `tick` hears the share of its time that has passed.
+
+    For `duration_s`; with None for 20 s, and for up to 20 s more if a busy machine has it take longer to finish.
 
     Raises:
         OperationError: the folder can't be written, a service could not start, or nothing was recorded.
@@ -76,7 +90,7 @@ def run_demo(duration_s: float, out: Path, say: Callable[[str], None], tick: Cal
     stopping = threading.Event()
     say("starting simulation, Modbus edge and recorder")
     with running_lab(lab, config, say, stopping) as supervisor:
-        say(f"running for {duration_s:g} s: {CONTROLLER} over Modbus TCP at {lab.edge.host}:{_port(lab)}")
+        say(f"running for {duration_s or DURATION_S:g} s: {CONTROLLER} over Modbus TCP at {lab.edge.host}:{_port(lab)}")
         said = _run_controller(lab, config, duration_s, supervisor.poll, tick)
     found = sorted(recordings.rglob("*.mcap"))
     if not found:
@@ -91,10 +105,11 @@ def _port(lab: LabConfig) -> int:
 
 
 def _run_controller(
-    lab: LabConfig, config: Path, duration_s: float, poll: Callable[[], None], tick: Callable[[float], None]
+    lab: LabConfig, config: Path, asked_s: float | None, poll: Callable[[], None], tick: Callable[[float], None]
 ) -> dict[str, Any]:
+    duration_s, overtime_s = (DURATION_S, OVERTIME_S) if asked_s is None else (asked_s, 0.0)
     command = [sys.executable, str(controller_path()), "--host", lab.edge.host, "--port", str(_port(lab))]
-    command += ["--duration", str(duration_s), "--scene", str(config), "--json"]
+    command += ["--duration", str(duration_s), "--overtime", str(overtime_s), "--scene", str(config), "--json"]
     begin_s = time.monotonic()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **own_process_group()) as process:
         try:
@@ -102,7 +117,7 @@ def _run_controller(
                 poll()
                 passed_s = time.monotonic() - begin_s
                 tick(min(1.0, passed_s / duration_s))
-                if passed_s > duration_s + CONTROLLER_GRACE_S:
+                if passed_s > duration_s + overtime_s + CONTROLLER_GRACE_S:
                     process.kill()
                 time.sleep(POLL_S)
         except BaseException:
@@ -113,7 +128,8 @@ def _run_controller(
         said = json.loads(output)
     except ValueError:
         return {}
-    return said if isinstance(said, dict) and process.returncode == 0 else {}
+    # 1: it ran, and did not place all.
+    return said if isinstance(said, dict) and process.returncode in (0, 1) else {}
 
 
 def controller_path() -> Path:
@@ -156,6 +172,16 @@ class Review:
         """Whether torques came back that answered states, and re-simulation gives the states that were recorded."""
         return self.latency.samples > 0 and self.verification.same
 
+    @property
+    def missing(self) -> list[str]:
+        """Names of the parts that stand in no tray."""
+        return [part.part for part in self.task.parts if part.place is None]
+
+    @property
+    def good(self) -> bool:
+        """Whether the loop closed, and no part is missing but those for which there was no time."""
+        return self.closed and set(self.missing) <= set(self.run.controller.get("missing", []))
+
     def as_dict(self) -> dict[str, Any]:
         """As plain values, for JSON."""
         return {
@@ -167,6 +193,8 @@ class Review:
             "task": {
                 "parts": [asdict(part) for part in self.task.parts],
                 "placed": self.task.placed,
+                "missing": self.missing,
+                "why": self._why_missing(),
                 "largest_error_mm": self.task.largest_error_mm,
             },
             "controller": self.run.controller,
@@ -176,13 +204,22 @@ class Review:
         """What a person reads below the table of latency."""
         error_mm = self.task.largest_error_mm
         placed = f"placed: {self.task.placed} of {len(self.task.parts)} parts stand in the tray"
+        if error_mm is not None:
+            placed += f", at most {error_mm:.2f} mm from their places"
+        if self.missing:
+            placed += f"; not {', '.join(self.missing)}: {self._why_missing()}"
         return [
             f"verified: {self.verification.sentence()}",
-            placed if error_mm is None else f"{placed}, at most {error_mm:.2f} mm from their places",
+            placed,
             f"recording: {self.run.recording}",
             f"3D run:    {self.rrd}  (look at it: hilrig replay {self.run.recording})",
             f"plot:      {self.plot}",
         ]
+
+    def _why_missing(self) -> str:
+        if not self.missing:
+            return ""
+        return self.run.why_unfinished or "the controller believed them placed"
 
 
 def review(recorded: DemoRun, out: Path) -> Review:
