@@ -119,8 +119,7 @@ class CommandFollower:
         if command.seq != self.seq or command.session != self.session or self._resets is None:
             self.is_new = self.changed = True
             self.seq, self.session, self.magnet = command.seq, command.session, command.magnet
-            first, second, third, fourth = command.effort
-            self._commanded = (_finite(first), _finite(second), _finite(third), _finite(fourth))
+            self._commanded = _bounded(*command.effort)
             self.effort = self._commanded
             self.arrived_ns = arrival.arrived_ns
             if command.basis_incarnation == self.incarnation:
@@ -135,6 +134,14 @@ class CommandFollower:
         # A count that fell is an edge that was started anew.
         self.reset = self._resets is not None and command.resets > self._resets
         self._resets = command.resets
+
+
+def _bounded(first: float, second: float, third: float, fourth: float) -> Effort:
+    most = LARGEST_EFFORT
+    # Of each rig at each tick, before its state can leave: what is not out of bounds is not looked at twice.
+    if -most <= first <= most and -most <= second <= most and -most <= third <= most and -most <= fourth <= most:
+        return first, second, third, fourth
+    return _finite(first), _finite(second), _finite(third), _finite(fourth)
 
 
 def _finite(value: float) -> float:

@@ -5,6 +5,7 @@ state x_k is published with the effort that acts from now on, and only then is x
 start of its step.
 """
 
+from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
@@ -78,6 +79,7 @@ class Simulation:
         self._states = service.batch_sender(topics.STATES)
         for rig in self._rigs:
             service.add_to_batch(self._states, topics.STATE, rig.name)
+        self._see(self._rigs)
         service.health.rig_reports = self._rig_reports
 
     def tick(self, tick: Tick) -> None:
@@ -96,20 +98,16 @@ class Simulation:
                 self._magnet[rig.index] = follower.magnet
             if follower.reset:
                 plant.reset(rig.index)
-        positions, velocities = plant.position.T.tolist(), plant.velocity.T.tolist()
-        errors = plant.error.T.tolist()
+                self._see([rig])
         lateness_ns = sampled_ns - tick.deadline_ns
         encoded = []
-        for rig, position, velocity, error in zip(rigs, positions, velocities, errors, strict=True):
+        for rig in rigs:
             state = rig.state
             state.step = step
             state.sampled_ns = sampled_ns
             state.wall_ns = wall_ns
             state.lateness_ns = lateness_ns
             state.missed_steps = tick.missed_steps
-            state.position[:] = position
-            state.velocity[:] = velocity
-            state.integration_error[:] = error
             encoded.append(rig.encoded(self._times, sampled_ns))
         self._states.send(encoded)
         for rig in rigs:
@@ -120,6 +118,7 @@ class Simulation:
             self._reporter.tell_of_plant(events, step + 1, sampled_ns, [rig.follower.session for rig in rigs])
         if not isfinite(plant.velocity.sum()):
             self._catch(step + 1)
+        self._see(rigs)
         self._counters.count_tick(tick, self._step_ns)
         if tick.missed_steps or tick.lateness_ns > self._step_ns:
             self._reporter.tell_of_overrun(tick, step, sampled_ns)
@@ -148,11 +147,24 @@ class Simulation:
         self._states.remove(index)
         self._regroup(plant)
 
+    def _see(self, rigs: "Sequence[_Rig]") -> None:
+        """Write into the states what the next step begins with: known long before its tick, which has less to do so."""
+        plant = self._plant
+        positions, velocities, errors = (each.T.tolist() for each in (plant.position, plant.velocity, plant.error))
+        limit_flags = plant.limit_flags
+        for rig in rigs:
+            state, index = rig.state, rig.index
+            state.position[:] = positions[index]
+            state.velocity[:] = velocities[index]
+            state.integration_error[:] = errors[index]
+            state.limit_flags = limit_flags[index]
+
     def _regroup(self, plant: Plant) -> None:
         self._plant = plant
         for index, rig in enumerate(self._rigs):
             rig.move_to(index, plant)
         self._reporter.regroup([rig.name for rig in self._rigs], plant)
+        self._see(self._rigs)
 
     def _rig_reports(self) -> list[RigReport]:
         return [rig.report() for rig in self._rigs]
@@ -196,7 +208,6 @@ class _Rig:
         """Be the rig `index` of a plant."""
         self.index = index
         self._world = plant.world
-        self._plant = plant
         self._part_names = plant.world.part_names[index]
 
     def encoded(self, times: StepTimes, sampled_ns: int) -> bytes:
@@ -221,7 +232,6 @@ class _Rig:
         elif self._has_commanded:
             state.command_arrived_ns = state.basis_step = state.loop_latency_ns = 0
             self._has_commanded = False
-        state.limit_flags = self._plant.limit_flags[index]
         if self._part_names and (world.moving[index] or sampled_ns >= self._parts_due_ns):
             self._parts_due_ns = sampled_ns + ALL_PARTS_PERIOD_NS
             parts = self._encoded_parts()
