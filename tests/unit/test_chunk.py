@@ -1,53 +1,55 @@
-"""What is kept of a file's chunks while it is written."""
+"""Chunks as they stand in a file, and how they are found there again."""
 
-import random
 from itertools import pairwise
 
+import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.records import Metadata
 
 from hilrig_recorder.channels import encode_message
-from hilrig_recorder.chunk import CHUNK_BYTES, ChunkNote, ChunkNotes, cut, encode_chunk
+from hilrig_recorder.chunk import CHUNK_BYTES, ChunkNote, chunks_of, compressor, cut, encode_chunk
+from hilrig_recorder.summary import encoded
 
-TIMES = st.integers(0, 2**62)
-SIZES = st.integers(0, 2**31)
-
-
-@st.composite
-def notes(draw: st.DrawFn) -> list[ChunkNote]:
-    made: list[ChunkNote] = []
-    end = 0
-    for gap in draw(st.lists(SIZES, max_size=10)):
-        first_ns, span_ns = draw(TIMES), draw(SIZES)
-        counts = draw(st.lists(st.tuples(st.integers(1, 4), st.integers(1, 1000)), min_size=1, max_size=4))
-        made.append(ChunkNote(end + gap, first_ns, first_ns + span_ns, draw(SIZES), draw(SIZES), tuple(counts)))
-        end = made[-1].end
-    return made
+MESSAGES = st.lists(st.tuples(st.integers(1, 4), st.integers(0, 2**62), st.binary(max_size=300)), min_size=1)
 
 
-@given(notes())
-def test_notes_come_back_as_they_were_given(given_notes: list[ChunkNote]) -> None:
-    kept = ChunkNotes()
-    assert not kept
-    for note in given_notes:
-        kept.add(note)
-    assert list(kept) == given_notes
-    while given_notes:
-        assert kept.take_back() == given_notes.pop()
-        assert list(kept) == given_notes
+def found(content: bytes, begin: int = 0) -> list[ChunkNote]:
+    return list(chunks_of(lambda at, size: content[at : at + size], begin, len(content)))
 
 
-def test_an_hour_of_a_rig_is_sixty_kilobytes() -> None:
-    rng = random.Random(1)
-    kept = ChunkNotes()
-    start = 10_000
-    for second in range(3600):
-        first_ns, span_ns = second * 10**9 + rng.randrange(10**7), 980_000_000 + rng.randrange(10**7)
-        sizes = 9_000 + rng.randrange(500), 25_000 + rng.randrange(50)
-        note = ChunkNote(start, first_ns, first_ns + span_ns, *sizes, ((1, 50), (2, 49 + rng.randrange(2))))
-        kept.add(note)
-        start = note.end
-    assert kept.size < 3600 * 18
+@given(st.lists(MESSAGES, max_size=5), st.binary(max_size=40))
+def test_chunks_are_found_again_with_all_that_an_index_needs(
+    chunks: list[list[tuple[int, int, bytes]]], before: bytes
+) -> None:
+    content = before
+    expected = []
+    compress = compressor()
+    for number, messages in enumerate(chunks):
+        records = [encode_message(channel, 1, time_ns, 0, data) for channel, time_ns, data in messages]
+        start = len(content)
+        content += encode_chunk(records, compress) + encoded(Metadata(f"between {number}", {"a": "b"}))
+        times = [time_ns for _, time_ns, _ in messages]
+        channels = [channel for channel, _, _ in messages]
+        expected.append(
+            ChunkNote(
+                start,
+                min(times),
+                max(times),
+                len(compress(b"".join(records))),
+                sum(map(len, records)),
+                tuple((channel, channels.count(channel)) for channel in dict.fromkeys(channels)),
+            )
+        )
+    assert found(content, len(before)) == expected
+
+
+def test_what_is_no_row_of_records_is_no_chunk() -> None:
+    content = encode_chunk([encode_message(1, 1, 1, 1, b"message")], compressor())
+    for wrong in (content[:-1], content + b"12345", b"\x01" + content):
+        with pytest.raises(ValueError, match="record"):
+            found(wrong)
 
 
 @given(st.lists(st.integers(0, CHUNK_BYTES * 2), max_size=30))
@@ -59,8 +61,6 @@ def test_runs_are_as_large_as_a_chunk_may_be_and_nothing_is_left_out(sizes: list
     assert all(sum(map(len, run)) + len(following[0]) > CHUNK_BYTES for run, following in pairwise(runs))
 
 
-def test_a_note_says_where_the_next_chunk_begins() -> None:
-    records = [encode_message(1 + number % 2, number, number, number, b"x" * number) for number in range(1, 40)]
-    data, note = encode_chunk(records, 500, lambda raw: raw)
-    assert (note.start, note.end) == (500, 500 + len(data))
-    assert (note.first_ns, note.last_ns, note.messages) == (1, 39, 39)
+@given(st.binary(max_size=CHUNK_BYTES))
+def test_compressing_loses_nothing(raw: bytes) -> None:
+    assert zstandard.ZstdDecompressor().decompress(compressor()(raw), max_output_size=len(raw)) == raw

@@ -8,7 +8,7 @@ import pytest
 from hilrig_recorder.channels import message_head
 from hilrig_recorder.intake import Arrival
 from hilrig_recorder.recording import Recording
-from hilrig_recorder.sessions import BLOCK_NS, CLOSINGS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
+from hilrig_recorder.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
 from hilrig_runtime.logstream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
@@ -313,21 +313,6 @@ def test_messages_are_written_within_a_second_and_not_of_all_rigs_at_once() -> N
         written = counts
     assert sum(turns) == len(rigs)
     assert max(turns) <= 4
-
-
-def test_when_a_class_ends_its_files_are_closed_a_few_at_a_time() -> None:
-    desk = Desk()
-    rigs = [f"rig{number}" for number in range(2 * CLOSINGS + 5)]
-    for rig in rigs:
-        desk.start(rig, rig)
-    for rig in rigs:
-        desk.end(rig, rig)
-    closed = []
-    for _ in range(5):
-        desk.wait(100 * MS)
-        closed.append(sum(file.end == "ended" for file in desk.shelf.files))
-    # From the second tick on: a file lingers for a little while.
-    assert closed == [0, CLOSINGS, 2 * CLOSINGS, len(rigs), len(rigs)]
 
 
 def test_a_gap_is_counted_as_lost_on_the_way() -> None:

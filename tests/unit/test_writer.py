@@ -1,7 +1,9 @@
 """The file that the recorder writes, judged by the stock MCAP reader."""
 
 import errno
+import os
 import random
+import tracemalloc
 from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
@@ -246,4 +248,36 @@ def test_with_no_room_for_anything_it_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space left"):
         writer.finish()
     assert writer.given_up == 10
+    writer.discard()
+
+
+def test_a_recording_takes_no_memory_however_long_it_grows(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+
+    def write(chunks: int) -> None:
+        for number in range(chunks):
+            writer.write([encode_message(STATE, number, START + number, START, b"state")])
+
+    write(100)
+    tracemalloc.start()
+    try:
+        write(100)
+        before, _ = tracemalloc.get_traced_memory()
+        write(2_000)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    writer.finish()
+    writer.publish()
+    assert after - before < 2_000
+    assert len(read(tmp_path / "run.mcap")) == 2_200
+
+
+def test_a_file_that_somebody_cut_meanwhile_is_not_finished(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    fill(writer, 10)
+    writer.close_chunk()
+    os.truncate(writer.part, writer.size // 2)
+    with pytest.raises(OSError, match="can't be read back"):
+        writer.finish()
     writer.discard()

@@ -33,10 +33,7 @@ _CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
 """Of a message's record."""
-_NOTE: Final = struct.Struct("<QqQIIB")
-_COUNT: Final = struct.Struct("<HI")
-_NOTES_BYTES: Final = 4096
-"""So many are compressed together."""
+_RECORD_HEAD: Final = struct.Struct("<BQ")
 
 
 class ChunkNote(NamedTuple):
@@ -56,12 +53,6 @@ class ChunkNote(NamedTuple):
     def messages(self) -> int:
         """How many there are."""
         return sum(count for _, count in self.counts)
-
-    @property
-    def end(self) -> int:
-        """Offset behind it and its indexes."""
-        indexes = sum(_INDEX_HEAD.size + 16 * count for _, count in self.counts)
-        return self.start + _CHUNK.size + self.data_size + indexes
 
     def index_record(self) -> bytes:
         """The record that leads a reader to it."""
@@ -86,62 +77,6 @@ class ChunkNote(NamedTuple):
         return head + channel_offsets + tail
 
 
-class ChunkNotes:
-    """The notes of all chunks of a file, as differences, compressed: an hour of them is sixty kilobytes."""
-
-    def __init__(self) -> None:
-        self._older: list[bytes] = []
-        self._recent = bytearray()
-        self._end = self._last_ns = 0
-
-    def add(self, note: ChunkNote) -> None:
-        """Add the next one."""
-        gap, since_last_ns, span_ns = (
-            note.start - self._end,
-            note.first_ns - self._last_ns,
-            note.last_ns - note.first_ns,
-        )
-        self._recent += _NOTE.pack(gap, since_last_ns, span_ns, note.data_size, note.raw_size, len(note.counts))
-        for count in note.counts:
-            self._recent += _COUNT.pack(*count)
-        self._end, self._last_ns = note.end, note.last_ns
-        if len(self._recent) >= _NOTES_BYTES:
-            self._older.append(zlib.compress(self._recent))
-            self._recent.clear()
-
-    def __iter__(self) -> Iterator[ChunkNote]:
-        """All of them, in the order of the file."""
-        packed = b"".join([*map(zlib.decompress, self._older), self._recent])
-        at = end = last_ns = 0
-        while at < len(packed):
-            gap, since_last_ns, span_ns, data_size, raw_size, channels = _NOTE.unpack_from(packed, at)
-            at += _NOTE.size
-            counts = tuple(_COUNT.iter_unpack(packed[at : at + channels * _COUNT.size]))
-            at += channels * _COUNT.size
-            first_ns = last_ns + since_last_ns
-            note = ChunkNote(end + gap, first_ns, first_ns + span_ns, data_size, raw_size, counts)
-            end, last_ns = note.end, note.last_ns
-            yield note
-
-    def take_back(self) -> ChunkNote:
-        """Remove the newest, and give it back."""
-        *kept, newest = self
-        self._older.clear()
-        self._recent.clear()
-        self._end = self._last_ns = 0
-        for note in kept:
-            self.add(note)
-        return newest
-
-    def __bool__(self) -> bool:
-        return bool(self._older or self._recent)
-
-    @property
-    def size(self) -> int:
-        """What they take in memory, bytes."""
-        return sum(map(len, self._older)) + len(self._recent)
-
-
 def compressor() -> Compress:
     """What compresses chunks; for one thread, and best shared by all files of it: its tables then stay in the cache."""
     return zstandard.ZstdCompressor(compression_params=_COMPRESSOR).compress
@@ -160,12 +95,11 @@ def cut(records: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
         yield records[begin:]
 
 
-def encode_chunk(records: Sequence[bytes], start: int, compress: Compress) -> tuple[bytes, ChunkNote]:
-    """A chunk and the message indexes that follow it, as they stand in a file at the offset `start`.
+def encode_chunk(records: Sequence[bytes], compress: Compress) -> bytes:
+    """A chunk and the message indexes that follow it, as they stand in a file.
 
     Args:
         records: one message or more, each a whole MCAP record (`channels.encode_message`).
-        start: where the chunk will stand, bytes.
         compress: see `compressor`.
     """
     indexes: dict[int, list[int]] = {}
@@ -197,5 +131,40 @@ def encode_chunk(records: Sequence[bytes], start: int, compress: Compress) -> tu
         size = 8 * len(index)
         pieces.append(_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX.value, 6 + size, channel_id, size))
         pieces.append(struct.pack(f"<{len(index)}Q", *index))
-    counts = tuple((channel_id, len(index) // 2) for channel_id, index in indexes.items())
-    return b"".join(pieces), ChunkNote(start, first_ns, last_ns, len(data), offset, counts)
+    return b"".join(pieces)
+
+
+def chunks_of(read: Callable[[int, int], bytes], begin: int, end: int) -> Iterator[ChunkNote]:
+    """The chunks that stand in a file, in order. Nothing has to be kept of them while it is written.
+
+    Args:
+        read: gives so many bytes of the file, or fewer at its end, from an offset on.
+        begin: where the first record stands, bytes.
+        end: where the last one ends.
+
+    Raises:
+        ValueError: records do not follow each other from `begin` to `end`.
+    """
+    at = begin
+    note: ChunkNote | None = None
+    counts: list[tuple[int, int]] = []
+    try:
+        while at < end:
+            head = read(at, _CHUNK.size)
+            opcode, length = _RECORD_HEAD.unpack_from(head)
+            if opcode == Opcode.CHUNK.value:
+                if note is not None:
+                    yield note._replace(counts=tuple(counts))
+                _, _, first_ns, last_ns, raw_size, _, _, _, data_size = _CHUNK.unpack(head)
+                note = ChunkNote(at, first_ns, last_ns, data_size, raw_size, ())
+                counts.clear()
+            elif opcode == Opcode.MESSAGE_INDEX.value:
+                _, _, channel_id, size = _INDEX_HEAD.unpack_from(head)
+                counts.append((channel_id, size // 16))
+            at += _RECORD_HEAD.size + length
+    except struct.error as error:
+        raise ValueError(f"no record at {at}") from error
+    if at != end:
+        raise ValueError(f"a record that ends at {at}, behind {end}")
+    if note is not None:
+        yield note._replace(counts=tuple(counts))

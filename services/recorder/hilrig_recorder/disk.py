@@ -1,28 +1,24 @@
-"""What the disk is slow at, on a thread of its own: syncing open files once a second, giving finished ones their name.
+"""What the disk is slow at, on a thread of its own: syncing what was written, ending files and giving them their name.
 
-The recorder's thread only appends; a disk that takes its time to sync holds nothing up.
+The recorder's thread only appends: neither a disk that takes its time nor the index of a long recording holds it up.
 """
 
 import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum, auto
 from queue import Empty, SimpleQueue
 from typing import Final
 
 from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.clock import Clock
 
-SYNC_PERIOD_NS: Final = 1_000_000_000
+LOOK_PERIOD_NS: Final = 100_000_000
+"""So soon what was written is synced; a file is written to about once a second."""
+ENDING_S: Final = 1.0
+"""When all ends: the longest that files are given to get their index and name, without syncing."""
 
 logger = logging.getLogger(__name__)
-
-
-class _Job(Enum):
-    FOLLOW = auto()
-    PUBLISH = auto()
-    ABANDON = auto()
 
 
 @dataclass(slots=True)
@@ -32,19 +28,28 @@ class _Open:
     """Bytes that are safe."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """A file that is followed from now on, or one that ends."""
+
+    writer: RunWriter
+    finish: Callable[[], None] | None = None
+
+
 class Disk:
-    """Syncs and publishes; results are handed back through `on_trouble` and `on_published`, on this thread."""
+    """Syncs, ends and publishes. What came of it is handed back on this thread: `on_trouble` hears of a file that could
+    not be synced, `on_ended` of each that has ended, with what was wrong, and keeps its `.part` name then."""
 
     def __init__(
         self,
         clock: Clock,
         on_trouble: Callable[[RunWriter, OSError], None],
-        on_published: Callable[[RunWriter], None],
+        on_ended: Callable[[RunWriter, OSError | None], None],
     ) -> None:
         self._clock = clock
         self._on_trouble = on_trouble
-        self._on_published = on_published
-        self._jobs: SimpleQueue[tuple[RunWriter, _Job] | None] = SimpleQueue()
+        self._on_ended = on_ended
+        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self._open: dict[int, _Open] = {}
         self._hurry = threading.Event()
         self._ended = False
@@ -52,19 +57,18 @@ class Disk:
         self._thread.start()
 
     def follow(self, writer: RunWriter) -> None:
-        """Sync this file once a second from now on."""
-        self._jobs.put((writer, _Job.FOLLOW))
+        """Sync what is written to this file, from now on."""
+        self._jobs.put(_Job(writer))
 
-    def publish(self, writer: RunWriter) -> None:
-        """Sync this finished file, close it and give it its name."""
-        self._jobs.put((writer, _Job.PUBLISH))
+    def end(self, writer: RunWriter, finish: Callable[[], None]) -> None:
+        """Call `finish`, which writes what a file ends with, sync it, close it and give it its name.
 
-    def abandon(self, writer: RunWriter) -> None:
-        """Close this file as it is, under its `.part` name."""
-        self._jobs.put((writer, _Job.ABANDON))
+        Nobody else may use the writer from now on.
+        """
+        self._jobs.put(_Job(writer, finish))
 
     def close(self, timeout_s: float) -> bool:
-        """Publish what is waiting and end; after `timeout_s` without syncing, so that every file gets its name.
+        """End what is waiting; after `timeout_s` without syncing, so that every file gets its name.
 
         Returns:
             Whether all is done.
@@ -72,61 +76,56 @@ class Disk:
         self._jobs.put(None)
         self._thread.join(timeout_s)
         self._hurry.set()
-        self._thread.join(timeout_s)
+        self._thread.join(ENDING_S)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        due_ns = self._clock.monotonic_ns() + SYNC_PERIOD_NS
+        due_ns = self._clock.monotonic_ns() + LOOK_PERIOD_NS
         while not self._ended:
             wait_ns = due_ns - self._clock.monotonic_ns()
             if wait_ns > 0:
                 self._next_job(wait_ns * 1e-9)
                 continue
             for item in list(self._open.values()):
-                self._sync(item)
-                # Names before syncs: a file that waits for its name is a session that has ended.
-                self._waiting_jobs()
-            due_ns = max(due_ns + SYNC_PERIOD_NS, self._clock.monotonic_ns())
+                if self._sync(item):
+                    # In turns: many files that end, and many that are open, do not wait for all of the others.
+                    self._next_job(0)
+            due_ns = self._clock.monotonic_ns() + LOOK_PERIOD_NS
 
-    def _waiting_jobs(self) -> None:
-        while not self._ended and self._next_job(0):
-            pass
-
-    def _next_job(self, timeout_s: float) -> bool:
+    def _next_job(self, timeout_s: float) -> None:
         try:
             job = self._jobs.get(timeout=timeout_s) if timeout_s > 0 else self._jobs.get_nowait()
         except Empty:
-            return False
+            return
         if job is None:
             self._ended = True
-            return False
-        writer, what = job
-        if what is _Job.FOLLOW:
-            self._open[id(writer)] = _Open(writer)
-            return True
-        self._open.pop(id(writer), None)
-        if what is _Job.PUBLISH:
-            self._publish(writer)
+        elif job.finish is None:
+            self._open[id(job.writer)] = _Open(job.writer)
         else:
-            writer.close()
-        return True
+            self._open.pop(id(job.writer), None)
+            self._end(job.writer, job.finish)
 
-    def _sync(self, item: _Open) -> None:
+    def _sync(self, item: _Open) -> bool:
+        """Sync a file that was written to; whether it was."""
         # A job between may have closed it.
-        if id(item.writer) not in self._open or item.writer.size == item.synced:
-            return
+        if self._ended or id(item.writer) not in self._open or item.writer.size == item.synced:
+            return False
         size = item.writer.size
         try:
             item.writer.sync()
         except OSError as error:
             self._on_trouble(item.writer, error)
         item.synced = size
+        return True
 
-    def _publish(self, writer: RunWriter) -> None:
+    def _end(self, writer: RunWriter, finish: Callable[[], None]) -> None:
         try:
+            finish()
             writer.publish(durably=not self._hurry.is_set())
         except OSError as error:
-            logger.error("%s: can't be finished: %s", writer.part, error.strerror)
-            self._on_trouble(writer, error)
+            writer.close()
+            logger.error("%s: can't be finished, and waits to be recovered: %s", writer.part, error.strerror)
+            self._on_ended(writer, error)
         else:
-            self._on_published(writer)
+            logger.info("recorded %s", writer.path)
+            self._on_ended(writer, None)

@@ -54,6 +54,7 @@ class Files:
         self._ask_config = ask_config
         self._give_up = give_up
         self._files: dict[Recording, RunFile] = {}
+        self._ending: dict[RunWriter, Recording] = {}
         self._trouble: dict[str, str] = {}
         self._space = Space(self.folder, instance, config.min_free_mib)
         self._space_due_ns = 0
@@ -68,7 +69,8 @@ class Files:
     @property
     def bytes_written(self) -> int:
         """Bytes in files since the start."""
-        return self._bytes_closed + sum(file.writer.size for file in self._files.values())
+        writers = [*self._ending, *(file.writer for file in self._files.values())]
+        return self._bytes_closed + sum(writer.size for writer in writers)
 
     # -- Shelf ------------------------------------------------------------------------------------------------------
 
@@ -123,11 +125,19 @@ class Files:
             if file.writer is writer:
                 file.fail(error)
 
+    def ended(self, writer: RunWriter, error: OSError | None) -> None:
+        """A file has ended: it has its name, or this is why not."""
+        recording = self._ending.pop(writer)
+        self._bytes_closed += writer.size
+        if error is not None:
+            text = f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}"
+            self._report(recording, text)
+
     def tick(self, now_ns: int) -> None:
         """Begin next files and end those that failed; some times a second."""
         failed = any(file.failure is not None for file in self._files.values())
-        # A file that just failed for want of space ends before space is looked at again.
-        if now_ns >= self._space_due_ns and not failed:
+        # Files that failed for want of space end before space is looked at, and set aside, again.
+        if now_ns >= self._space_due_ns and not failed and not (self._space.full and self._ending):
             self._space_due_ns = now_ns + _SPACE_PERIOD_NS
             self._look_at_space()
         for file in list(self._files.values()):
@@ -196,16 +206,8 @@ class Files:
             following.note_source(source, incarnation)
 
     def _finish(self, file: RunFile, end: str, reason: str) -> None:
-        writer = file.writer
-        try:
-            file.finish(end, reason)
-        except OSError as error:
-            text = f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}"
-            self._report(file.recording, text)
-            self._disk.abandon(writer)
-        else:
-            self._disk.publish(writer)
-        self._bytes_closed += writer.size
+        self._ending[file.writer] = file.recording
+        self._disk.end(file.writer, file.ending(end, reason))
 
     # -- trouble ----------------------------------------------------------------------------------------------------
 

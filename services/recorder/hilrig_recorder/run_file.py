@@ -92,28 +92,29 @@ class RunFile:
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
 
-    def finish(self, end: str, reason: str) -> None:
-        """Write the last words and the index; `end` is one word for programs, `reason` a sentence for people.
+    def ending(self, end: str, reason: str) -> Callable[[], None]:
+        """What writes the last words and the index, on whatever thread; nothing is written to this file any more.
 
-        Raises:
-            OSError: see `RunWriter.finish`.
+        `end` is one word for programs, `reason` a sentence for people. Calling it raises what `RunWriter.finish` does.
         """
         writer, recording = self.writer, self.recording
+        # The recording may go on in a next file, with a tally of its own.
+        tally, end_wall_ns = recording.tally, recording.end_wall_ns or self._clock.wall_ns()
 
         def last_words() -> dict[str, dict[str, str]]:
-            tally = {name: str(value) for name, value in asdict(recording.tally).items()}
-            tally["lost_recorder"] = str(recording.tally.lost_recorder + writer.given_up)
+            values = {name: str(value) for name, value in asdict(tally).items()}
+            values["lost_recorder"] = str(tally.lost_recorder + writer.given_up)
             return {
                 "hilrig.summary": {
                     "ended": end,
                     "reason": reason,
-                    "end_wall_ns": str(recording.end_wall_ns or self._clock.wall_ns()),
-                    **tally,
+                    "end_wall_ns": str(end_wall_ns),
+                    **values,
                     "messages": str(writer.message_count),
                 }
             }
 
-        writer.finish(last_words)
+        return lambda: writer.finish(last_words)
 
     def _note(self, name: str, values: Mapping[str, str]) -> None:
         try:

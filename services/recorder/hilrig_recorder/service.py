@@ -88,6 +88,7 @@ class Recorder:
         lab, config = service.lab, service.lab.recorder
         # What other threads have to say; the recorder's thread listens.
         self._troubles: SimpleQueue[tuple[RunWriter, OSError] | str] = SimpleQueue()
+        self._ended: SimpleQueue[tuple[RunWriter, OSError | None]] = SimpleQueue()
         self._configs: SimpleQueue[tuple[str, RigConfig | None]] = SimpleQueue()
         self._requests: SimpleQueue[_Request] = SimpleQueue()
         self._asked: dict[str, int] = {}
@@ -96,7 +97,7 @@ class Recorder:
         self._disk = Disk(
             service.clock,
             on_trouble=lambda writer, error: self._troubles.put((writer, error)),
-            on_published=lambda writer: logger.info("recorded %s", writer.path),
+            on_ended=lambda writer, error: self._ended.put((writer, error)),
         )
         self._files = Files(
             lab.name,
@@ -179,6 +180,9 @@ class Recorder:
                     self._tell(Event(kind=Event.RECORDING, severity=Event.ERROR, text=trouble))
                 else:
                     self._files.fail(*trouble)
+        with contextlib.suppress(Empty):
+            while True:
+                self._files.ended(*self._ended.get_nowait())
         with contextlib.suppress(Empty):
             while True:
                 self._take_config(*self._configs.get_nowait())

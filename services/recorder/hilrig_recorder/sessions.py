@@ -21,8 +21,8 @@ from hilrig_runtime.logstream import entries_of
 from hilrig_schemas import Event, LogBatch
 from hilrig_schemas.topics import is_name, parse_rig_key
 
-BLOCK_NS: Final = SECOND_NS
-"""Messages wait so long at most before they are written."""
+BLOCK_NS: Final = 8 * SECOND_NS // 10
+"""Messages wait so long at most before they are written: with the batch, the tick and the sync less than a second."""
 LINGER_MIN_NS: Final = SECOND_NS // 5
 """A file stays open at least so long after its session's end."""
 IDLE_NS: Final = SECOND_NS
@@ -31,8 +31,6 @@ LINGER_MAX_NS: Final = 10 * SECOND_NS
 """A service that has not passed the end by then is not waited for: its log stream's cache reaches no further back."""
 KEEPER_SILENCE_NS: Final = 30 * SECOND_NS
 """A session whose keeper is silent so long has ended."""
-CLOSINGS: Final = 20
-"""Files closed at a tick: the index of a long recording takes its time, and what comes meanwhile waits."""
 RETRY_NS: Final = 10 * SECOND_NS
 """A session that could not be recorded is tried again after this."""
 _PHASES: Final = 10
@@ -255,15 +253,13 @@ class SessionBook:
                 rig.cut(wall_ns)
                 rig.forget(wall_ns - self._preroll_ns, wall_ns)
         heard = self._sources.last_heard()
-        closings = 0
         for recording in self.recordings:
             if recording.seen is not None and now_ns - recording.opened_ns > SETTLING_NS:
                 # What could come twice has come.
                 recording.seen = None
             if recording.end_wall_ns is None:
                 self._watch_keeper(recording, heard.get(recording.keeper, 0), now_ns)
-            elif closings < CLOSINGS and self._is_complete(recording, now_ns):
-                closings += 1
+            elif self._is_complete(recording, now_ns):
                 self._close(recording, "ended", recording.end_reason)
         for session, until_ns in list(self._over.items()):
             if now_ns > until_ns:

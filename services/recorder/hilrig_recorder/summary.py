@@ -20,24 +20,22 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from hilrig_recorder.chunk import ChunkNote, ChunkNotes
+from hilrig_recorder.chunk import ChunkNote
 
 
 @dataclass(slots=True)
 class Contents:
-    """What stands in a file."""
+    """What stands in a file beside its chunks."""
 
     schemas: list[Schema] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
-    chunks: ChunkNotes = field(default_factory=ChunkNotes)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
 
-    def end(self, size: int) -> bytes:
-        """What finishes a file of `size` bytes that holds this."""
+    def end(self, size: int, chunks: Sequence[ChunkNote]) -> bytes:
+        """What finishes a file of `size` bytes that holds this and these chunks."""
         data_end = encoded(DataEnd(0))
         start = size + len(data_end)
-        chunks = list(self.chunks)
         summary = bytearray()
         offsets = bytearray()
         groups: list[tuple[Opcode, bytes]] = [

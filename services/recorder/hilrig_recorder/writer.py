@@ -1,13 +1,14 @@
 """One recording: an MCAP file that is called `.part` while it is written and gets its name when it is whole.
 
-Chunks of at most 64 KiB leave in one write each, so that a kill tears at most the last one; the index is collected
-on the way and written at the end. A write that fails is taken back to the last whole chunk, and the file can still
-be finished: what did not fit is tried again then, and where no space is left even for the index, the newest chunks
-make room for it.
+Chunks of at most 64 KiB leave in one write each, so that a kill tears at most the last one. The index at the end is
+made of what stands in the file: nothing is kept of a chunk once it is written, however long a recording grows. A write
+that fails is taken back to the last whole chunk, and the file can still be finished: what did not fit is tried again
+then, and where no space is left even for the index, the newest chunks make room for it.
 """
 
+import errno
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -16,7 +17,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata,
 from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.channels import CHANNELS, SCHEMAS
-from hilrig_recorder.chunk import CHUNK_BYTES, Compress, compressor, cut, encode_chunk
+from hilrig_recorder.chunk import CHUNK_BYTES, ChunkNote, Compress, chunks_of, compressor, cut, encode_chunk
 from hilrig_recorder.durable import lock_file, part_path, sync_folder
 from hilrig_recorder.summary import Contents, encoded
 
@@ -24,7 +25,7 @@ LIBRARY: Final = "hilrig"
 
 
 class RunWriter:
-    """Writes one recording; use it from one thread, and `sync` and `publish` from any one other.
+    """Writes one recording; use it from one thread, and `sync` from any one other, which may `finish` it too.
 
     Raises:
         OSError: from every method that writes, when the disk does not take it. What was written before stays whole.
@@ -44,7 +45,7 @@ class RunWriter:
     ) -> None:
         self.path = path
         self.part = part_path(path) if part is None else part
-        self._file = FileIO(self.part, "x")
+        self._file = FileIO(self.part, "x+")
         lock_file(self._file.fileno())
         self.size = 0
         """Bytes in the file, all of whole records."""
@@ -105,9 +106,7 @@ class RunWriter:
         written = 0
         try:
             for run in cut(self._pending):
-                data, note = encode_chunk(run, self.size, self._compress)
-                self._append(data)
-                self._contents.chunks.add(note)
+                self._append(encode_chunk(run, self._compress))
                 written += len(run)
         finally:
             self.message_count += written
@@ -139,35 +138,46 @@ class RunWriter:
         Raises:
             OSError: there is not even room for the index of nothing; what stands in the file can be recovered.
         """
-        try:
-            self.close_chunk()
-        except OSError:
-            self.given_up += len(self._pending)
-            self._pending.clear()
+        if self._pending:
+            # The one that the others share is of the thread that writes.
+            self._compress = compressor()
+            try:
+                self.close_chunk()
+            except OSError:
+                self.given_up += len(self._pending)
+                self._pending.clear()
+        chunks = self._chunks()
         while True:
             try:
-                self._end(last_words())
+                self._end(last_words(), chunks)
                 return
             except OSError:
-                if not self._contents.chunks:
+                if not chunks:
                     raise
-                self._take_back_chunk()
+                self._take_back(chunks.pop())
 
-    def _end(self, last_words: Mapping[str, Mapping[str, str]]) -> None:
+    def _chunks(self) -> list[ChunkNote]:
+        try:
+            return list(chunks_of(self._read, len(MCAP0_MAGIC), self.size))
+        except ValueError as error:
+            raise OSError(errno.EIO, f"what was written can't be read back: {error}") from error
+        finally:
+            self._file.seek(self.size)
+
+    def _end(self, last_words: Mapping[str, Mapping[str, str]], chunks: Sequence[ChunkNote]) -> None:
         size, known = self.size, len(self._contents.metadata)
         try:
             for name, values in last_words.items():
                 self.add_metadata(name, values)
-            self._append(self._contents.end(self.size))
+            self._append(self._contents.end(self.size, chunks))
         except OSError:
             del self._contents.metadata[known:]
             self._cut(size)
             raise
 
-    def _take_back_chunk(self) -> None:
+    def _take_back(self, chunk: ChunkNote) -> None:
         """Give up the newest chunk, and whatever was written behind it."""
         contents = self._contents
-        chunk = contents.chunks.take_back()
         contents.metadata = [index for index in contents.metadata if index.offset < chunk.start]
         contents.attachments = [index for index in contents.attachments if index.offset < chunk.start]
         self.message_count -= chunk.messages
@@ -200,6 +210,10 @@ class RunWriter:
         """Remove the unfinished file."""
         self._file.close()
         self.part.unlink(missing_ok=True)
+
+    def _read(self, offset: int, size: int) -> bytes:
+        self._file.seek(offset)
+        return self._file.read(size)
 
     def _append(self, data: bytes) -> None:
         rest = memoryview(data)
