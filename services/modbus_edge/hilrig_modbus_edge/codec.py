@@ -36,7 +36,12 @@ def words_of_position(position: Sequence[float]) -> tuple[bytes, bool]:
     """Four position registers (8 bytes) of a joint vector (rad, rad, m, rad), and whether one saturated."""
     c1, c2, c3, c4 = COUNTS_PER_UNIT
     q1, q2, q3, q4 = position
-    return _saturate([q1 * c1, q2 * c2, q3 * c3, q4 * c4])
+    q1, q2, q3, q4 = q1 * c1, q2 * c2, q3 * c3, q4 * c4
+    most = FULL_SCALE
+    if -most <= q1 <= most and -most <= q2 <= most and -most <= q3 <= most and -most <= q4 <= most:
+        # Of each rig at each step: what can't saturate takes the short way.
+        return _INT16X4.pack(round(q1), round(q2), round(q3), round(q4)), False
+    return _saturate([q1, q2, q3, q4])
 
 
 def position_of(words: bytes | bytearray) -> tuple[float, float, float, float]:

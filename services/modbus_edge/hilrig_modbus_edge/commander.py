@@ -40,6 +40,7 @@ class Commander:
         self._repeat_ns = repeat_ns
         self._repeat_due_ns = clock.monotonic_ns()
         self._message = TorqueCommand(rig=rig, effort=(0.0, 0.0, 0.0, 0.0), safe=True)
+        self._effort = self._message.effort
         self._standing = self._message
         """What was last sent, to be repeated."""
         self._way: Line[tuple[TorqueCommand, bytes]] | None = None
@@ -168,7 +169,7 @@ class Commander:
 
     def _set_out(self, way: Line[tuple[TorqueCommand, bytes]]) -> bool:
         message = self._message
-        self._fill(message)
+        self._fill()
         now_ns = self._monotonic_ns()
         if not way.put((_copy(message), bytes(self.torque)), now_ns):
             return False
@@ -191,13 +192,14 @@ class Commander:
 
     # -- sending
 
-    def _fill(self, message: TorqueCommand) -> None:
-        message.effort[:] = codec.effort_of(self.torque)
+    def _fill(self) -> None:
+        message = self._message
+        self._effort[:] = codec.effort_of(self.torque)
         message.seq += 1
         self._session_told = message.session
 
     def _send(self) -> None:
-        self._fill(self._message)
+        self._fill()
         self._dispatch(self._message)
 
     def _dispatch(self, command: TorqueCommand) -> None:
