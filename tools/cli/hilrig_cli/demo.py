@@ -62,7 +62,7 @@ class DemoRun:
             return "the controller ended badly"
         if self.controller["done_s"] is not None or not self.controller["missing"]:
             return ""
-        return f"its {self.controller['duration_s']:.0f} s were over at {self.controller['doing']!r}"
+        return f"the controller's {self.controller['duration_s']:.0f} s were over at {self.controller['doing']!r}"
 
 
 def run_demo(duration_s: float | None, out: Path, say: Callable[[str], None], tick: Callable[[float], None]) -> DemoRun:
@@ -178,6 +178,15 @@ class Review:
         return [part.part for part in self.task.parts if part.place is None]
 
     @property
+    def why_missing(self) -> str:
+        """Why they do not; empty: all stand."""
+        reasons = [self.run.why_unfinished] if self.missing and self.run.why_unfinished else []
+        believed = [name for name in self.missing if name not in self.run.controller.get("missing", [])]
+        if believed and self.run.controller:
+            reasons.append(f"the controller believed {', '.join(believed)} placed")
+        return "; ".join(reasons)
+
+    @property
     def good(self) -> bool:
         """Whether the loop closed, and no part is missing but those for which there was no time."""
         return self.closed and set(self.missing) <= set(self.run.controller.get("missing", []))
@@ -194,7 +203,7 @@ class Review:
                 "parts": [asdict(part) for part in self.task.parts],
                 "placed": self.task.placed,
                 "missing": self.missing,
-                "why": self._why_missing(),
+                "why": self.why_missing,
                 "largest_error_mm": self.task.largest_error_mm,
             },
             "controller": self.run.controller,
@@ -207,7 +216,7 @@ class Review:
         if error_mm is not None:
             placed += f", at most {error_mm:.2f} mm from their places"
         if self.missing:
-            placed += f"; not {', '.join(self.missing)}: {self._why_missing()}"
+            placed += f"; not {', '.join(self.missing)}: {self.why_missing}"
         return [
             f"verified: {self.verification.sentence()}",
             placed,
@@ -215,11 +224,6 @@ class Review:
             f"3D run:    {self.rrd}  (look at it: hilrig replay {self.run.recording})",
             f"plot:      {self.plot}",
         ]
-
-    def _why_missing(self) -> str:
-        if not self.missing:
-            return ""
-        return self.run.why_unfinished or "the controller believed them placed"
 
 
 def review(recorded: DemoRun, out: Path) -> Review:
