@@ -1,4 +1,4 @@
-# One image a service: `docker build --build-arg PARTS=sim .` (router, sim, edge, recorder, or all for every command).
+# One image a service: `docker build --build-arg PARTS=sim .` (router, sim, edge, recorder, console, or all for every command).
 ARG PYTHON=3.11.11-slim-bookworm
 
 FROM python:${PYTHON} AS build

@@ -1,5 +1,6 @@
 """compose.yaml: what it says is started for real, each service on a host of its own with its own certificate alone."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,8 @@ LAB_FILE = ROOT / "compose/lab.toml"
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 EDGES = {"east": "rig1,rig2", "west": "rig3,rig4"}
+CERTIFICATES = {"console": "viewer"}
+"""Of what is no service of the loop: the console only looks."""
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 CONTROLLER = """
@@ -36,6 +39,26 @@ for _ in range(60):
 after = client.read_holding_registers(4, count=4).registers
 print(before[0], after[0])
 client.close()
+"""
+
+LOOK = """
+import json, sys, urllib.error, urllib.request
+
+address, password = sys.argv[1:]
+try:
+    urllib.request.urlopen(address, timeout=10)
+except urllib.error.HTTPError as refusal:
+    print(refusal.code)
+known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+known.add_password(None, address, "teacher", password)
+opener = urllib.request.build_opener(urllib.request.HTTPBasicAuthHandler(known))
+with opener.open(address, timeout=20) as stream:
+    for line in stream:
+        lab = json.loads(line[6:]) if line.startswith(b'data: {"lab"') else {"rigs": []}
+        seen = [rig["rig"] for rig in lab["rigs"] if rig["served"] and rig["simulated"] and rig["address"]]
+        if len(seen) == 4:
+            print(*sorted(seen))
+            break
 """
 
 STRANGER = """
@@ -67,15 +90,19 @@ def test_every_service_is_confined_and_looked_after(name: str) -> None:
     assert service["command"][:2] == ["hilrig", kind]
     assert service["build"]["args"]["PARTS"] == kind
     check = service["healthcheck"]["test"]
-    assert check[:5] == ["CMD", "hilrig", "doctor", "--service", kind]
+    asked = ["console", "--check"] if kind == "console" else ["doctor", "--service", kind]
+    assert check[: 2 + len(asked)] == ["CMD", "hilrig", *asked]
 
 
 @pytest.mark.parametrize("name", SERVICES)
 def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
     mounted = {source: (target, mode) for source, target, *mode in (v.split(":") for v in SERVICES[name]["volumes"])}
     certificates = {source for source in mounted if source.startswith("./certs/")}
-    assert certificates == {f"./certs/bus/{file}" for file in ("ca.pem", f"{name}.pem", f"{name}.key")}
-    assert all(mounted[source][1] == ["ro"] for source in mounted if source != "./recordings")
+    own = CERTIFICATES.get(name, name)
+    assert certificates == {f"./certs/bus/{file}" for file in ("ca.pem", f"{own}.pem", f"{own}.key")}
+    assert {source for source in mounted if mounted[source][1] != ["ro"]} <= {"./recordings"}
+    assert ("./recordings" in mounted) == (name in ("recorder", "console"))
+    assert mounted.get("./recordings", ("", []))[1] == (["ro"] if name == "console" else [])
 
 
 def test_the_lab_and_the_compose_file_agree() -> None:
@@ -92,7 +119,9 @@ def test_the_lab_and_the_compose_file_agree() -> None:
         assert SERVICES[edge]["ports"] == [f"127.0.0.1:{span}:{span}"]
     assert f"./recordings:{lab.recorder.folder}" in SERVICES["recorder"]["volumes"]
     assert COMPOSE["networks"]["bus"]["internal"] is True
-    assert all(SERVICES[name]["networks"] == ["bus"] for name in SERVICES if name not in EDGES)
+    assert SERVICES["console"]["ports"] == ["127.0.0.1:8050:8050"]
+    apart = {"east": ["bus", "controllers"], "west": ["bus", "controllers"], "console": ["bus", "browsers"]}
+    assert all(service["networks"] == apart.get(name, ["bus"]) for name, service in SERVICES.items())
 
 
 def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compose_names() -> None:
@@ -127,7 +156,8 @@ class Containers:
     processes: dict[str, subprocess.Popen[Any]]
 
     def start(self, name: str) -> None:
-        self.processes[name] = self.network.popen(name, self.words(name, SERVICES[name]["command"]))
+        with (self.folder / f"{name}.log").open("a") as log:
+            self.processes[name] = self.network.popen(name, self.words(name, SERVICES[name]["command"]), stdout=log)
 
     def words(self, name: str, command: list[str]) -> list[str]:
         """A command of a container's, with the paths that stand for its mounts here."""
@@ -183,6 +213,12 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
         assert after > before
     assert all(eventually(lambda name=name: containers.is_well(name), timeout_s=30) for name in SERVICES)
 
+    told = re.search(r"password: (\S+)", (folder / "console.log").read_text())
+    assert told is not None
+    look = [sys.executable, "-c", LOOK, f"http://{network.address('console')}:8050/live", told[1]]
+    seen = network.run("controller", look, stdout=subprocess.PIPE, text=True).stdout.split()
+    assert seen == ["401", *sorted(rig.name for rig in load_lab(LAB_FILE).rigs)]
+
     stranger = [sys.executable, "-c", STRANGER % (folder / "router/ca.pem")]
     assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "not let in\n"
 
@@ -192,7 +228,7 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
     containers.start("sim")
     assert eventually(lambda: containers.is_well("sim"), timeout_s=30)
 
-    for name in ("east", "west", "sim", "recorder", "router"):
+    for name in ("console", "east", "west", "sim", "recorder", "router"):
         process = containers.processes[name]
         assert process.poll() is None, f"{name} ended by itself"
         process.terminate()

@@ -1,12 +1,15 @@
 """Whom the console answers: by which name it is asked, with which password, from which page, at which address."""
 
 import base64
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from hilrig_cli.commands.console import console
 from hilrig_console.guard import Guard, is_loopback, own_names
 from hilrig_console.serving import Address
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import HilrigError, InputError, OperationError
 
 GUARD = Guard(names=own_names(["Lab-PC", "", "wall.example."]))
 
@@ -76,3 +79,24 @@ def test_only_loopback_is_private() -> None:
     assert is_loopback("127.1.2.3")
     assert not is_loopback("")
     assert not is_loopback("10.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "why"),
+    [
+        ({"listen": "here"}, InputError, "expected HOST:PORT"),
+        ({"password_file": Path("none")}, InputError, "none can't be read: No such file"),
+        ({"password_file": Path("short")}, InputError, "at least 8 characters"),
+        ({"certificate": Path("torn.pem")}, InputError, "give both"),
+        ({"certificate": Path("torn.pem"), "key": Path("torn.pem")}, InputError, "no certificate with its key"),
+        ({"check": True, "listen": "127.0.0.1:1"}, OperationError, "no console answers at http://127.0.0.1:1/"),
+    ],
+)
+def test_what_is_asked_wrongly_is_refused_before_anything_begins(
+    options: dict[str, Any], error: type[HilrigError], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("short").write_text("short\n")
+    Path("torn.pem").write_text("no certificate")
+    with pytest.raises(error, match=why):
+        console(**options)

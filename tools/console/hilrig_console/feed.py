@@ -26,6 +26,9 @@ RETRY_S: Final = 2.0
 TURN_S: Final = 0.2
 """How often the feed looks whether there is something to ask."""
 ROSTERS_S: Final = 10.0
+"""How often it is asked where the rigs are reached."""
+NEWCOMERS_S: Final = 1.0
+"""The same while there are rigs of which that is not known yet."""
 ASKED_A_TURN: Final = 4
 """Rigs that are asked what they look like, one after the other, before the next turn."""
 LEFT_S: Final = 5.0
@@ -94,7 +97,9 @@ class Feed:
             elif not watched and states is not None:
                 states.close()
                 states = None
-            if watched and now_s - asked_s > ROSTERS_S:
+            with self._page.lock:
+                period_s = NEWCOMERS_S if self._page.has_newcomers(now_s) else ROSTERS_S
+            if watched and now_s - asked_s > period_s:
                 asked_s = now_s
                 found = rosters(bus, self._lab.name)
                 with self._page.lock:

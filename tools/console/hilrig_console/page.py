@@ -74,6 +74,10 @@ class Page:
             for rig, address in zip(roster.rigs, roster.addresses, strict=False)
         }
 
+    def has_newcomers(self, now_s: float) -> bool:
+        """Whether an edge serves a rig of which it is not known where it is reached."""
+        return any(rig.served and rig.rig not in self._addresses for rig in self.view.rigs(now_s))
+
     def frame(self, now_s: float, more: Mapping[str, Any]) -> Frame:
         """What there is to show at `now_s`; `more` goes into the lab's part."""
         if now_s >= self._lab_due_s:

@@ -59,9 +59,9 @@ class Address:
             return socket.create_server((self.host, self.port), family=family, backlog=128)
         except OSError as error:
             where = f"{self.host or '0.0.0.0'}:{self.port}"
-            raise OperationError(
-                f"can't listen on {where}: {error.strerror or error}; choose another address with --listen"
-            ) from error
+            # Python adds the address to the system's words.
+            reason = (error.strerror or str(error)).partition(" (while")[0]
+            raise OperationError(f"can't listen on {where}: {reason}; choose another address with --listen") from error
 
     def url(self, port: int, scheme: str) -> str:
         """What to open in a browser."""
@@ -76,6 +76,17 @@ class TlsFiles:
     certificate: Path
     key: Path
 
+    def check(self) -> None:
+        """See whether they can be used.
+
+        Raises:
+            InputError: they can't.
+        """
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key)
+        except (ssl.SSLError, OSError) as error:
+            raise InputError(f"--certificate and --key are no certificate with its key (PEM): {error}") from error
+
 
 class ConsoleServer:
     """Serves a lab's console until it is closed; a context manager.
@@ -86,6 +97,10 @@ class ConsoleServer:
     """
 
     def __init__(self, lab: LabConfig, address: Address, guard: Guard, tls: TlsFiles | None = None) -> None:
+        if tls is not None:
+            tls.check()
+        self._socket = address.listening()
+        self.url = address.url(self._socket.getsockname()[1], "http" if tls is None else "https")
         self._feed = Feed(lab)
         self._shelf = Shelf(lab.recorder.folder)
         self._console = Console(self._feed, self._shelf, guard)
@@ -101,13 +116,7 @@ class ConsoleServer:
         )
         # What uvicorn has to say beyond this is of connections that broke off.
         logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
-        try:
-            config.load()
-        except (ssl.SSLError, OSError) as error:
-            raise InputError(f"--certificate and --key are no certificate with its key (PEM): {error}") from error
         self._server = uvicorn.Server(config)
-        self._socket = address.listening()
-        self.url = address.url(self._socket.getsockname()[1], "http" if tls is None else "https")
         self._thread = threading.Thread(target=self._serve, name="console", daemon=True)
 
     def _serve(self) -> None:

@@ -16,10 +16,10 @@ from hilrig_console.worker import Worker
 from hilrig_replay.index import RECORDING, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
-PERIOD_S: Final = 5.0
+PERIOD_S: Final = 2.0
 """Between looks at the folder, while somebody looks at the page."""
 REST: Final = 10
-"""A look that took long is rested from so many times as long."""
+"""So many times as long as the work of a look took is rested from it."""
 MEASURED_S: Final = 0.5
 """How long a look may read recordings for their latency; the next one goes on."""
 LIST_TIMEOUT_S: Final = 120.0
@@ -36,20 +36,21 @@ class Librarian:
     def __init__(self, folder: Path) -> None:
         self._index = RunIndex(folder)
 
-    def entries(self) -> list[RunEntry]:
-        """Every recording, newest first, with its latency as far as the time allowed.
+    def entries(self) -> tuple[list[RunEntry], float]:
+        """Every recording, newest first, with latencies as far as the time allowed; and the processor time taken, s.
 
         Raises:
             InputError: there is no such folder.
         """
+        begun_s = time.process_time()
         entries = self._index.load()
-        until_s = time.monotonic() + MEASURED_S
+        spent_s, listed_s = time.process_time() - begun_s, time.monotonic()
         for number, entry in enumerate(entries):
-            if time.monotonic() > until_s:
+            if time.monotonic() - listed_s > MEASURED_S:
                 break
             (entries[number],) = self._index.measure([entry])
         self._index.save()
-        return entries
+        return entries, spent_s
 
 
 class Reporter:
@@ -87,17 +88,16 @@ class Shelf:
 
     def look(self) -> None:
         """List the folder anew, if it is time."""
-        begun_s = time.monotonic()
-        if begun_s < self._due_s:
+        if time.monotonic() < self._due_s:
             return
+        spent_s, trouble = 0.0, ""
         try:
-            entries, trouble = self._librarian.call("entries", timeout_s=LIST_TIMEOUT_S), ""
+            entries, spent_s = self._librarian.call("entries", timeout_s=LIST_TIMEOUT_S)
         except InputError as error:
             entries, trouble = [], str(error)
         except HilrigError as error:
             entries, trouble = self._entries, f"the recordings can't be listed: {error}"
-        ended_s = time.monotonic()
-        self._due_s = ended_s + max(PERIOD_S, REST * (ended_s - begun_s))
+        self._due_s = time.monotonic() + max(PERIOD_S, REST * spent_s)
         if (entries, trouble) != (self._entries, self.trouble):
             self._entries, self.trouble = entries, trouble
             self._by_path = {entry.path: entry for entry in entries}
@@ -159,8 +159,8 @@ class Shelf:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._librarian.kill()
-        self._reporter.kill()
+        self._librarian.close()
+        self._reporter.close()
         self._cache.cleanup()
 
 

@@ -27,6 +27,7 @@ class Worker:
     def __init__(self, make: Callable[..., Any], *arguments: Any) -> None:
         self._made = (make, arguments)
         self._turn = threading.Lock()
+        self._closed = False
         self._process: Any = None
         self._pipe: Any = None
 
@@ -35,10 +36,13 @@ class Worker:
 
         Raises:
             HilrigError: the method raised it.
-            OperationError: it takes too long, or the process ended.
+            OperationError: it takes too long, the process ended, or the worker is closed.
         """
         with self._turn:
             self._start()
+            if self._closed:
+                self._end()
+                raise OperationError("it is being closed")
             try:
                 self._pipe.send((method, arguments))
                 if not self._pipe.poll(timeout_s):
@@ -57,8 +61,9 @@ class Worker:
         with self._turn:
             self._end()
 
-    def kill(self) -> None:
-        """End the process at once."""
+    def close(self) -> None:
+        """End the process at once, and start none any more; whoever waits for a call is told that it ended."""
+        self._closed = True
         process = self._process
         if process is not None:
             process.kill()

@@ -62,11 +62,12 @@ def console(
     if invented:
         password = secrets.token_urlsafe(12)
     names = own_names([platform.node(), address.host, *(name or [])])
+    server = ConsoleServer(lab, address, Guard(password, names), tls)
     yield_to_others()
     stopping = threading.Event()
     stop_on_signals(stopping)
     end_when_closing_hangs(stopping, 8.0)
-    with ConsoleServer(lab, address, Guard(password, names), tls) as server:
+    with server:
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if invented:
             print(f"password: {password} (any user name)", flush=True)

@@ -180,10 +180,11 @@ class Rig {
 // ---- what is shown
 
 const rigs = new Map();
-let scenes = [], scenesWanted = -1, runsShown = -1, heardMs = 0, gliding = false, chosenView = "";
+let poses = {}, scenes = [], scenesWanted = -1, runsShown = -1, heardMs = 0, gliding = false, chosenView = "";
 const place = new URLSearchParams(location.hash.slice(1));
 const visible = new IntersectionObserver((entries) => {
   for (const entry of entries) entry.target.rig.arm.seen = entry.isIntersecting;
+  showPoses(poses);
 });
 
 function showLab(lab) {
@@ -263,7 +264,9 @@ function arrange() {
   at("as-table").setAttribute("aria-pressed", String(asTable));
 }
 
-function showPoses(poses) {
+// They are sent when they change; what was not to be drawn then is drawn when it is.
+function showPoses(newest) {
+  poses = newest;
   for (const rig of rigs.values()) {
     const pose = poses[rig.name], scene = pose && scenes[pose[0]];
     if (!scene) rig.arm.lost();
@@ -346,6 +349,7 @@ async function fetchScenes(wanted) {
   scenesWanted = wanted;
   try {
     scenes = await (await fetch("scenes")).json();
+    showPoses(poses);
   } catch {
     scenesWanted = -1;
   }
