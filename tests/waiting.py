@@ -1,8 +1,10 @@
-"""Waiting on conditions, never on time."""
+"""Waiting on conditions, never on time; and how punctual the machine is meanwhile."""
 
+import threading
 import time
 from collections.abc import Callable
-from typing import TypeVar
+from types import TracebackType
+from typing import Self, TypeVar
 
 T = TypeVar("T")
 
@@ -17,3 +19,35 @@ def eventually(condition: Callable[[], T], *, timeout_s: float = 10.0, every_s: 
         if time.monotonic() > deadline:
             raise AssertionError(f"did not come true within {timeout_s} s (last: {value!r})")
         time.sleep(every_s)
+
+
+class Stalls:
+    """How long the machine keeps a thread of this process waiting, at worst; a context manager."""
+
+    PERIOD_S = 0.005
+
+    def __init__(self) -> None:
+        self.worst_s = 0.0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self.worst_s = 0.0
+
+    def _watch(self) -> None:
+        before_s = time.monotonic()
+        while not self._ended.wait(self.PERIOD_S):
+            now_s = time.monotonic()
+            self.worst_s = max(self.worst_s, now_s - before_s - self.PERIOD_S)
+            before_s = now_s
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()

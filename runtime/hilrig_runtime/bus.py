@@ -9,9 +9,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 from hilrig_schemas.topics import Traffic
+
+KEPT: Final = 500
+"""Messages that a sender of recordings can repeat, where nothing else is said: 10 s at 50 a second."""
 
 OnMessage = Callable[[str, bytes], None]
 """Called with the key and the payload of each message."""
@@ -62,8 +65,8 @@ class Bus(Handle):
     """For how long after it was opened some who are there may not be linked yet, s."""
 
     @abstractmethod
-    def publisher(self, key: str, traffic: Traffic) -> Publisher:
-        """Declare that this process sends on `key`."""
+    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:
+        """Declare that this process sends on `key`; the newest `kept` of `Traffic.RECORDING` can be repeated."""
 
     @abstractmethod
     def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
@@ -77,11 +80,11 @@ class Bus(Handle):
         """
 
     @abstractmethod
-    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int = KEPT) -> Handle:
         """Receive `Traffic.RECORDING` completely and in order, including what was sent shortly before.
 
-        What an outage of the link kept back is fetched from the publisher's cache; `on_loss` gets what is lost
-        all the same.
+        What an outage of the link kept back is fetched from the publisher's cache, which has its newest `kept`
+        messages; `on_loss` gets what is lost all the same.
         """
 
     @abstractmethod

@@ -15,6 +15,11 @@ FLUSH_PERIOD_NS: Final = 20_000_000
 SESSIONS_PERIOD_NS: Final = 500_000_000
 """How often a service that keeps sessions states them all, ns."""
 
+KEPT_MESSAGES: Final = 50_000
+"""What a service keeps for a recorder that comes back, where that is more than the shortest while: some 15 MB."""
+SHORTEST_KEPT_S: Final = 10.0
+LONGEST_KEPT_S: Final = 30.0
+
 Entry = tuple[str, int, int, bytes]
 """Key, sequence of the sender on that key, time of publication (ns, wall clock), encoded message."""
 
@@ -37,6 +42,15 @@ def entries_of(batch: LogBatch) -> Iterable[Entry]:
         ValueError: while it is iterated, that the columns are not equally long.
     """
     return zip(batch.keys, batch.sequences, batch.publish_wall_ns, batch.payloads, strict=True)
+
+
+def batches_kept(rigs: int, step_ms: float) -> int:
+    """How many batches of a lab's recording stream its sender keeps: 30 s of a few rigs, 10 s of hundreds.
+
+    The memory that this takes has a bound, and so has what a recorder that comes back must take in at once.
+    """
+    seconds = KEPT_MESSAGES / (rigs * 1000 / step_ms)
+    return round(min(max(seconds, SHORTEST_KEPT_S), LONGEST_KEPT_S) * 1e9 / FLUSH_PERIOD_NS)
 
 
 class LogStream:

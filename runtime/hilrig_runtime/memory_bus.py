@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.bus import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.errors import HilrigError
 from hilrig_schemas.topics import Traffic
 
@@ -83,7 +83,7 @@ class MemoryBus(Bus):
         self.hub = MemoryHub() if hub is None else hub
         self._handles: list[Handle] = []
 
-    def publisher(self, key: str, traffic: Traffic) -> Publisher:
+    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
         """See `Bus.publisher`."""
         return _MemoryPublisher(self.hub, key, traffic)
 
@@ -95,7 +95,13 @@ class MemoryBus(Bus):
         """See `Bus.subscribe_newest`; delivery is at once, so nothing ever waits."""
         return self.subscribe(key_expr, on_message)
 
-    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:  # noqa: ARG002
+    def subscribe_recording(
+        self,
+        key_expr: str,
+        on_message: OnMessage,
+        on_loss: OnLoss,  # noqa: ARG002
+        kept: int = KEPT,  # noqa: ARG002
+    ) -> Handle:
         """See `Bus.subscribe_recording`; nothing is ever lost here."""
         with self.hub.lock:
             for key, payloads in self.hub.history.items():

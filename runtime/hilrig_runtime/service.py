@@ -19,7 +19,7 @@ from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
 from hilrig_runtime.config import LabConfig, RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters, HealthReporter
-from hilrig_runtime.logstream import LogStream
+from hilrig_runtime.logstream import LogStream, batches_kept
 from hilrig_runtime.presence import Presence
 from hilrig_runtime.rig_batch import BatchSender, Gatherer
 from hilrig_schemas import Event, RigBatch, Roster
@@ -149,7 +149,11 @@ class Service:
         self._closing = ExitStack()
         self._closing.callback(bus.close)
         self._event_senders: dict[str, Sender[Event]] = {}
-        log_publisher = self._closing.enter_context(bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic))
+        self.batches_kept = batches_kept(len(lab.rigs), lab.sim.step_ms)
+        """How far back each recording stream of the lab can be repeated."""
+        log_publisher = self._closing.enter_context(
+            bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batches_kept)
+        )
         self.log = LogStream(log_publisher, self.source, self.incarnation)
         health_publisher = self._closing.enter_context(
             bus.publisher(HEALTH.key(lab.name, name, instance), HEALTH.traffic)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import zenoh
 
-from hilrig_runtime.bus import Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.bus import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.zenoh_config import (
@@ -110,10 +110,10 @@ class ZenohBus(Bus):
             raise OperationError("the bus is closed")
         return self._session
 
-    def publisher(self, key: str, traffic: Traffic) -> Publisher:
+    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:
         """See `Bus.publisher`."""
         if traffic is Traffic.RECORDING:
-            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic]))
+            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic], kept))
         return _ZenohPublisher(
             self.session.declare_publisher(
                 key,
@@ -131,9 +131,9 @@ class ZenohBus(Bus):
         """See `Bus.subscribe_newest`."""
         return _NewestReader(self.session, key_expr, on_message, waiting)
 
-    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> Handle:
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int = KEPT) -> Handle:
         """See `Bus.subscribe_recording`."""
-        return CompleteStream(self.session, key_expr, on_message, on_loss)
+        return CompleteStream(self.session, key_expr, on_message, on_loss, kept)
 
     def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.serve`."""

@@ -19,8 +19,6 @@ import zenoh.ext
 from hilrig_runtime.bus import Handle, OnLoss, OnMessage
 from hilrig_runtime.in_order import InOrder
 
-CACHE_SAMPLES: Final = 500
-"""What a publisher can repeat: 10 s at 50 batches a second."""
 PIECE_BYTES: Final = 256 * 1024
 """Of samples asked for at once: little enough to lie in the buffers between two processes."""
 _PAUSE_S: Final = 0.002
@@ -36,15 +34,18 @@ _HEARTBEAT_S: Final = 0.25
 logger = logging.getLogger(__name__)
 
 
-def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority) -> Any:
-    """A publisher with a cache. It never waits: what a slow reader has no room for is dropped, and can be repeated."""
+def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority, kept: int) -> Any:
+    """A publisher with a cache of its newest `kept` samples.
+
+    It never waits: what a slow reader has no room for is dropped, and can be repeated.
+    """
     return zenoh.ext.declare_advanced_publisher(
         session,
         key,
         congestion_control=zenoh.CongestionControl.DROP,
         priority=priority,
         cache=zenoh.ext.CacheConfig(
-            CACHE_SAMPLES,
+            kept,
             # The cache is locked while it answers: it must not wait for a reader that is held up. Who misses an answer
             # asks again.
             replies_config=zenoh.ext.RepliesConfig(
@@ -78,11 +79,14 @@ class _Source:
 class CompleteStream(Handle):
     """Subscribes to the recording publishers on `key_expr`; messages of each come in order and without a gap.
 
-    `on_loss` hears how many messages of a publisher could not be recovered.
+    `on_loss` hears how many messages of a publisher could not be recovered; each can repeat its newest `kept`.
     """
 
-    def __init__(self, session: zenoh.Session, key_expr: str, on_message: OnMessage, on_loss: OnLoss) -> None:
+    def __init__(
+        self, session: zenoh.Session, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int
+    ) -> None:
         self._session = session
+        self._kept = kept
         self._on_message = on_message
         self._on_loss = on_loss
         self._changed = threading.Condition()
@@ -140,7 +144,7 @@ class CompleteStream(Handle):
     def _source(self, cache: str) -> _Source:
         source = self._sources.get(cache)
         if source is None:
-            samples: InOrder[zenoh.Sample] = InOrder(self._deliver, self._on_loss, CACHE_SAMPLES)
+            samples: InOrder[zenoh.Sample] = InOrder(self._deliver, self._on_loss, self._kept)
             source = self._sources[cache] = _Source(cache, samples)
         return source
 

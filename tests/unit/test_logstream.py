@@ -1,7 +1,7 @@
 """The recording stream: batches that lose nothing and keep the bytes as they were."""
 
 from hilrig_runtime.bus import Publisher
-from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream, entries_of
+from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream, batches_kept, entries_of
 from hilrig_schemas import LogBatch, OpenSession
 
 
@@ -61,3 +61,11 @@ def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_n
     log.flush(30 + SESSIONS_PERIOD_NS)
     assert [[s.session for s in batch.sessions] for batch in out.batches] == [["s1"], [], []]
     assert all(batch.complete_sessions for batch in out.batches)
+
+
+def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:
+    kept_ns = {rigs: batches_kept(rigs, 20.0) * FLUSH_PERIOD_NS for rigs in (1, 30, 50, 100, 500)}
+    assert {rigs: ns / 1e9 for rigs, ns in kept_ns.items()} == {1: 30, 30: 30, 50: 20, 100: 10, 500: 10}
+    # At a step of 1 ms a rig says twenty times as much.
+    assert batches_kept(1, 1.0) == 1500
+    assert batches_kept(10, 1.0) == 500

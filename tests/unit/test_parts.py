@@ -4,7 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.parts import next_part
+from hilrig_recorder.parts import horizon_of, next_part
+from hilrig_recorder.recording import EVENT_CHANNEL
+from hilrig_recorder.recover import Tail
+from log_streams import SECOND
 
 SESSION = "20260101T000000Z-rig1-abcd"
 
@@ -36,3 +39,10 @@ def test_a_session_goes_on_behind_its_last_file(
 
 def test_a_rig_without_a_folder_begins_with_the_first(tmp_path: Path) -> None:
     assert next_part(tmp_path / "rig1", SESSION).number == 1
+
+
+def test_what_is_older_than_what_was_looked_at_is_not_recorded_again() -> None:
+    tail = Tail("", set(), {1: (500, 1_000 * SECOND), 2: (90, 940 * SECOND), EVENT_CHANNEL: (3, 100 * SECOND)}, 0)
+    horizon_ns = horizon_of(tail, 35 * SECOND)
+    # Each channel by its sender's clock; an event may be the first for a long time.
+    assert horizon_ns == {1: 965 * SECOND, 2: 905 * SECOND, EVENT_CHANNEL: 965 * SECOND}

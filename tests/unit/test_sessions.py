@@ -56,11 +56,12 @@ class FakeShelf:
     accepts: bool = True
     seen: set[tuple[int, int, int]] | None = None
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
+    horizon_ns: dict[int, int] = field(default_factory=dict)
 
     def open(self, recording: Recording) -> FakeFile | None:
         if not self.accepts:
             return None
-        recording.seen, recording.last = self.seen, dict(self.last)
+        recording.seen, recording.last, recording.horizon_ns = self.seen, dict(self.last), self.horizon_ns
         self.files.append(FakeFile(recording, self.flush))
         return self.files[-1]
 
@@ -296,21 +297,27 @@ def test_a_recorder_of_some_rigs_passes_over_the_others() -> None:
     assert (desk.file.recording.tally.lost_transport, desk.book.lost_transport) == (0, 0)
 
 
-def test_messages_are_written_within_a_second_and_not_of_all_rigs_at_once() -> None:
+def test_what_comes_first_is_written_at_once_and_then_within_a_second_and_not_of_all_rigs_at_once() -> None:
     desk = Desk()
     rigs = [f"rig{number}" for number in range(20)]
     for rig in rigs:
         desk.start(rig, rig)
-    for rig in rigs:
-        desk.sim.state(rig, desk.wall)
-    desk.take(desk.sim.batch())
-    written = [len(file.records) for file in desk.shelf.files]
-    turns = []
-    for _ in range(10):
-        desk.wait(BLOCK_NS // 10)
-        counts = [len(file.records) for file in desk.shelf.files]
-        turns.append(sum(now > before for now, before in zip(counts, written, strict=True)))
-        written = counts
+
+    def written_in_turns() -> list[int]:
+        for rig in rigs:
+            desk.sim.state(rig, desk.wall)
+        desk.take(desk.sim.batch())
+        written = [len(file.records) for file in desk.shelf.files]
+        turns = []
+        for _ in range(10):
+            desk.wait(BLOCK_NS // 10)
+            counts = [len(file.records) for file in desk.shelf.files]
+            turns.append(sum(now > before for now, before in zip(counts, written, strict=True)))
+            written = counts
+        return turns
+
+    assert written_in_turns() == [len(rigs)] + 9 * [0]
+    turns = written_in_turns()
     assert sum(turns) == len(rigs)
     assert max(turns) <= 4
 
@@ -442,6 +449,17 @@ def test_a_continued_session_leaves_out_what_the_file_before_holds_and_counts_wh
     new = desk.states(1)
     assert desk.file.payloads == payloads(*new)
     assert desk.file.recording.tally.lost_recorder == 3
+
+
+def test_what_is_repeated_from_before_what_is_known_of_the_file_before_is_left_out() -> None:
+    desk = Desk()
+    desk.shelf.seen = set()
+    desk.shelf.horizon_ns = {1: desk.wall}
+    desk.sim.state("rig1", desk.wall - 1)
+    wanted = desk.sim.state("rig1", desk.wall)
+    desk.take(desk.sim.batch())
+    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    assert desk.file.payloads == payloads(wanted)
 
 
 def test_a_session_that_can_not_be_recorded_is_tried_again() -> None:

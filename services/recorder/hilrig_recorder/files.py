@@ -12,7 +12,7 @@ from mcap.records import Metadata
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.chunk import compressor
 from hilrig_recorder.disk import Disk
-from hilrig_recorder.parts import NextPart, next_part, tail_of_session
+from hilrig_recorder.parts import NextPart, horizon_of, next_part, tail_of_session
 from hilrig_recorder.recording import SECOND_NS, Recording, Sink, Tally
 from hilrig_recorder.run_file import RunFile
 from hilrig_recorder.space import MIB, Space
@@ -28,8 +28,8 @@ _NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
 class Files:
     """The recordings' files; used from the recorder's thread alone. Implements `recording.Shelf`.
 
-    `tell` gets what the operator should know; `ask_config` the name of a rig whose configuration is wanted;
-    `give_up` a recording whose file can't go on.
+    `repeated_ns` is how old what senders repeat after a restart may be. `tell` gets what the operator should know;
+    `ask_config` the name of a rig whose configuration is wanted; `give_up` a recording whose file can't go on.
     """
 
     def __init__(
@@ -40,6 +40,7 @@ class Files:
         disk: Disk,
         *,
         instance: str,
+        repeated_ns: int,
         tell: Callable[[Event], None],
         ask_config: Callable[[str], None],
         give_up: Callable[[Recording], None],
@@ -50,6 +51,7 @@ class Files:
         self._clock = clock
         self._disk = disk
         self._instance = instance
+        self._repeated_ns = repeated_ns
         self._tell = tell
         self._ask_config = ask_config
         self._give_up = give_up
@@ -79,10 +81,11 @@ class Files:
         folder = self.folder / recording.rig
         part = next_part(folder, recording.session)
         if part.previous is not None:
-            tail = tail_of_session(folder, recording.session, part.number - 1)
+            tail = tail_of_session(folder, recording.session, part.number - 1, self._repeated_ns)
             if tail.end == "ended":
                 return None
             recording.seen, recording.last = tail.keys, tail.last
+            recording.horizon_ns = horizon_of(tail, self._repeated_ns)
         return None if self._space.full else self._open(recording, part)
 
     def close(self, recording: Recording, end: str, reason: str) -> None:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilrig_recorder.durable import PART_SUFFIX, part_path
-from hilrig_recorder.recover import TAIL_NS, Tail, read_tail
+from hilrig_recorder.recording import EVENT_CHANNEL
+from hilrig_recorder.recover import Tail, read_tail
 from hilrig_runtime.errors import InputError
 
 
@@ -36,17 +37,25 @@ def next_part(folder: Path, session: str) -> NextPart:
     return NextPart(folder / file_name(session, number + 1), number + 1, previous)
 
 
-def tail_of_session(folder: Path, session: str, number: int) -> Tail:
-    """The last seconds of a session's files up to a number: a recorder may have been restarted often."""
-    tail = _tail(folder / file_name(session, number))
+def tail_of_session(folder: Path, session: str, number: int, tail_ns: int) -> Tail:
+    """The last `tail_ns` of a session's files up to a number: a recorder may have been restarted often."""
+    tail = _tail(folder / file_name(session, number), tail_ns)
     last_ns = tail.last_ns
-    while number > 1 and (not last_ns or last_ns - tail.last_ns < TAIL_NS):
+    while number > 1 and (not last_ns or last_ns - tail.last_ns < tail_ns):
         number -= 1
-        before = _tail(folder / file_name(session, number))
+        before = _tail(folder / file_name(session, number), tail_ns)
         last_ns = last_ns or before.last_ns
         reached_ns = before.last_ns or tail.last_ns
         tail = Tail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
     return tail
+
+
+def horizon_of(tail: Tail, tail_ns: int) -> dict[int, int]:
+    """Publish time of each channel before which `tail`, read with `tail_ns`, does not know what was recorded."""
+    # Senders' clocks may differ, so each channel has its own; events are too rare for that.
+    newest_ns = max((publish_ns for _, publish_ns in tail.last.values()), default=0)
+    horizon_ns = {channel_id: publish_ns - tail_ns for channel_id, (_, publish_ns) in tail.last.items()}
+    return horizon_ns | {EVENT_CHANNEL: newest_ns - tail_ns}
 
 
 def file_name(session: str, number: int) -> str:
@@ -63,9 +72,9 @@ def _number(name: str, session: str) -> int:
     return int(number) if number.isdecimal() and number != stem else 0
 
 
-def _tail(path: Path) -> Tail:
+def _tail(path: Path, tail_ns: int) -> Tail:
     # It may get its name just now, from the disk's thread or because it is recovered.
     for candidate in (path, part_path(path), path):
         with contextlib.suppress(InputError):
-            return read_tail(candidate)
+            return read_tail(candidate, tail_ns)
     return Tail("", set(), {}, 0)

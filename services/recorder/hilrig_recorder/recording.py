@@ -58,6 +58,8 @@ class Recording:
     """Messages (channel, sequence, publish time) that an earlier file of this session holds; None: none is known."""
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Last sequence and publish time of each channel in that earlier file."""
+    horizon_ns: dict[int, int] = field(default_factory=dict)
+    """What is stamped earlier than this, by channel, came before `seen` was looked at; publish time."""
     end_wall_ns: int | None = None
     """Its end, sender's wall clock, ns; None: it goes on."""
     end_reason: str = ""
@@ -82,7 +84,7 @@ class Recording:
         if self.seen is None:
             return True
         channel_id, sequence, publish_ns = head.channel_id, head.sequence, head.publish_time
-        if (channel_id, sequence, publish_ns) in self.seen:
+        if (channel_id, sequence, publish_ns) in self.seen or publish_ns < self.horizon_ns.get(channel_id, 0):
             return False
         # The first new message of a channel with one sender tells what was missed between the files.
         if channel_id != EVENT_CHANNEL and channel_id in self.last:

@@ -21,8 +21,6 @@ from hilrig_runtime.errors import InputError, OperationError
 
 RECOVERING_SUFFIX: Final = ".recovering"
 _HEAD_BYTES: Final = 64 * 1024
-TAIL_NS: Final = 15_000_000_000
-"""How far back from its end a file's messages are looked at when the next file of its session begins."""
 
 
 @dataclass(slots=True)
@@ -74,8 +72,8 @@ def map_file(path: Path) -> memoryview:
         raise InputError(f"{path}: can't be read: {error.strerror}") from error
 
 
-def read_tail(path: Path) -> Tail:
-    """What the next file of a session must know of the one before.
+def read_tail(path: Path, tail_ns: int) -> Tail:
+    """What the next file of a session must know of the one before; of its messages, those of the last `tail_ns`.
 
     Raises:
         InputError: it can't be read.
@@ -91,7 +89,7 @@ def read_tail(path: Path) -> Tail:
             chunks.append(item)
     last_ns = max((chunk.last_ns for chunk in chunks), default=0)
     for chunk in chunks:
-        if chunk.last_ns >= last_ns - TAIL_NS:
+        if chunk.last_ns >= last_ns - tail_ns:
             with contextlib.suppress(DamagedError):
                 for key in message_keys(chunk):
                     keys.add(key)

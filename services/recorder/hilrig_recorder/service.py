@@ -25,6 +25,7 @@ from hilrig_recorder.sessions import SessionBook
 from hilrig_recorder.share import Share
 from hilrig_recorder.writer import RunWriter
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.logstream import FLUSH_PERIOD_NS
 from hilrig_runtime.service import Service
 from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
@@ -36,6 +37,8 @@ _ANSWER_TIMEOUT_S: Final = 1.0
 _LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
 """When it is told to stop, the recorder waits so long for what the others still have to say."""
 _DRAIN_NS: Final = SECOND_NS // 2
+_REPEATED_LATE_NS: Final = 5 * SECOND_NS
+"""What a sender repeats may have arrived at an earlier recorder so much later than it was sent."""
 _FINISH_TIMEOUT_S: Final = 0.4
 
 logger = logging.getLogger(__name__)
@@ -105,6 +108,7 @@ class Recorder:
             service.clock,
             self._disk,
             instance=service.instance,
+            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _REPEATED_LATE_NS,
             tell=self._tell,
             ask_config=self._ask_config,
             give_up=self._give_up,
@@ -117,7 +121,9 @@ class Recorder:
         )
         parts = [part for part in unfinished(self._files.folder) if share.has(part.parent.name)]
         self._restore(parts)
-        self._stream = service.bus.subscribe_recording(LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss)
+        self._stream = service.bus.subscribe_recording(
+            LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss, service.batches_kept
+        )
         self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
         service.health.rig_reports = self._rig_reports
         self._housekeeping = Housekeeping(self._files.folder, parts, config, service.clock, self._troubles.put)

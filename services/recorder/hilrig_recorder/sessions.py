@@ -140,9 +140,10 @@ class SessionBook:
     def _rig(self, name: str, now_ns: int) -> RigLog:
         rig = self._rigs.get(name)
         if rig is None:
-            # In turns, so that the blocks of a large lab are not all written at once.
+            # In turns, so that the blocks of a large lab are not all written at once. The first is written soon: what
+            # comes first was fetched, after a restart, and may not be there to be fetched again after the next.
             phase_ns = BLOCK_NS * (len(self._rigs) % _PHASES) // _PHASES
-            rig = self._rigs[name] = RigLog(name, now_ns + phase_ns)
+            rig = self._rigs[name] = RigLog(name, now_ns + phase_ns - BLOCK_NS)
         return rig
 
     def _lose(self, source: Source, stream: Stream, transport: int, recorder: int) -> None:
