@@ -34,17 +34,19 @@ h1 { font-size: 1.6rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 0 
 p { margin: .3rem 0; } .quiet { color: #5d6771; }
 section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8px;
   padding: 1rem 1.2rem; margin: 1rem 0; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .8rem; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .8rem; }
 .facts div { border-left: 3px solid #4c78a8; padding-left: .6rem; } .facts b { display: block; font-size: 1.25rem; }
 .facts span { color: #5d6771; font-size: .85rem; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
+th, td { padding: .25rem .45rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
 th:first-child, td:first-child, td.text { text-align: left; }
 td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600; }
 img { max-width: 100%; height: auto; display: block; }
-@media (max-width: 44rem) { .scroll img { max-width: none; width: 46rem; } th, td { padding: .25rem .4rem; } }
+@media (max-width: 44rem) { .scroll img { max-width: none; width: 46rem; } th, td { padding: .25rem .3rem; }
+  td.text { min-width: 9rem; } }
  li { margin: .25rem 0; }
-.good { color: #1a7f37; } .bad { color: #b35900; } summary { cursor: pointer; font-weight: 600; }
+.good { color: #1a7f37; } .bad { color: #b35900; }
+summary { cursor: pointer; font-weight: 600; } summary span { font-weight: 400; }
 @media print { body { max-width: none; } section, details { break-inside: avoid; } }
 """
 
@@ -99,11 +101,12 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str]) -> str:
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
-        body = f"<h1>{escape(title)}</h1>{_run(pages[0])}"
+        body = f'<h1>{escape(title)}</h1><p class="quiet">{escape(_who(summary))}</p>{_run(pages[0])}'
     else:
         title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
-            f"<details><summary>{number}. {escape(page.summary.session)}</summary>{_run(page)}</details>"
+            f"<details><summary>{number}. {escape(page.summary.session)} "
+            f'<span class="quiet">· {escape(_who(page.summary))}</span></summary>{_run(page)}</details>'
             for number, page in enumerate(pages, start=1)
         )
         body = f"<h1>{title}</h1>{_overview(pages)}{_left_out(left_out)}{details}"
@@ -126,16 +129,18 @@ def _page(run: Run, verified: bool, task: TaskConfig | None) -> _Page:
 
 def _run(page: _Page) -> str:
     summary = page.summary
-    who = summary.controller or "nobody"
-    about = f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · controlled by {who} · {summary.start}"
     return (
-        f'<p class="quiet">{escape(about)}</p>'
         f"<section>{_facts(page)}</section>"
         f"{_task(summary)}"
         f"<section><h2>Motion</h2>{page.pictures[0]}{_efforts(summary)}</section>"
         f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.pictures[1:])}</section>"
         f"<section><h2>Events</h2>{_events(summary)}</section>"
     )
+
+
+def _who(summary: RunSummary) -> str:
+    who = summary.controller or "nobody"
+    return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · controlled by {who} · {summary.start}"
 
 
 def _facts(page: _Page) -> str:

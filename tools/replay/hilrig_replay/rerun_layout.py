@@ -74,13 +74,16 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         ),
     )
     curves = rrb.Vertical(
-        plot("Positions: θ in °, d3 in mm; events as marks", "position", "marks"),
-        plot("Velocities: θ in °/s, d3 in mm/s", "velocity", legend=False),
+        # Of several runs each has its colour: one plot that says so is enough.
+        plot("Positions: θ in °, d3 in mm", "position", legend=len(roots) == 1),
+        # Marks stand where there is no legend: each kind of event would take a line of it.
+        plot("Velocities: θ in °/s, d3 in mm/s; events as marks", "velocity", "marks", legend=False),
         plot("Efforts: τ1 τ2 τ4 in N·m, τ3 in N (thin: commanded)", "effort", legend=False),
-        plot("Loop latency, made of its stages, ms", "stages", "marks")
-        if len(roots) == 1
-        else plot("Loop latency, ms", "loop"),
-        rrb.Tabs(plot("Tick lateness, ms", "lateness", legend=False), plot("Modbus requests per second", "modbus")),
+        plot("Loop latency, made of its stages, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
+        rrb.Tabs(
+            plot("Tick lateness, ms; events as marks", "lateness", "marks", legend=False),
+            plot("Modbus requests per second", "modbus"),
+        ),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
     )
     return rrb.Blueprint(
