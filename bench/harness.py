@@ -11,7 +11,8 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -142,6 +143,22 @@ def progress(text: str) -> None:
     """Say on standard error what runs now, where somebody watches."""
     if sys.stderr.isatty():
         print(f"  {text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def services_log(path: Path) -> Iterator[None]:
+    """What processes that are started meanwhile say on standard error goes into a file; what we say does not."""
+    sys.stderr.flush()
+    ours = os.dup(2)
+    before = sys.stderr
+    with path.open("ab") as log, os.fdopen(ours, "w", buffering=1) as said:
+        os.dup2(log.fileno(), 2)
+        sys.stderr = said
+        try:
+            yield
+        finally:
+            sys.stderr = before
+            os.dup2(ours, 2)
 
 
 def run(measure: Callable[[Report, bool], None], question: str) -> int:
