@@ -36,7 +36,7 @@ def config(parameters: RigParameters = RIG) -> RigConfig:
 
 def poses(*rigs: str, now_s: float = 0.0) -> Poses:
     made = Poses()
-    made.hear(batch(**dict.fromkeys(rigs, state())), now_s)
+    made.hear([batch(**dict.fromkeys(rigs, state()))], now_s)
     for rig in rigs:
         made.learn(rig, config())
     return made
@@ -69,21 +69,21 @@ def test_a_scene_has_the_parts_in_the_order_of_the_states() -> None:
 
 def test_a_rig_is_drawn_when_it_is_known_what_it_looks_like() -> None:
     made = Poses()
-    made.hear(batch(rig1=state()), 0.0)
+    made.hear([batch(rig1=state())], 0.0)
     assert made.unknown() == ["rig1"]
     assert made.drawn(0.0) == {}
     made.learn("rig1", None)
     assert made.unknown() == ["rig1"]
     made.learn("rig1", config())
     assert made.unknown() == []
-    made.hear(batch(rig1=state()), 0.1)
+    made.hear([batch(rig1=state())], 0.1)
     number, pose, parts = made.drawn(0.1)["rig1"]
     assert (number, len(pose), parts) == (0, 6, [])
 
 
 def test_an_answer_that_is_not_understood_is_not_asked_for_again() -> None:
     made = Poses()
-    made.hear(batch(rig1=state()), 0.0)
+    made.hear([batch(rig1=state())], 0.0)
     made.learn("rig1", RigConfig(parameters_json="{}"))
     assert made.unknown() == []
 
@@ -93,26 +93,42 @@ def test_a_simulation_that_starts_anew_is_asked_again_and_rigs_share_a_scene() -
     assert len(made.scenes) == 1
     again = state()
     again.incarnation = 8
-    made.hear(batch(rig1=again), 0.1)
+    made.hear([batch(rig1=again)], 0.1)
     assert made.unknown() == ["rig1"]
     other = RigParameters(arm=ArmParameters(l2=0.4), scene=RIG.scene)
     made.learn("rig1", config(other))
-    made.hear(batch(rig1=again, rig2=state()), 0.2)
+    made.hear([batch(rig1=again, rig2=state())], 0.2)
     assert [drawn[0] for drawn in made.drawn(0.2).values()] == [1, 0]
 
 
 def test_parts_stay_where_they_were_said_to_be_last() -> None:
     made = poses("rig1")
     moved = state(parts=[PartState(name="red", x=0.1, y=-0.2, z=0.0, yaw=math.pi / 2)])
-    made.hear(batch(rig1=moved), 0.1)
-    made.hear(batch(rig1=state()), 0.2)
+    made.hear([batch(rig1=moved)], 0.1)
+    made.hear([batch(rig1=state())], 0.2)
     assert made.drawn(0.2)["rig1"][2] == [[100, -200, 90]]
+
+
+def test_of_several_states_the_newest_pose_and_the_newest_parts_count() -> None:
+    made = poses("rig1", "rig2")
+
+    def placed(x: float) -> JointState:
+        return state((0.0, 0.0, 0.0, 0.0), parts=[PartState(name="red", x=x, y=0.1, z=0.1, yaw=0.1)])
+
+    still, bent = state((0.0, 0.0, 0.0, 0.0)), state((math.pi / 2, 0.0, 0.0, 0.0))
+    made.hear([batch(rig1=placed(0.1)), batch(rig1=placed(0.2), rig2=bent), batch(rig1=bent), batch(rig2=still)], 0.1)
+    drawn = made.drawn(0.1)
+    assert [drawn[rig][1][2:4] for rig in ("rig1", "rig2")] == [[0, 600], [600, 0]]
+    assert drawn["rig1"][2] == [[200, 100, 6]]
+    # Also later, when how long such a state is is known.
+    made.hear([batch(rig1=placed(0.3)), batch(rig1=still)], 0.2)
+    assert made.drawn(0.2)["rig1"][2] == [[300, 100, 6]]
 
 
 def test_a_rig_that_is_silent_is_drawn_no_more_and_garbage_changes_nothing() -> None:
     made = poses("rig1")
-    made.hear(batch(rig1=state()), 1.0)
-    made.hear(b"\xff\xff garbage", 1.0)
+    made.hear([batch(rig1=state())], 1.0)
+    made.hear([b"\xff\xff garbage"], 1.0)
     assert "rig1" in made.drawn(1.0 + SILENT_S)
     assert made.drawn(1.1 + SILENT_S) == {}
 

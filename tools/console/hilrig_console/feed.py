@@ -42,7 +42,7 @@ class Feed:
     def __init__(self, lab: LabConfig) -> None:
         self._lab = lab
         self._page = Page(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
-        self._states: deque[tuple[bytes, float]] = deque(maxlen=_BATCHES)
+        self._states: deque[bytes] = deque(maxlen=_BATCHES)
         self._looked_s = -LEFT_S
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
@@ -53,8 +53,7 @@ class Feed:
         self._looked_s = now_s
         page = self._page
         with page.lock:
-            for _ in range(len(self._states)):
-                page.poses.hear(*self._states.popleft())
+            page.poses.hear([self._states.popleft() for _ in range(len(self._states))], now_s)
             return page.frame(now_s, more)
 
     def scenes(self) -> list[Any]:
@@ -97,14 +96,18 @@ class Feed:
             elif not watched and states is not None:
                 states.close()
                 states = None
-            with self._page.lock:
-                period_s = NEWCOMERS_S if self._page.has_newcomers(now_s) else ROSTERS_S
-            if watched and now_s - asked_s > period_s:
+            if watched and self._are_rosters_due(now_s, now_s - asked_s):
                 asked_s = now_s
                 found = rosters(bus, self._lab.name)
                 with self._page.lock:
                     self._page.know(found)
             self._ask_what_rigs_look_like(bus)
+
+    def _are_rosters_due(self, now_s: float, age_s: float) -> bool:
+        if not NEWCOMERS_S < age_s <= ROSTERS_S:
+            return age_s > ROSTERS_S
+        with self._page.lock:
+            return self._page.has_newcomers(now_s)
 
     def _ask_what_rigs_look_like(self, bus: Bus) -> None:
         with self._page.lock:
@@ -130,7 +133,7 @@ class Feed:
 
     def _on_states(self, key: str, payload: bytes) -> None:
         del key
-        self._states.append((payload, time.monotonic()))
+        self._states.append(payload)
 
 
 def _config(bus: Bus, lab: str, rig: str) -> RigConfig | None:
