@@ -157,6 +157,18 @@ def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path:
 
 
 @pytest.mark.rig
+def test_a_disk_that_is_read_only_is_one_line_and_exit_3(tmp_path: Path) -> None:
+    config, _ = make_lab(tmp_path)
+    with tmpfs(tmp_path / "recordings", 600) as folder:
+        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        with RecorderProcess(config) as recorder:
+            assert recorder.process.wait(30) == 3
+    errors = [line for line in recorder.log.read_text().splitlines() if "error" in line]
+    assert len(errors) == 1
+    assert "recordings can't be written there: Read-only file system" in errors[0]
+
+
+@pytest.mark.rig
 def test_a_folder_that_can_not_be_written_is_one_line_and_exit_3(tmp_path: Path) -> None:
     config, _ = make_lab(tmp_path)
     (tmp_path / "recordings").write_text("in the way")
