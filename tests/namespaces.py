@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,11 +28,14 @@ def require_namespaces() -> None:
     subprocess.run(["ip", "netns", "delete", f"hr{os.getpid()}probe"], check=True)
 
 
+_NUMBERS = count()
+
+
 class Network:
     """Hosts by name, each in a namespace of its own, all on one bridge; use it as a context manager."""
 
     def __init__(self, hosts: list[str]) -> None:
-        self._prefix = f"hr{os.getpid()}"
+        self._prefix = f"hr{os.getpid()}n{next(_NUMBERS)}"
         self._addresses = {host: f"10.77.0.{number}" for number, host in enumerate(hosts, start=10)}
         self._closing = ExitStack()
 

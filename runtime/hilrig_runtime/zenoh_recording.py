@@ -28,7 +28,7 @@ _OVERTAKEN_S: Final = 0.1
 _ASK_TIMEOUT_S: Final = 1.0
 _ASK_AGAIN_S: Final = 0.25
 _GIVE_UP_S: Final = 10.0
-"""After so long without an answer the cache, at its usual rate, no longer has what is missing."""
+"""Who has not answered for so long is not waited for any more: what came after is to be written."""
 _HEARTBEAT_S: Final = 0.25
 
 logger = logging.getLogger(__name__)
