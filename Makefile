@@ -32,9 +32,11 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-# What judges real time runs alone, one test after the other; all else shares the cores, with a worker more than cores, for
-# real processes are often waited for. Where the host of a virtual machine takes its processors away for a moment, a
-# judgement of real time fails for it: only those are made once more.
+# What judges real time runs alone, one test after the other; all else shares the cores, with a worker more than two cores
+# have, for real processes are often waited for; so no process spreads its matrices over all cores. Where the host of a
+# virtual machine takes its processors away for a moment, a judgement of real time fails for it: only those are made
+# once more.
+test: export OPENBLAS_NUM_THREADS = 1
 test: .venv/bin/python ## everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 system check
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not alone"

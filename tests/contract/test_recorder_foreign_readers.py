@@ -108,7 +108,7 @@ def test_foxglove_s_reader_for_node_finds_the_same(files: list[Path], tmp_path: 
 
 def test_pymcap_s_doctor_finds_no_fault(files: list[Path], tmp_path: Path) -> None:
     target = tmp_path / "packages"
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
     install([*pip, "--target", str(target), "pymcap-cli"], "pymcap-cli")
     for path in files:
         done = subprocess.run(

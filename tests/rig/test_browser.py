@@ -30,6 +30,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def report(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    page = tmp_path_factory.mktemp("report") / "report.html"
+    result = hilrig("report", runs / "quick.mcap", "--out", page)
+    assert (result.returncode, result.stdout.strip()) == (0, str(page)), result.stderr
+    return page
+
+
+@pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with Browser(tmp_path_factory.mktemp("browser")) as opened:
         yield opened
@@ -37,12 +45,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.mark.parametrize("width", [1200, 420])
 def test_a_report_is_whole_wide_and_narrow_and_asks_the_network_for_nothing(
-    runs: Path, browser: Browser, width: int, tmp_path: Path
+    report: Path, browser: Browser, width: int
 ) -> None:
-    page = tmp_path / "report.html"
-    result = hilrig("report", runs / "quick.mcap", "--out", page)
-    assert (result.returncode, result.stdout.strip()) == (0, str(page)), result.stderr
-    browser.open(page.as_uri(), width=width, height=2400)
+    browser.open(report.as_uri(), width=width, height=2400)
     assert browser.errors == []
     assert all(address.startswith(("file:", "data:")) for address in browser.requests)
     assert browser.run("[...document.images].every(image => image.complete && image.naturalWidth > 500)")
@@ -73,6 +78,7 @@ def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, brows
     assert browser.run("document.body.scrollHeight") > before + 500
 
 
+@pytest.mark.timeout(300)
 def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path) -> None:
     run = record(tmp_path / "run.mcap", Script(seconds=6.0))
     process = subprocess.Popen(
@@ -83,14 +89,15 @@ def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path
         told = re.match(r"open (http://127\.0\.0\.1:\S+) ", process.stderr.readline())
         assert told is not None
         with Browser(tmp_path / "browser", graphics=True) as browser:
-            browser.open(told[1], width=1000, height=600)
+            browser.open(told[1], width=800, height=480)
 
             def arm_on_its_table(picture: np.ndarray) -> bool:
                 scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
                 table = share_of(scene, (0.75, 1), (0.7, 1), (0.6, 0.9))
                 return table > 0.05 and share_of(scene, (0.6, 1), (0.35, 0.75), (0, 0.45)) > 0.003
 
-            picture = browser.until(arm_on_its_table)
+            # Drawn in software, beside whatever else runs here.
+            picture = browser.until(arm_on_its_table, timeout_s=240)
             curves = picture[:, int(0.6 * picture.shape[1]) :]
             assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10
             elsewhere = [one for one in browser.requests if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", one)]
