@@ -35,7 +35,7 @@ from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Connection as ModbusConnection
 from hilrig_modbus_edge.server import Limits, RigServer
 from hilrig_modbus_edge.settings import DeviceSettings
-from hilrig_runtime.bus import Publisher
+from hilrig_runtime.bus import KEPT, Publisher
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus
 from hilrig_runtime.service import Arrival, Service
@@ -235,7 +235,7 @@ def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG
 class NowhereBus(MemoryBus):
     """A bus that carries states and nothing else: what is published goes nowhere, and costs nothing."""
 
-    def publisher(self, key: str, traffic: topics.Traffic) -> Publisher:  # noqa: ARG002
+    def publisher(self, key: str, traffic: topics.Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
         return _Nowhere()
 
 

@@ -10,6 +10,7 @@ import zenoh
 from hilrig_runtime.bus import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.realtime import one_ahead
 from hilrig_runtime.zenoh_config import (
     FIRST_INSTANCE,
     MESH_ORDER,
@@ -58,6 +59,10 @@ class _NewestReader(Handle):
         self._thread.start()
 
     def _read(self) -> None:
+        with one_ahead():
+            self._read_all()
+
+    def _read_all(self) -> None:
         recv, on_sample = self._ring.recv, self._on_sample
         while not self._closing:
             try:
@@ -99,7 +104,8 @@ class ZenohBus(Bus):
         if finds_others_by_gossip(bus, service, instance):
             self.settling_s = _GOSSIP_S
         try:
-            self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
+            with one_ahead():
+                self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
         except zenoh.ZError as error:
             raise OperationError(_why_not_open(bus, service, error)) from error
 

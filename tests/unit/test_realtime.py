@@ -85,6 +85,39 @@ def test_the_real_time_policy_holds_for_all_threads_where_it_is_granted(target: 
     assert priority == (1 if granted else 0)
 
 
+def _one_ahead(connection: Connection) -> None:
+    import threading
+
+    priorities = []
+
+    def look() -> None:
+        priorities.append(realtime.realtime_priority())
+
+    def receive() -> None:
+        with realtime.one_ahead():
+            look()
+            thread = threading.Thread(target=look)
+            thread.start()
+            thread.join()
+        look()
+
+    receive()
+    granted = realtime.go_realtime(1)
+    receive()
+    connection.send((granted, priorities))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the policy")
+def test_who_receives_goes_one_ahead_and_back_under_the_real_time_policy_alone() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_one_ahead, args=(theirs,))
+    process.start()
+    assert ours.poll(20)
+    granted, priorities = ours.recv()
+    process.join(10)
+    assert priorities == [0, 0, 0, 2, 2, 1] if granted else [0] * 6
+
+
 def _stepped_back(connection: Connection) -> None:
     realtime.yield_to_others()
     connection.send(os.getpriority(os.PRIO_PROCESS, 0))
