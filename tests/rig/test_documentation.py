@@ -28,6 +28,7 @@ OPENS_A_WINDOW = ("hilrig replay", "hilrig live")
 """Run with --save, for there is no screen."""
 TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose up": "tests/hosts/test_compose.py",
+    "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
     "hilrig jitter": "tests/rig/test_jitter.py",

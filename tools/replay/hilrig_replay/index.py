@@ -95,7 +95,8 @@ class RunIndex:
         if not self.folder.is_dir():
             what = "a file, where a folder of recordings was expected" if self.folder.exists() else "no such folder"
             raise InputError(f"{self.folder}: {what}")
-        known = {} if rebuild else self._read()
+        # What was read before holds also where the folder can't be written.
+        known = {} if rebuild else self._known or self._read()
         self._changed = rebuild
         self._known = {}
         for relative, info in _walk(self.folder):
