@@ -15,7 +15,7 @@ from hilrig_runtime.clock import Clock
 
 LOOK_PERIOD_NS: Final = 100_000_000
 """So soon what was written is synced; a file is written to about once a second."""
-ENDING_S: Final = 1.0
+ENDING_S: Final = 0.9
 """When all ends: the longest that files are given to get their index and name, without syncing."""
 
 logger = logging.getLogger(__name__)
@@ -51,6 +51,7 @@ class Disk:
         self._on_ended = on_ended
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self._open: dict[int, _Open] = {}
+        self._closing = threading.Event()
         self._hurry = threading.Event()
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
@@ -73,6 +74,7 @@ class Disk:
         Returns:
             Whether all is done.
         """
+        self._closing.set()
         self._jobs.put(None)
         self._thread.join(timeout_s)
         self._hurry.set()
@@ -107,8 +109,8 @@ class Disk:
 
     def _sync(self, item: _Open) -> bool:
         """Sync a file that was written to; whether it was."""
-        # A job between may have closed it.
-        if self._ended or id(item.writer) not in self._open or item.writer.size == item.synced:
+        # A job between may have closed it; and at the end every file is about to be.
+        if self._closing.is_set() or id(item.writer) not in self._open or item.writer.size == item.synced:
             return False
         size = item.writer.size
         try:

@@ -1,7 +1,7 @@
 """The last seconds of one rig, in sessions or not, so that a session's file can begin before its start.
 
-Messages are encoded as they come and wait until they are cut off as a block, about once a second: a block goes into every
-file that is open, and stays as pre-roll for the next. Nothing about a message is kept but its record: for a large
+Messages are encoded as they come and wait until they are cut off as a block, about once a second: a block goes into
+every file that is open, and stays as pre-roll for the next. Nothing about a message is kept but its record: for a large
 lab these are a hundred thousand, and keeping them must not cost as much as recording them.
 """
 

@@ -39,7 +39,7 @@ _LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
 _DRAIN_NS: Final = SECOND_NS // 2
 _REPEATED_LATE_NS: Final = 5 * SECOND_NS
 """What a sender repeats may have arrived at an earlier recorder so much later than it was sent."""
-_FINISH_TIMEOUT_S: Final = 0.4
+_FINISH_TIMEOUT_S: Final = 0.3
 
 logger = logging.getLogger(__name__)
 
