@@ -31,6 +31,11 @@ class Rate:
         self._clock = clock
         self._deadline_ns: int | None = None
 
+    @property
+    def next_ns(self) -> int:
+        """The next deadline, as long as no period passes wholly, ns, monotonic clock."""
+        return (self._clock.monotonic_ns() if self._deadline_ns is None else self._deadline_ns) + self.period_ns
+
     def wait(self) -> Tick:
         """Sleep until the next deadline that has not wholly passed, and say how that went."""
         period = self.period_ns

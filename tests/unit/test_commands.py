@@ -134,3 +134,25 @@ def test_times_of_steps_are_kept_for_a_while() -> None:
     for step in range(1, 7):
         times.add(step, step * 10)
     assert [times.get(step) for step in range(8)] == [None, None, None, 30, 40, 50, 60, None]
+
+
+def test_what_was_expected_is_latched_as_it_is_and_a_newer_one_instead_of_it() -> None:
+    follows = follower()
+    expected, newer = command(seq=1, effort=[9.0, 0.0, 0.0, 0.0]), command(seq=2)
+    follows.expect(None)
+    follows.expect(expected)
+    # Nothing of it acts before the tick.
+    assert (follows.seq, follows.effort, follows.safe) == (0, ZERO_EFFORT, True)
+    follows.latch(expected, 20 * MS)
+    assert (follows.seq, follows.effort, follows.is_new) == (1, (9.0, 0.0, 0.0, 0.0), True)
+    follows.expect(expected)
+    follows.latch(expected, 40 * MS)
+    assert not follows.is_new
+    follows.expect(command(seq=3, effort=[8.0, 0.0, 0.0, 0.0]))
+    follows.latch(newer, 60 * MS)
+    assert (follows.seq, follows.effort) == (2, (1.0, 2.0, 3.0, 4.0))
+    rubbish = Came(b"\xff\xff\xff", MS)
+    follows.expect(rubbish)
+    assert follows.malformed == 0
+    follows.latch(rubbish, 80 * MS)
+    assert (follows.seq, follows.malformed) == (2, 1)

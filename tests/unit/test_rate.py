@@ -70,3 +70,12 @@ def test_sleeping_through_deadlines_counts_too() -> None:
 def test_a_period_must_be_positive() -> None:
     with pytest.raises(ValueError, match="a period must be positive, found 0 ns"):
         Rate(0)
+
+
+def test_the_next_deadline_is_known_before_it_is_waited_for() -> None:
+    clock = ManualClock()
+    rate = Rate(20_000_000, clock)
+    for _ in range(3):
+        expected_ns = rate.next_ns
+        assert rate.wait().deadline_ns == expected_ns
+        clock.advance(5_000_000)

@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig
+from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig, parse_lab
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.rate import Rate
 from hilrig_schemas import Event
 from hilrig_sim.configured import rig_parameters
 from hilrig_sim.model import RigParameters
@@ -175,3 +176,16 @@ def test_a_step_that_would_be_unstable_is_refused_with_the_rig_named() -> None:
     lab = LabConfig(sim=SimConfig(step_ms=40))
     with pytest.raises(InputError, match=r"rig 'rig1': the step of 40 ms would be unstable.*sim\.substeps = 2"):
         rig_parameters(lab, lab.rigs[0])
+
+
+def test_of_many_rigs_a_command_that_came_shortly_before_the_tick_is_obeyed_and_the_tick_is_punctual() -> None:
+    with VirtualRig(parse_lab("[rigs]\ncount = 20\n")) as rig:
+        rate = Rate(rig.lab.sim.step_ns, rig.clock)
+        for early, late in ((0.25, 0.5), (0.75, 1.0)):
+            rig.command((early, 0.0, 0.0, 0.0), rig="rig20")
+            rig.simulation.look_ahead(rate.next_ns)
+            rig.command((late, 0.0, 0.0, 0.0), rig="rig20")
+            tick = rate.wait()
+            rig.simulation.tick(tick)
+            assert (tick.lateness_ns, rig.states[-1].rig, rig.states[-1].effort[0]) == (0, "rig20", late)
+            assert rig.states[-2].effort[0] == 0.0

@@ -6,7 +6,7 @@ in force; a repeat only says that the edge is still there.
 
 import math
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from google.protobuf.message import DecodeError
 
@@ -49,6 +49,18 @@ class StepTimes:
         return None
 
 
+class _Command(NamedTuple):
+    """What matters of a command."""
+
+    seq: int
+    session: str
+    effort: Effort
+    magnet: bool
+    basis_incarnation: int
+    basis_step: int
+    resets: int
+
+
 @dataclass(slots=True)
 class CommandFollower:
     """Follows the commands of one rig; its attributes say what acts from the latest tick on."""
@@ -84,10 +96,17 @@ class CommandFollower:
     malformed: int = 0
     """Messages that were no commands."""
     _arrival: Arrival | None = None
+    _expected: Arrival | None = None
+    _decoded: _Command | None = None
     _heard_ns: int = 0
     _commanded: Effort = ZERO_EFFORT
     _resets: int | None = None
     _is_plain: bool = True
+
+    def expect(self, arrival: Arrival | None) -> None:
+        """Decode what `latch` will take if nothing newer comes: before a tick there is time, in it there is none."""
+        if arrival is not None and arrival is not self._arrival and arrival is not self._expected:
+            self._expected, self._decoded = arrival, _decode(arrival.payload)
 
     def latch(self, arrival: Arrival | None, now_ns: int) -> None:
         """Take the newest arrival, the same object as before where nothing came; `now_ns` is not before it."""
@@ -106,14 +125,8 @@ class CommandFollower:
             self.effort = ZERO_EFFORT
 
     def _take(self, arrival: Arrival, now_ns: int) -> None:
-        try:
-            command = TorqueCommand.FromString(arrival.payload)
-        except DecodeError:
-            self.malformed += 1
-            return
-        # Taken as a list at once: to ask a repeated field for its numbers one by one takes twice as long.
-        effort = command.effort[:]
-        if len(effort) != 4:
+        command = self._decoded if arrival is self._expected else _decode(arrival.payload)
+        if command is None:
             self.malformed += 1
             return
         was_silent_ns = now_ns - self._heard_ns
@@ -121,8 +134,7 @@ class CommandFollower:
         if command.seq != self.seq or command.session != self.session or self._resets is None:
             self.is_new = self.changed = True
             self.seq, self.session, self.magnet = command.seq, command.session, command.magnet
-            self._commanded = _bounded(*effort)
-            self.effort = self._commanded
+            self.effort = self._commanded = command.effort
             self.arrived_ns = arrival.arrived_ns
             if command.basis_incarnation == self.incarnation:
                 self.basis_step = command.basis_step
@@ -138,9 +150,30 @@ class CommandFollower:
         self._resets = command.resets
 
 
+def _decode(payload: bytes) -> _Command | None:
+    """The command that some bytes are; None: they are none."""
+    try:
+        message = TorqueCommand.FromString(payload)
+    except DecodeError:
+        return None
+    # Taken as a list at once: to ask a repeated field for its numbers one by one takes twice as long.
+    effort = message.effort[:]
+    if len(effort) != 4:
+        return None
+    return _Command(
+        message.seq,
+        message.session,
+        _bounded(*effort),
+        message.magnet,
+        message.basis_incarnation,
+        message.basis_step,
+        message.resets,
+    )
+
+
 def _bounded(first: float, second: float, third: float, fourth: float) -> Effort:
     most = LARGEST_EFFORT
-    # Of each rig at each tick, before its state can leave: what is not out of bounds is not looked at twice.
+    # Of each rig at each step: what is within bounds is not looked at twice.
     if -most <= first <= most and -most <= second <= most and -most <= third <= most and -most <= fourth <= most:
         return first, second, third, fourth
     return _finite(first), _finite(second), _finite(third), _finite(fourth)
