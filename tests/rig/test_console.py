@@ -22,6 +22,7 @@ import pytest
 
 from browser import CHROMIUM, Browser
 from bus_certificates import make_bus_folder
+from hilrig_console.app import BROWSERS
 from hilrig_console.guard import Guard
 from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
 from hilrig_runtime.config import load_lab
@@ -173,6 +174,7 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
         with Watcher(running.port) as watcher:
             eventually(lambda: "lab" in watcher.newest, timeout_s=20)
             without = watcher.newest["lab"]
+            eventually(lambda: "no such folder" in running.json("/runs")["trouble"], timeout_s=20)
         lab = closing.enter_context(RunningLab(config))
         yield Beside(lab, running, without)
 
@@ -192,7 +194,10 @@ def test_a_console_without_a_lab_says_so_and_finds_the_lab_when_it_comes(beside:
 
 
 def test_a_rig_in_use_shows_who_holds_it_how_it_moves_and_what_happened(beside: Beside) -> None:
-    with Watcher(beside.console.port) as watcher, Watcher(beside.console.port) as other:
+    port = beside.console.port
+    # One that never reads holds up nobody.
+    with Watcher(port) as watcher, Watcher(port) as other, socket.create_connection(("127.0.0.1", port)) as asleep:
+        asleep.sendall(b"GET /live HTTP/1.1\r\nHost: localhost\r\n\r\n")
         eventually(lambda: watcher.pose("rig1"), timeout_s=20)
         before = watcher.pose("rig1")
         with controller(beside.lab.port):
@@ -281,6 +286,25 @@ def test_it_answers_its_own_page_alone_and_changes_nothing(beside: Beside) -> No
     assert ask("/", "HEAD")[2] == b""
 
 
+def test_there_are_only_so_many_places_and_who_leaves_makes_room(beside: Beside) -> None:
+    crowd = []
+
+    def is_full() -> bool:
+        connection = http.client.HTTPConnection("127.0.0.1", beside.console.port, timeout=10)
+        connection.request("GET", "/live")
+        crowd.append(connection)
+        return connection.getresponse().status == 503
+
+    try:
+        eventually(is_full, every_s=0)
+        assert len(crowd) > BROWSERS
+    finally:
+        for connection in crowd:
+            connection.close()
+    eventually(lambda: not is_full())
+    crowd.pop().close()
+
+
 def test_a_simulation_that_starts_anew_is_seen_to_go_and_to_come(beside: Beside) -> None:
     with Watcher(beside.console.port) as watcher:
         eventually(lambda: watcher.pose("rig2"), timeout_s=20)
@@ -304,7 +328,7 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
             found = "[...document.querySelectorAll('#cards > li')].find(card => card.innerText.startsWith('rig2'))"
             return str(browser.run(f"(card => card ? {what} : '')({found})"))
 
-        text, arm = "card.innerText", "card.querySelector('.one') ? card.querySelector('.one').getAttribute('y2') : ''"
+        text, arm = "card.innerText", "(card.querySelector('.one')?.getAttribute('y2') ?? '')"
         eventually(lambda: "free" in card(text) and card(arm), timeout_s=30)
         before = float(card(arm))
         with controller(beside.lab.lab.ports["rig2"]):

@@ -5,7 +5,8 @@ connection has taken the last one: one that is slow sees fewer.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from html import escape
 from http import HTTPStatus
@@ -33,6 +34,8 @@ BROWSERS: Final = 64
 FILES: Final = Path(__file__).with_name("static")
 PAGE_FILES: Final = ("console.css", "console.js", "icon.svg")
 
+logger = logging.getLogger(__name__)
+
 
 class Broadcast:
     """The newest frame, for all browsers; `close` ends their streams."""
@@ -48,17 +51,10 @@ class Broadcast:
         """End every stream within a period; from any thread."""
         self.closed = True
 
-    async def run(self) -> None:
-        """Make frames for as long as somebody looks, until it is closed."""
-        while not self.closed:
-            if self.browsers:
-                # On another thread: with hundreds of rigs it takes a while, and downloads go on.
-                self._frame = await asyncio.to_thread(self._make)
-            self._wake()
-            await asyncio.sleep(PERIOD_S)
-        self._wake()
-
-    def _wake(self) -> None:
+    async def make(self) -> None:
+        """Make a frame, if somebody looks."""
+        # On another thread: with hundreds of rigs it takes a while, and downloads go on.
+        self._frame = await asyncio.to_thread(self._make) if self.browsers else None
         woken, self._next = self._next, asyncio.Event()
         woken.set()
 
@@ -104,7 +100,7 @@ class Console:
     async def _life(self, app: Starlette) -> AsyncIterator[None]:
         del app
         self.broadcast = Broadcast(self._frame)
-        tasks = [asyncio.create_task(self.broadcast.run()), asyncio.create_task(self._look())]
+        tasks = [asyncio.create_task(_repeat(work)) for work in (self.broadcast.make, self._look)]
         yield
         for task in tasks:
             task.cancel()
@@ -116,10 +112,8 @@ class Console:
 
     async def _look(self) -> None:
         """Keep the list of recordings fresh while somebody looks."""
-        while True:
-            if self._stream.browsers:
-                await asyncio.to_thread(self._shelf.look)
-            await asyncio.sleep(PERIOD_S)
+        if self._stream.browsers:
+            await asyncio.to_thread(self._shelf.look)
 
     @property
     def _stream(self) -> Broadcast:
@@ -159,6 +153,16 @@ class Console:
         page = await asyncio.to_thread(self._shelf.report, request.path_params["path"])
         text = await asyncio.to_thread(page.read_text, "utf-8")
         return HTMLResponse(text, headers={"Content-Security-Policy": REPORT_POLICY})
+
+
+async def _repeat(work: Callable[[], Awaitable[None]]) -> None:
+    """Do it every period; a mistake in it once is no reason to stop."""
+    while True:
+        try:
+            await work()
+        except Exception:
+            logger.exception("%s failed", work)
+        await asyncio.sleep(PERIOD_S)
 
 
 async def _sorry(request: Request, error: HilrigError) -> Response:

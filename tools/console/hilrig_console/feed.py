@@ -4,6 +4,7 @@ The states are subscribed to only while somebody looks, for they are many. What 
 after the other: each answer is work for a simulation that has a loop to close.
 """
 
+import logging
 import threading
 import time
 from collections import deque
@@ -34,6 +35,8 @@ ASKED_A_TURN: Final = 4
 LEFT_S: Final = 5.0
 """So long after the last browser has left, states are still taken: one that is loaded anew comes back at once."""
 _BATCHES: Final = 64
+
+logger = logging.getLogger(__name__)
 
 
 class Feed:
@@ -77,7 +80,11 @@ class Feed:
                     self._follow(bus)
             except HilrigError as error:
                 self._say(str(error))
-                self._stopping.wait(RETRY_S)
+            except Exception:
+                # The page says so, and goes on with a new connection.
+                logger.exception("following the bus failed")
+                self._say("following the bus failed; the console's log says why")
+            self._stopping.wait(RETRY_S)
 
     def _say(self, trouble: str) -> None:
         with self._page.lock:
