@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC
 from hilrig_recorder.parts import horizon_of, next_part
 from hilrig_recorder.recording import EVENT_CHANNEL
 from hilrig_recorder.recover import Tail
-from log_streams import SECOND
 
 SESSION = "20260101T000000Z-rig1-abcd"
 
@@ -42,7 +42,14 @@ def test_a_rig_without_a_folder_begins_with_the_first(tmp_path: Path) -> None:
 
 
 def test_what_is_older_than_what_was_looked_at_is_not_recorded_again() -> None:
-    tail = Tail("", set(), {1: (500, 1_000 * SECOND), 2: (90, 940 * SECOND), EVENT_CHANNEL: (3, 100 * SECOND)}, 0)
-    horizon_ns = horizon_of(tail, 35 * SECOND)
-    # Each channel by its sender's clock; an event may be the first for a long time.
-    assert horizon_ns == {1: 965 * SECOND, 2: 905 * SECOND, EVENT_CHANNEL: 965 * SECOND}
+    state, command = CHANNEL_OF_TOPIC["state"], CHANNEL_OF_TOPIC["command"]
+    seen = {(state, 7, 1_000), (state, 6, 980), (command, 3, 940), (command, 4, 960), (EVENT_CHANNEL, 1, 990)}
+    horizon_ns = horizon_of(Tail("", seen, {}, 0))
+    # Each channel by its sender's clock; of events, and of what was not seen, all that is older than everything.
+    assert horizon_ns == {
+        state: 980,
+        command: 940,
+        EVENT_CHANNEL: 940,
+        CHANNEL_OF_TOPIC["traffic"]: 940,
+    }
+    assert set(horizon_of(Tail("", set(), {}, 0)).values()) == {0}

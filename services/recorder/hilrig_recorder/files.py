@@ -85,7 +85,7 @@ class Files:
             if tail.end == "ended":
                 return None
             recording.seen, recording.last = tail.keys, tail.last
-            recording.horizon_ns = horizon_of(tail, self._repeated_ns)
+            recording.horizon_ns = horizon_of(tail)
         return None if self._space.full else self._open(recording, part)
 
     def close(self, recording: Recording, end: str, reason: str) -> None:

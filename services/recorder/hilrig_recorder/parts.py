@@ -8,6 +8,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from hilrig_recorder.channels import CHANNEL_OF_TOPIC
 from hilrig_recorder.durable import PART_SUFFIX, part_path
 from hilrig_recorder.recording import EVENT_CHANNEL
 from hilrig_recorder.recover import Tail, read_tail
@@ -50,12 +51,18 @@ def tail_of_session(folder: Path, session: str, number: int, tail_ns: int) -> Ta
     return tail
 
 
-def horizon_of(tail: Tail, tail_ns: int) -> dict[int, int]:
-    """Publish time of each channel before which `tail`, read with `tail_ns`, does not know what was recorded."""
-    # Senders' clocks may differ, so each channel has its own; events are too rare for that.
-    newest_ns = max((publish_ns for _, publish_ns in tail.last.values()), default=0)
-    horizon_ns = {channel_id: publish_ns - tail_ns for channel_id, (_, publish_ns) in tail.last.items()}
-    return horizon_ns | {EVENT_CHANNEL: newest_ns - tail_ns}
+def horizon_of(tail: Tail) -> dict[int, int]:
+    """Of each channel the publish time before which `tail` does not know what was recorded.
+
+    A channel is recorded in order. Events have several senders, whose clocks may differ; for them, and for a channel of
+    which nothing was seen, it is the earliest of all.
+    """
+    earliest = min((publish_ns for _, _, publish_ns in tail.keys), default=0)
+    horizon_ns = dict.fromkeys(CHANNEL_OF_TOPIC.values(), 0)
+    for channel_id, _, publish_ns in tail.keys:
+        horizon_ns[channel_id] = min(horizon_ns[channel_id] or publish_ns, publish_ns)
+    horizon_ns[EVENT_CHANNEL] = 0
+    return {channel_id: publish_ns or earliest for channel_id, publish_ns in horizon_ns.items()}
 
 
 def file_name(session: str, number: int) -> str:

@@ -59,7 +59,7 @@ class Recording:
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Last sequence and publish time of each channel in that earlier file."""
     horizon_ns: dict[int, int] = field(default_factory=dict)
-    """What is stamped earlier than this, by channel, came before `seen` was looked at; publish time."""
+    """Publish time of each channel before which `seen` does not say what that earlier file holds."""
     end_wall_ns: int | None = None
     """Its end, sender's wall clock, ns; None: it goes on."""
     end_reason: str = ""
