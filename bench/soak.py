@@ -55,6 +55,8 @@ ENDING_S = 6.0
 """After the last controller: until its session has ended and its file is closed."""
 GROWTH_MIB_H = 12.0
 """What a service may grow in an hour; what is below can't be told from noise in half an hour."""
+LONG_S = 600.0
+"""After the warm-up: in less, noise is more than that."""
 RESIMULATED = 200
 """Recordings, evenly out of all; each takes as long as reading some twenty."""
 
@@ -327,7 +329,11 @@ def judge(report: Report, case: str, name: str, before: Sample, samples: Sequenc
     report.add(case, f"{name}: handles after", after.handles, "count")
     report.add(case, f"{name}: threads before", before.threads, "count")
     report.add(case, f"{name}: threads after", after.threads, "count")
-    report.bar(f"{name}: growth of memory", growth_mib_h(settled), "<=", GROWTH_MIB_H, "MiB/h")
+    growth = report.add(case, f"{name}: growth of memory", growth_mib_h(settled), "MiB/h")
+    if settled[-1].at_s - settled[0].at_s >= LONG_S:
+        report.bar(f"{name}: growth of memory", growth, "<=", GROWTH_MIB_H, "MiB/h")
+    else:
+        report.say(f"{name}: too short a run to judge the growth of memory; it takes {LONG_S / 60:g} min after warm-up")
     report.bar(f"{name}: handles left behind", after.handles - before.handles, "<=", 2)
     report.bar(f"{name}: threads left behind", after.threads - before.threads, "<=", 2)
 
