@@ -111,6 +111,37 @@ def test_what_theory_says_stands_beside_what_the_runs_did(tmp_path: Path) -> Non
     assert low.nominal.jitter_margin_s < low.nominal.delay_margin_s
 
 
+def test_where_delays_are_drawn_the_boundary_is_that_of_the_second_moments(tmp_path: Path) -> None:
+    delays = [0.0, 30.0, 60.0, 90.0, 120.0]
+    text = SMALL.replace("[0, 40, 150]", str(delays)) + '[impairment]\ncommand = "uniform:0,75"\n'
+    study = load(tmp_path, text.replace("[0.3, 0.9]", "[0.3, 0.65, 1.5]"))
+    swept = sweep(study, tmp_path, lambda _: None, workers=1)
+    slack, middle, stiff = swept.theory
+    assert (slack.mean_square_until, stiff.mean_square_until) == (np.inf, -1)
+    assert middle.mean_square_until in delays
+    # The same loop on the linear arm, for long: below the boundary it dies out, well above it grows.
+    assert 0 < middle.mean_square_until < 100
+    for delay_ms, dies_out in ((middle.mean_square_until - 20, True), (middle.mean_square_until + 50, False)):
+        plane = {
+            "x": study.x.model_copy(update={"values": (delay_ms,)}),
+            "y": study.y.model_copy(update={"values": (0.65,)}),
+        }
+        long = study.model_copy(
+            update={**plane, "plant": "linear", "loop": study.loop.model_copy(update={"duration_s": 40.0})}
+        )
+        results, _ = run_cells(long, cells_of(long)[:1], tmp_path)
+        assert bool(results["settled"][0]) is dies_out
+    figure = plane_figure(study, swept, 0)
+    assert "stable in the mean square" in {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_where_nothing_is_drawn_or_the_law_predicts_there_is_no_such_boundary(tmp_path: Path) -> None:
+    predicts = '[[controllers]]\nname = "LQR"\nkind = "lqr"\nimpairment = { command = "uniform:0,40" }\n'
+    study = load(tmp_path, SMALL + predicts + '[[controllers]]\nkind = "pd"\n')
+    swept = sweep(study, tmp_path, lambda _: None, workers=1)
+    assert np.isnan([one.mean_square_until for one in swept.theory]).all()
+
+
 def test_what_is_unstable_by_itself_is_a_clear_result(tmp_path: Path) -> None:
     study = load(tmp_path, SMALL.replace("values = [0.3, 0.9]", "values = [3.0]"))
     (theory,) = sweep(study, tmp_path, lambda _: None, workers=1).theory

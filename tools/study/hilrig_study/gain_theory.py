@@ -25,6 +25,9 @@ class GainTheory:
     nominal: Margins | None
     """At the loop's own latency; None: the controller does not poll once a step."""
     nominal_latency_ms: float
+    mean_square_until: float = math.nan
+    """Where delays or losses are drawn: largest value of what is swept beside the gain, in its unit, up to which the
+    loop is stable in the mean square; -1 and inf as above; NaN: nothing is drawn, or it can't be told."""
 
 
 def gain_theory(

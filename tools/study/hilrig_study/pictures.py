@@ -27,6 +27,7 @@ FAILED: Final = "#5b5b5b"
 BOUNDARY: Final = "#d62728"
 DELAY_MARGIN: Final = "#ffffff"
 JITTER_MARGIN: Final = "#f5a623"
+MEAN_SQUARE: Final = "#ff5fc8"
 _LETTERS: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
@@ -174,11 +175,15 @@ def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], p
     lines: list[tuple[str, str, str, list[float]]] = []
     # One that predicts over the latency that it measures bears less of what it does not know of.
     unknown = ", if not measured" if predicts else ""
+    drawn = not all(math.isnan(one.mean_square_until) for one in theory)
     if other == "delay_ms":
-        lines.append(("exact: spectral radius 1", BOUNDARY, "-", [one.stable_until_ms for one in theory]))
+        label = "spectral radius 1, without what is drawn" if drawn else "exact: spectral radius 1"
+        lines.append((label, BOUNDARY, "-", [one.stable_until_ms for one in theory]))
         lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
     if other in ("delay_ms", "jitter_ms"):
         lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(one, "jitter") for one in theory]))
+    if drawn:
+        lines.append(("stable in the mean square", MEAN_SQUARE, "-.", [one.mean_square_until for one in theory]))
     most = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
     for label, color, style, values_ms in lines:
         values = np.array(values_ms)[order]

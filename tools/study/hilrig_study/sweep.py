@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hilrig_modbus_edge.impairment import Impairment
 from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
 from hilrig_study.gain_theory import GainTheory, gain_theory
+from hilrig_study.mean_square import TICKS, stable_until
 from hilrig_study.plants import ArmPlant, LinearArms, StudyPlant
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.timing import LoopTiming, Timeline, poll_count, timeline
@@ -270,7 +271,29 @@ def _results_of(study: StudyConfig, cells: NDArray[np.void], folder: Path) -> ND
 
 def _theory_of(study: StudyConfig, asked: _Asked, delays_ms: Sequence[float]) -> _Theory | None:
     controller, gain, step_ms, poll_ms = asked
-    return gain_theory(study, controller, gain, step_ms, poll_ms, delays_ms)
+    found = gain_theory(study, controller, gain, step_ms, poll_ms, delays_ms)
+    if found is None:
+        return None
+    return replace(found[0], mean_square_until=_mean_square_until(study, asked)), found[1]
+
+
+def _mean_square_until(study: StudyConfig, asked: _Asked) -> float:
+    controller, gain, step_ms, poll_ms = asked
+    config, axes = study.controllers[controller], (study.x, study.y)
+    others = [axis for axis in axes if axis.what in ("delay_ms", "jitter_ms", "loss")]
+    drawn = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
+    predicts = config.kind == "lqr" and config.compensate
+    if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not drawn or predicts or poll_ms != step_ms:
+        return math.nan
+    timing = study.loop.timing(step_ms, poll_ms)
+
+    def ages_at(value: float) -> NDArray[np.int64]:
+        cell = np.zeros(1, CELL)
+        cell["controller"], cell["step_ms"], cell["poll_ms"], cell[others[0].what] = controller, step_ms, poll_ms, value
+        (line,) = timelines(study, cell, timing, TICKS)
+        return line.ages()
+
+    return stable_until(study, controller, gain, step_ms, np.sort(others[0].points).tolist(), ages_at)
 
 
 def _leave_interrupts_to_the_parent() -> None:
