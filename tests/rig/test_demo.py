@@ -13,7 +13,7 @@ from hilrig_replay.latency import STAGES, measure
 from hilrig_replay.run import open_run
 from labs import hilrig
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = pytest.mark.rig
 
 
 @pytest.fixture(scope="module")

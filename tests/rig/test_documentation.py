@@ -1,7 +1,7 @@
 """Every documented command runs: each line of a `console` block in the README and the pages of docs/.
 
-They run in one folder that holds a recording (RUN.mcap, of a short demo) and a lab's file (lab.toml), beside a running
-lab of that file. A new kind of command fails here until somebody says how it is run.
+They run in one folder that holds a recording (RUN.mcap, of the demo's controller) and a lab's file (lab.toml), beside a
+running lab of that file. A new kind of command fails here until somebody says how it is run.
 """
 
 import re
@@ -9,13 +9,14 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from labs import HILRIG, RunningLab, hilrig, write_lab
+from labs import HILRIG, RunningLab, write_lab
 from waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -66,12 +67,13 @@ class Place:
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = tmp_path_factory.mktemp("documented")
-    done = hilrig("demo", "--duration", "5", "--out", folder / "demo-out")
-    assert done.returncode == 0, done.stderr
-    (recording,) = (folder / "demo-out").rglob("*.mcap")
-    shutil.copy(recording, folder / "RUN.mcap")
-    shutil.copy(recording, folder / "OTHER.mcap")
-    with RunningLab(write_lab(folder)) as lab:
+    with RunningLab(write_lab(folder, extra="edge.session_grace_ms = 100")) as lab:
+        controller = [sys.executable, str(ROOT / "examples/pick_and_place.py"), "--port", str(lab.port)]
+        done = subprocess.run([*controller, "--duration", "5"], check=False, capture_output=True, timeout=60)
+        assert done.returncode == 1, "not every part is placed so soon"
+        (recording,) = eventually(lambda: lab.recordings)
+        for name in ("RUN.mcap", "OTHER.mcap"):
+            shutil.copy(recording, folder / name)
         yield Place(folder, lab)
 
 
