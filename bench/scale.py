@@ -149,7 +149,8 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
         begin_ns, end_ns = wall_ns + round(SETTLE_S * 1e9), wall_ns + round((SETTLE_S + figures["seconds"]) * 1e9)
         found = in_recordings(Path(folder), count, figures, begin_ns)
     for service, reports in healths.items():
-        steady = [health for health in reports if begin_ns <= health.wall_ns <= end_ns]
+        # A service that got no time to report in is seen by its first and last word.
+        steady = [health for health in reports if begin_ns <= health.wall_ns <= end_ns] or reports
         first, last = steady[0], steady[-1]
         share = (last.cpu_ns - first.cpu_ns) / max(1, last.wall_ns - first.wall_ns)
         found.cpu_s[service] = share * found.wall_s
