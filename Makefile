@@ -22,8 +22,9 @@ PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constrain
 	$(PIP_INSTALL) '.[all]'
 	@touch $@
 
+# To compile all of what is installed takes longer than what tests import of it, which is compiled then.
 .venv/dev: pyproject.toml constraints.txt | .venv/bin/python
-	$(PIP_INSTALL) '.[dev]'
+	$(PIP_INSTALL) '.[dev]' --no-compile
 	@touch .venv/ready $@
 
 system: ## the system parts that tests and benchmarks use (apt, as root)
