@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_replay.latency import STAGES, LatencyReport, Matcher, match, measure
+from hilrig_replay.latency import STAGES, LatencyReport, Matcher, SampleTable, match, measure
 from hilrig_replay.latency_plot import save_plot
 from hilrig_replay.run import open_run
 from hilrig_runtime.errors import InputError
@@ -84,11 +84,21 @@ def test_blocks_of_any_size_give_the_same_samples(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0, poll_ms=3.0)))
     whole = match(run.states, run.commands)
     for rows in (7, 100, 1000):
-        matcher = Matcher()
-        pieces = [matcher.add(block.states, block.commands) for block in run.blocks(rows=rows)]
-        found = np.concatenate(pieces)
-        assert np.array_equal(found[np.argsort(found["step"])], whole), rows
+        matcher, table = Matcher(), SampleTable(len(whole))
+        for block in run.blocks(rows=rows):
+            table.add(matcher.add(block.states, block.commands))
+        assert np.array_equal(table.in_order(), whole), rows
         assert matcher.unmatched == 0
+
+
+def test_samples_are_put_in_order_whatever_was_expected_of_their_number(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
+    whole = match(run.states, run.commands)
+    for most in (0, 10, 10_000):
+        table = SampleTable(most)
+        for piece in (whole[100:], whole[:40], whole[40:100]):
+            table.add(piece)
+        assert np.array_equal(table.in_order(), whole)
 
 
 def test_the_report_has_what_scripts_rely_on(tmp_path: Path) -> None:

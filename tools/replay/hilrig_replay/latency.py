@@ -137,27 +137,39 @@ class Matcher:
         return _stages(effective[found], known[rows[found]])
 
 
-def in_order(pieces: list[NDArray[np.void]]) -> NDArray[np.void]:
-    """Samples out of several blocks in the order of their states, shape (n,), fields as `SAMPLE`.
+class SampleTable:
+    """Samples as they are found, in one array: a long run's are never held twice.
 
-    The pieces are used up on the way: of a long run there is never more than one copy.
+    The array is made as long as it can get. What is not written of it takes no memory, and pieces that are joined at
+    the end would, for what they are made of is not given back before.
     """
-    pieces.reverse()
-    samples = np.empty(sum(map(len, pieces)), SAMPLE)
-    end = 0
-    while pieces:
-        piece = pieces.pop()
-        samples[end : end + len(piece)] = piece
-        end += len(piece)
-    same = np.diff(samples["incarnation"]) == 0
-    if (same & (np.diff(samples["sampled_ns"]) >= 0)).all():
-        return samples
-    return samples[np.lexsort((samples["sampled_ns"], samples["incarnation"]))]
+
+    def __init__(self, most: int) -> None:
+        """For up to `most` samples; should there be more, it grows."""
+        self._rows = np.empty(most, SAMPLE)
+        self._end = 0
+
+    def add(self, samples: NDArray[np.void]) -> None:
+        """Take in some more, fields as `SAMPLE`."""
+        begin, self._end = self._end, self._end + len(samples)
+        if self._end > len(self._rows):
+            self._rows = np.concatenate((self._rows[:begin], np.empty(self._end, SAMPLE)))
+        self._rows[begin : self._end] = samples
+
+    def in_order(self) -> NDArray[np.void]:
+        """All of them in the order of their states, shape (n,), fields as `SAMPLE`."""
+        samples = self._rows[: self._end]
+        same = np.diff(samples["incarnation"]) == 0
+        if (same & (np.diff(samples["sampled_ns"]) >= 0)).all():
+            return samples
+        return samples[np.lexsort((samples["sampled_ns"], samples["incarnation"]))]
 
 
 def match(states: Rows, commands: Rows) -> NDArray[np.void]:
     """The samples of a whole run, shape (n,), fields as `SAMPLE`."""
-    return in_order([Matcher().add(states, commands)])
+    table = SampleTable(len(states))
+    table.add(Matcher().add(states, commands))
+    return table.in_order()
 
 
 def join_commands(states: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -206,14 +218,14 @@ def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyR
             f"{run.path}: a recording without commands: no controller wrote in this session, so it has no loop latency"
         )
     matcher = Matcher()
-    found = []
+    table = SampleTable(run.file.counts["state"])
     watch = FitnessWatch(run)
     for block in run.blocks(frozenset({"state", "command", "event"})):
         if also is not None:
             also(block)
-        found.append(matcher.add(block.states, block.commands))
+        table.add(matcher.add(block.states, block.commands))
         watch.add(block.states, block.commands)
-    samples = in_order(found)
+    samples = table.in_order()
     evidence = Evidence(
         run=run,
         samples=samples,
