@@ -17,6 +17,8 @@ from hilrig_runtime.errors import HilrigError
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
+TURN_S: Final = 0.5
+"""Of waiting for a signal."""
 
 
 def stop_on_signals(stopping: threading.Event) -> None:
@@ -30,6 +32,16 @@ def stop_on_signals(stopping: threading.Event) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", None)):
         if number is not None:
             signal.signal(number, on_signal)
+
+
+def wait_for(stopping: threading.Event) -> None:
+    """Wait until `stopping` is set by a signal.
+
+    In turns: Python hears of a signal between two instructions, and one that comes just as the main thread begins to
+    wait would only be heard of when it wakes.
+    """
+    while not stopping.wait(TURN_S):
+        pass
 
 
 def stop_with_stdin(stopping: threading.Event) -> None:

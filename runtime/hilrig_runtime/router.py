@@ -6,7 +6,7 @@ from contextlib import closing
 import zenoh
 
 from hilrig_runtime.config import LabConfig
-from hilrig_runtime.ending import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
+from hilrig_runtime.ending import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin, wait_for
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.zenoh_config import ROUTER, router_config, system_reason
 from hilrig_schemas.topics import alive_key
@@ -50,4 +50,4 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
         ) from error
     with closing(session), session.liveliness().declare_token(alive_key(lab.name, ROUTER, "1")):
         print(f"router of lab {lab.name!r} at {endpoint}", flush=True)
-        stopping.wait()
+        wait_for(stopping)

@@ -347,6 +347,9 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
             browser.open(f"http://127.0.0.1:{beside.console.port}/", width=width, height=900)
             eventually(lambda: "rig2" in browser.run("document.body.innerText"), timeout_s=20)
             assert browser.run("document.documentElement.scrollWidth") <= width
+            eventually(
+                lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2, timeout_s=20
+            )
         assert browser.errors == []
         assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", asked).partition("?")[0] for asked in browser.requests} <= {
             "",

@@ -4,9 +4,11 @@ import os
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from hilrig_console import worker as worker_module
 from hilrig_console.shelf import Librarian, Shelf
 from hilrig_console.worker import Worker
 from hilrig_runtime.errors import InputError, OperationError
@@ -83,6 +85,22 @@ def test_closing_ends_a_call_that_goes_on() -> None:
     asking.join(10)
     assert len(said) == 1
     assert eventually(lambda: not is_there(pid))
+
+
+def test_a_worker_that_is_closed_while_it_starts_ends_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    worker, begun = Worker(Clerk, "Ada"), list[Any]()
+    start = worker_module._SPAWN.Process.start
+
+    def start_and_close(process: Any) -> None:
+        worker.close()
+        start(process)
+        worker.close()
+        begun.append(process)
+
+    monkeypatch.setattr(worker_module._SPAWN.Process, "start", start_and_close)
+    with pytest.raises(OperationError, match="it is being closed"):
+        worker.call("greet", timeout_s=30)
+    assert begun[0].exitcode is not None
 
 
 def test_only_what_is_listed_and_still_there_is_given_out(tmp_path: Path) -> None:

@@ -72,9 +72,11 @@ class Worker:
         if self._process is None or not self._process.is_alive():
             self._end()
             self._pipe, other = _SPAWN.Pipe()
-            self._process = _SPAWN.Process(target=_serve, args=(other, *self._made), daemon=True)
-            self._process.start()
+            process = _SPAWN.Process(target=_serve, args=(other, *self._made), daemon=True)
+            process.start()
             other.close()
+            # Known to `close` only now that it can be ended.
+            self._process = process
 
     def _end(self) -> None:
         process, pipe, self._process, self._pipe = self._process, self._pipe, None, None

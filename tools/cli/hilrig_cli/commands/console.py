@@ -45,7 +45,7 @@ def console(
     from hilrig_console.guard import Guard, own_names
     from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import end_when_closing_hangs, stop_on_signals
+    from hilrig_runtime.ending import end_when_closing_hangs, stop_on_signals, wait_for
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.realtime import yield_to_others
 
@@ -73,7 +73,7 @@ def console(
             print(f"password: {password} (any user name)", flush=True)
         if tls is None and not address.is_private:
             print("hilrig: without --certificate and --key the password can be overheard", file=sys.stderr, flush=True)
-        stopping.wait()
+        wait_for(stopping)
 
 
 def _password(file: Path) -> str:

@@ -21,7 +21,7 @@ def metrics(
     from hilrig_cli.prometheus import metrics_server, text_of
     from hilrig_console.lab_watch import LabWatch
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import stop_on_signals
+    from hilrig_runtime.ending import stop_on_signals, wait_for
     from hilrig_runtime.errors import InputError, OperationError
 
     lab = load_lab(config)
@@ -45,5 +45,5 @@ def metrics(
         with server:
             threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
             print(f"metrics of lab {lab.name}: http://{host or '0.0.0.0'}:{server.server_port}/metrics", flush=True)
-            stopping.wait()
+            wait_for(stopping)
             server.shutdown()

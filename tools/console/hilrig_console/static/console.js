@@ -145,9 +145,9 @@ class Rig {
     this.row = made("tr", {}, made("th", {scope: "row"}, name), made("td", {}, this.rowPill), ...this.cells);
   }
 
-  update(rig) {
+  update(rig, runs) {
     this.held = Boolean(rig.controller);
-    this.level = LEVELS[rig.state] ?? "warn";
+    this.level = runs ? LEVELS[rig.state] ?? "warn" : "";
     this.text = `${rig.rig} ${rig.state} ${rig.controller} ${rig.address} ${rig.session}`.toLowerCase();
     const recorded = rig.recording ? rig.session || "by hand" : "–";
     const p50 = fixed(rig.loop_p50_ms, 1), p99 = fixed(rig.loop_p99_ms, 1), late = fixed(rig.simulated ? rig.lateness_p99_ms : null, 2);
@@ -199,6 +199,8 @@ function showLab(lab) {
     rig.row.remove();
     rigs.delete(name);
   }
+  // Where nothing runs, no single rig is to blame.
+  const runs = lab.services.some((service) => !service.silent);
   const cards = at("cards"), rows = at("rows").querySelector("tbody");
   for (const known of lab.rigs) {
     let rig = rigs.get(known.rig);
@@ -208,7 +210,7 @@ function showLab(lab) {
       rows.append(rig.row);
       visible.observe(rig.card);
     }
-    rig.update(known);
+    rig.update(known, runs);
   }
   const alarms = [...rigs.values()].filter((rig) => rig.level === "bad").length;
   const sums = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
@@ -218,8 +220,8 @@ function showLab(lab) {
     made("li", what.startsWith("alarm") ? {class: "alarm"} : {}, made("b", {}, String(number)), ` ${what}`)));
   const troubles = lab.troubles.map((text) => ["warn", text]);
   if (lab.link) troubles.unshift(["bad", lab.link]);
-  else if (lab.services.every((service) => service.silent)) {
-    troubles.unshift(["bad", `Nothing is heard of lab ${lab.lab}: is it running (hilrig up), with this lab.toml?`]);
+  else if (!runs) {
+    troubles.unshift(["bad", `Nothing is heard of the lab “${lab.lab}”: is it running (hilrig up), with this lab.toml?`]);
   }
   const list = at("troubles"), before = [...list.children].map((item) => item.textContent).join("\n");
   if (before !== troubles.map(([, text]) => text).join("\n")) {
@@ -387,6 +389,7 @@ function look() {
   const link = at("link"), live = Date.now() - heardMs < QUIET_MS;
   mark(link, live ? "good" : "bad");
   say(link, live ? "live" : "no connection to the console");
+  document.body.classList.toggle("cut", !live);
   if (!live) for (const rig of rigs.values()) rig.arm.lost();
 }
 
