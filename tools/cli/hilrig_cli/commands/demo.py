@@ -13,7 +13,7 @@ def demo(
     duration: Annotated[
         float | None,
         typer.Option(
-            min=1.0, help="How long the controller runs, seconds. [default: 20, or longer to finish its work]"
+            min=1.0, help="How long the controller runs, seconds; where it is not said, 20, or more to finish its work."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-out"),
