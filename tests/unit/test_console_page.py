@@ -207,7 +207,14 @@ def test_the_lab_is_told_once_a_second() -> None:
     made = page()
     first = made.frame(0.0, {})
     assert made.frame(0.9, {}).lab is first.lab
-    assert made.frame(1.0, {}).lab is not first.lab
+    assert made.frame(1.0, {}).lab != first.lab
+
+
+def test_a_page_hears_of_a_lab_in_which_nothing_happens() -> None:
+    made, seen = Page("lab", (), 0), Seen()
+    for second in range(3):
+        text, seen = made.frame(float(second), {}).news(seen)
+        assert text.startswith("event: lab\n")
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,6 @@ from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 0.2
 """Between frames."""
-ALIVE_S: Final = 10.0
-"""A browser that has heard nothing for so long is sent an empty line: whether it is there still shows then."""
 BROWSERS: Final = 64
 """That follow the lab at once."""
 FILES: Final = Path(__file__).with_name("static")
@@ -60,15 +58,12 @@ class Broadcast:
 
     async def stream(self, event: int) -> AsyncIterator[str]:
         """What one browser gets that has seen the events up to a number."""
-        seen, quiet_s = Seen(event=event), 0.0
+        seen = Seen(event=event)
         self.browsers += 1
         try:
             while not self.closed:
                 await self._next.wait()
                 text, seen = ("", seen) if self._frame is None else self._frame.news(seen)
-                quiet_s = 0.0 if text else quiet_s + PERIOD_S
-                if quiet_s >= ALIVE_S:
-                    text, quiet_s = ":\n\n", 0.0
                 if text:
                     yield text
         finally:

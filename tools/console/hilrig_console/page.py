@@ -89,7 +89,8 @@ class Page:
         known = self.view.as_dict(now_s)
         for rig in known["rigs"]:
             rig["address"] = self._addresses.get(rig["rig"], "")
-        return {"lab": self._lab, "link": self._trouble, "scenes": len(self.poses.scenes)} | known
+        # Its time makes it news although nothing changed: a page that hears nothing takes the console for gone.
+        return {"lab": self._lab, "at_s": now_s, "link": self._trouble, "scenes": len(self.poses.scenes)} | known
 
 
 def _json(value: Any) -> str:
