@@ -82,7 +82,8 @@ class LogStream:
     def flush_if_due(self, now_ns: int) -> None:
         """Send what has come in, at most every `FLUSH_PERIOD_NS`; `now_ns` is of the monotonic clock."""
         if now_ns >= self._flush_due_ns:
-            self._flush_due_ns = now_ns + FLUSH_PERIOD_NS
+            # Not counted from now: a loop of this period, a little early now and then, would skip every other turn.
+            self._flush_due_ns = max(self._flush_due_ns + FLUSH_PERIOD_NS, now_ns)
             self.flush(now_ns)
 
     def flush(self, now_ns: int) -> None:

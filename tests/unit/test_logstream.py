@@ -1,5 +1,7 @@
 """The recording stream: batches that lose nothing and keep the bytes as they were."""
 
+import random
+
 from hilrig_runtime.bus import Publisher
 from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream, batches_kept, entries_of
 from hilrig_schemas import LogBatch, OpenSession
@@ -44,7 +46,7 @@ def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
 def test_a_flush_is_due_once_a_period() -> None:
     out = Collecting()
     log = LogStream(out, "sim/1", incarnation=7)
-    for now in (1_000, 2_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
+    for now in (1_000, 2_000, FLUSH_PERIOD_NS - 1_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
         log.append("k", 1, 0, b"")
         log.flush_if_due(now)
     assert [len(batch.keys) for batch in out.batches] == [1, 3]
@@ -61,6 +63,21 @@ def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_n
     log.flush(30 + SESSIONS_PERIOD_NS)
     assert [[s.session for s in batch.sessions] for batch in out.batches] == [["s1"], [], []]
     assert all(batch.complete_sessions for batch in out.batches)
+
+
+def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> None:
+    out = Collecting()
+    log = LogStream(out, "sim/1", incarnation=7)
+    jitter = random.Random(1)
+    for turn in range(200):
+        log.append("hil/lab/rig1/state", turn + 1, turn, b"")
+        log.flush_if_due(turn * FLUSH_PERIOD_NS + jitter.randrange(1_000_000))
+    assert len(out.batches) >= 198
+    # And one that is quicker does not send more often.
+    for turn in range(4_000):
+        log.append("hil/lab/rig1/state", 201 + turn, turn, b"")
+        log.flush_if_due((4_000 + turn) * 1_000_000)
+    assert len(out.batches) <= 402
 
 
 def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:
