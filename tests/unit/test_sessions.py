@@ -451,6 +451,29 @@ def test_a_continued_session_leaves_out_what_the_file_before_holds_and_counts_wh
     assert desk.file.recording.tally.lost_recorder == 3
 
 
+@pytest.mark.parametrize("opened_before_the_gap", [True, False])
+def test_a_gap_between_two_files_that_was_seen_on_the_stream_is_counted_once(opened_before_the_gap: bool) -> None:
+    desk = Desk()
+    known = [desk.sim.state("rig1", desk.wall + number) for number in range(4)]
+    desk.shelf.seen = {(1, message.sequence, message.publish_ns) for message in known}
+    desk.shelf.last = {1: (4, known[-1].publish_ns)}
+    desk.take(desk.sim.batch())
+    for lost in range(3):
+        desk.sim.state("rig1", desk.wall + 4 + lost)
+    desk.sim.batch()
+    desk.sim.sequence -= 1
+    session = OpenSession(rig="rig1", session="s1")
+    if opened_before_the_gap:
+        desk.take(desk.edge.batch(sessions=[session]))
+    wanted = desk.sim.state("rig1", desk.wall + 7)
+    desk.take(desk.sim.batch())
+    if not opened_before_the_gap:
+        desk.take(desk.edge.batch(sessions=[session]))
+    assert desk.file.payloads == payloads(wanted)
+    tally = desk.file.recording.tally
+    assert (tally.lost_transport, tally.lost_recorder) == (3, 0)
+
+
 def test_what_is_repeated_from_before_what_is_known_of_the_file_before_is_left_out() -> None:
     desk = Desk()
     desk.shelf.seen = set()

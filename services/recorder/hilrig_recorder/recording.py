@@ -60,6 +60,8 @@ class Recording:
     """Last sequence and publish time of each channel in that earlier file."""
     horizon_ns: dict[int, int] = field(default_factory=dict)
     """Publish time of each channel before which `seen` does not say what that earlier file holds."""
+    stated: int = 0
+    """Messages that its tally has as lost already; a gap to that earlier file may be the same ones."""
     end_wall_ns: int | None = None
     """Its end, sender's wall clock, ns; None: it goes on."""
     end_reason: str = ""
@@ -90,7 +92,10 @@ class Recording:
         if channel_id != EVENT_CHANNEL and channel_id in self.last:
             last_sequence, last_publish_ns = self.last.pop(channel_id)
             if publish_ns > last_publish_ns and sequence > last_sequence:
-                self.tally.lost_recorder += sequence - last_sequence - 1
+                gap = sequence - last_sequence - 1
+                known = min(gap, self.stated)
+                self.stated -= known
+                self.tally.lost_recorder += gap - known
         return True
 
 

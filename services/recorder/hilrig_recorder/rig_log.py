@@ -42,16 +42,20 @@ class RigLog:
         """Count messages that are missing, in every recording and for those that begin soon."""
         self._losses.append((wall_ns, transport, recorder))
         for recording in self.recordings:
-            recording.tally.lost_transport += transport
-            recording.tally.lost_recorder += recorder
+            self._state(recording, transport, recorder)
 
     def begin(self, recording: Recording, horizon_ns: int) -> None:
         """Let a recording begin with what arrived since `horizon_ns`; what waits must have been cut off before."""
         for _, transport, recorder in self._losses:
-            recording.tally.lost_transport += transport
-            recording.tally.lost_recorder += recorder
+            self._state(recording, transport, recorder)
         self.recordings.append(recording)
         recording.take([record for _, block in self._blocks for record in block], horizon_ns)
+
+    @staticmethod
+    def _state(recording: Recording, transport: int, recorder: int) -> None:
+        recording.tally.lost_transport += transport
+        recording.tally.lost_recorder += recorder
+        recording.stated += transport + recorder
 
     def forget(self, horizon_ns: int, wall_ns: int) -> None:
         """Drop what is older than `horizon_ns`."""
