@@ -379,7 +379,7 @@ def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with
             eventually(lambda: "lab" in watcher.newest, timeout_s=20)
             assert answers(Address("", running.port), None)
             running.process.send_signal(signal.SIGINT)
-            assert running.process.wait(3) == 0
+            assert running.process.wait(10) == 0
             eventually(lambda: watcher.ended, timeout_s=5)
         assert running.process.stderr is not None
         assert "can be overheard" in running.process.stderr.read()
