@@ -1,6 +1,9 @@
 """Loop latency: the stages add up, nothing is negative, and what was scripted is what is found."""
 
+import errno
 import json
+import mmap
+import os
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +102,31 @@ def test_samples_are_put_in_order_whatever_was_expected_of_their_number(tmp_path
         for piece in (whole[100:], whole[:40], whole[40:100]):
             table.add(piece)
         assert np.array_equal(table.in_order(), whole)
+
+
+@pytest.mark.parametrize("room", [True, False])
+def test_samples_of_a_very_long_run_are_kept_in_a_file_where_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, room: bool
+) -> None:
+    def refuse(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
+    whole = match(run.states, run.commands)
+    report = measure(run).as_dict()
+    monkeypatch.setattr(SampleTable, "LARGE", 10)
+    if not room:
+        monkeypatch.setattr(os, "posix_fallocate", refuse)
+    found = match(run.states, run.commands)
+    assert np.array_equal(found, whole)
+    assert in_a_file(found) == room
+    assert measure(run).as_dict() == report
+
+
+def in_a_file(rows: object) -> bool:
+    while isinstance(rows, np.ndarray):
+        rows = rows.base
+    return isinstance(rows, mmap.mmap)
 
 
 def test_the_report_has_what_scripts_rely_on(tmp_path: Path) -> None:

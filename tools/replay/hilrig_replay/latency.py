@@ -5,6 +5,8 @@ state that the controller had last been served. Five stages are differences of t
 both ways over the bus, is what remains. So the six add up exactly, and no clocks are compared (docs/timing.md).
 """
 
+import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
@@ -141,12 +143,16 @@ class SampleTable:
     """Samples as they are found, in one array: a long run's are never held twice.
 
     The array is made as long as it can get. What is not written of it takes no memory, and pieces that are joined at
-    the end would, for what they are made of is not given back before.
+    the end would, for what they are made of is not given back before. A very long run's is a file without a name, of
+    which the system keeps in memory what there is room for.
     """
+
+    LARGE: Final = 500_000
+    """Samples from which on they are kept in a file, count: nearly three hours at a step of 20 ms."""
 
     def __init__(self, most: int) -> None:
         """For up to `most` samples; should there be more, it grows."""
-        self._rows = np.empty(most, SAMPLE)
+        self._rows = _in_file(most) if most >= self.LARGE else np.empty(most, SAMPLE)
         self._end = 0
 
     def add(self, samples: NDArray[np.void]) -> None:
@@ -163,6 +169,17 @@ class SampleTable:
         if (same & (np.diff(samples["sampled_ns"]) >= 0)).all():
             return samples
         return samples[np.lexsort((samples["sampled_ns"], samples["incarnation"]))]
+
+
+def _in_file(rows: int) -> NDArray[np.void]:
+    try:
+        with tempfile.TemporaryFile() as file:
+            # Reserved, for a disk that is found full later would end the process.
+            os.posix_fallocate(file.fileno(), 0, rows * SAMPLE.itemsize)
+            return np.asarray(np.memmap(file, SAMPLE, "r+", shape=(rows,)))
+    except (OSError, AttributeError):
+        # No room on the disk, or a system that can't reserve it.
+        return np.empty(rows, SAMPLE)
 
 
 def match(states: Rows, commands: Rows) -> NDArray[np.void]:
