@@ -38,6 +38,7 @@ from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_runtime.bus import KEPT, Publisher
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus
+from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
 from hilrig_runtime.service import Arrival, Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigBatch, topics
@@ -248,7 +249,8 @@ class _Nowhere(Publisher):
 
 
 def serve_alone(port: int, rigs: int, control: Connection) -> None:
-    """The edge with a bus that leads nowhere; nothing is kept for a recorder."""
+    """The edge with a bus that leads nowhere; nothing is kept for a recorder, and no policy but the ordinary one."""
+    prefer_latency()
     lab = lab_of(port, rigs)
     bus = NowhereBus()
     with Service("edge", lab, bus) as service:
@@ -258,6 +260,8 @@ def serve_alone(port: int, rigs: int, control: Connection) -> None:
 
 def serve_whole(port: int, rigs: int, control: Connection) -> None:
     """The edge as `hilrig edge` runs it; another process takes the simulation's place and hears every command."""
+    prefer_latency()
+    go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
@@ -274,7 +278,6 @@ def serve_whole(port: int, rigs: int, control: Connection) -> None:
 
 
 def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, control: Connection) -> None:
-    sys.setswitchinterval(0.0005)
     lab = service.lab
     alive = topics.alive_key(lab.name, "edge", "*")
 
@@ -298,6 +301,7 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
 
 def send_states(lab: LabConfig, control: Connection) -> None:
     """In the simulation's place: states at 50 Hz, and every command received."""
+    go_realtime(REALTIME_PRIORITIES["sim"])
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
         states = service.batch_sender(topics.STATES)
         for rig in lab.rigs:
