@@ -228,7 +228,7 @@ def test_a_service_that_the_system_did_not_grant_real_time_is_noticed_with_what_
     [finding] = services.check_realtime(lab, refused)
     assert finding.level is Level.NOTICE
     assert "edge/1 on left was not granted" in finding.text
-    assert "rtprio 2" in finding.mend
+    assert "rtprio 3" in finding.mend
     [unwanted] = services.check_realtime(parse_lab("realtime = false"), refused)
     assert unwanted.level is Level.GOOD
     assert "not asked for" in unwanted.text

@@ -20,8 +20,8 @@ LISTENING_S = 2.5
 CLOCK_NOTICE_S = 1.0
 CLOCK_WRONG_S = 60.0
 _GRANT = (
-    'on Linux write "<user> - rtprio 2" into /etc/security/limits.conf and log in anew, or LimitRTPRIO=2 into the '
-    "unit, or ulimits: {rtprio: 2} for the container; then start the services again"
+    'on Linux write "<user> - rtprio 3" into /etc/security/limits.conf and log in anew, or LimitRTPRIO=3 into the '
+    "unit, or ulimits: {rtprio: 3} for the container; then start the services again"
 )
 
 
