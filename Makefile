@@ -35,13 +35,14 @@ demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus T
 
 # What judges real time runs alone, one test after the other; all else shares the cores, with a worker more than two cores
 # have, for real processes are often waited for; so no process spreads its matrices over all cores. Where the host of a
-# virtual machine takes its processors away for a moment, a judgement of real time fails for it: only those are made
-# once more.
+# virtual machine takes its processors away for a moment, a test of real processes can fail for it: what failed is made
+# once more, with nothing beside it, and both are to be read. What fails for a reason fails again.
+AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
 test: export OPENBLAS_NUM_THREADS = 1
 test: .venv/bin/python ## everything that CI runs
 	@$(MAKE) --no-print-directory --jobs=2 system check
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not alone"
-	$(BIN)/pytest -m alone tests/rig || $(BIN)/pytest --last-failed --last-failed-no-failures none -m alone tests/rig
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
+	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .
