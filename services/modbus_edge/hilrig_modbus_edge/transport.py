@@ -7,6 +7,9 @@ again where the selector finds it; only what is asyncio's own goes back to async
 
 import asyncio
 import logging
+import math
+import os
+import select
 import selectors
 import socket
 from collections.abc import Callable
@@ -20,6 +23,8 @@ LOW_WATER: Final = 16_384
 """Bytes that wait to be sent: above the one the protocol is told to pause, below the other to go on."""
 
 _Events = list[tuple[selectors.SelectorKey, int]]
+_Ready = list[tuple[int, int]]
+"""Handles and what they are ready for, as the system says it."""
 
 logger = logging.getLogger(__name__)
 
@@ -27,23 +32,66 @@ logger = logging.getLogger(__name__)
 class DirectSelector(selectors.DefaultSelector):
     """A selector for an asyncio loop that calls what was registered with a function, and tells asyncio of the rest."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._calls: dict[int, Callable[[int], None]] = {}
+        """By handle, what to call with the events."""
+        self._poll: Callable[[float], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        """See `selectors.BaseSelector.register`; `data` that can be called is called with the events."""
+        key = super().register(fileobj, events, data)
+        # asyncio's own data is a pair of handles.
+        if callable(data):
+            self._calls[key.fd] = data
+        return key
+
+    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
+        """See `selectors.BaseSelector.unregister`."""
+        key = super().unregister(fileobj)
+        self._calls.pop(key.fd, None)
+        return key
+
     def select(self, timeout: float | None = None) -> _Events:
         """See `selectors.BaseSelector.select`."""
-        ready: _Events = super().select(timeout)
+        poll, call_of = self._poll, self._calls.get
+        # Never too early: asyncio would come back at once, and again.
+        ready = poll(-1 if timeout is None else math.ceil(timeout * 1e3) * 1e-3 if timeout > 0 else 0)
         served = 0
-        while True:
+        while ready:
             others: _Events = []
-            for event in ready:
-                # asyncio's own data is a pair of handles.
-                data = event[0].data
-                if type(data) is tuple:
-                    others.append(event)
-                else:
-                    data(event[1])
+            for handle, mask in ready:
+                call = call_of(handle)
+                # By far the most often there is something to read and nothing else.
+                events = EVENT_READ if mask == EVENT_READ else _events_of(mask)
+                if call is not None:
+                    call(events)
+                elif (key := self.get_map().get(handle)) is not None and events & key.events:
+                    others.append((key, events & key.events))
             served += len(ready)
-            if others or not ready or served >= TURN:
+            if others or served >= TURN:
                 return others
-            ready = super().select(0)
+            ready = poll(0)
+        return []
+
+    def _super_poll(self, timeout: float) -> _Ready:
+        return [(key.fd, events) for key, events in super().select(None if timeout < 0 else timeout)]
+
+
+if hasattr(select, "epoll"):
+    # To let the standard library make a key of each event takes longer than to ask the system.
+    def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float], _Ready]:
+        # A handle of its own to the same set, for it is closed with this object.
+        return select.epoll.fromfd(os.dup(selector.fileno())).poll
+
+    def _events_of(mask: int) -> int:
+        return (EVENT_READ if mask & ~select.EPOLLOUT else 0) | (EVENT_WRITE if mask & ~select.EPOLLIN else 0)
+
+    assert select.EPOLLIN == EVENT_READ
+else:
+
+    def _events_of(mask: int) -> int:
+        return mask
 
 
 class DirectLoop(asyncio.SelectorEventLoop):
