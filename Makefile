@@ -56,7 +56,7 @@ gen: .venv/dev ## generated code and tables, from their sources
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python tests/conformance.py > docs/modbus-conformance.md
 
-bench: .venv/dev system ## every benchmark; writes the tables of docs/performance.md
+bench: .venv/dev system ## every benchmark (most of an hour); writes docs/performance.md
 	$(BIN)/python bench/run_all.py
 
 clean: ## everything that was built or installed here
