@@ -27,6 +27,7 @@ from mcap.writer import Writer
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.rate import Rate
+from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_runtime.service import Service
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Event, Health, JointState, OpenSession
@@ -112,6 +113,8 @@ def states(rig: str, number: int) -> list[bytes]:
 
 def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
     """Send the states of every rig of a lab within a session each, and say how many."""
+    # As the simulations do for which it stands.
+    go_realtime(REALTIME_PRIORITIES["sim"])
     rigs = [rig.name for rig in lab.rigs]
     pool = [(STATE.key(lab.name, rig), states(rig, number)) for number, rig in enumerate(rigs)]
     stopping = threading.Event()
