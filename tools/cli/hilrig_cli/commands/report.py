@@ -23,7 +23,7 @@ def report(
         Path | None,
         typer.Option(
             metavar="LAB.TOML",
-            help="Grade by the [task] of this lab's file; without: by the one that was recorded.",
+            help="Grade by the \\[task] of this lab's file; without: by the one that was recorded.",
             show_default=False,
         ),
     ] = None,

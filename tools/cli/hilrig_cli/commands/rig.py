@@ -52,7 +52,7 @@ def add(
     ] = None,
     settings: Annotated[
         Path | None,
-        typer.Option(metavar="RIG.TOML", help="What differs from the lab, as in [[rigs]].", show_default=False),
+        typer.Option(metavar="RIG.TOML", help="What differs from the lab, as in \\[\\[rigs]].", show_default=False),
     ] = None,
     config: Config = None,
 ) -> None:
