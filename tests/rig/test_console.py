@@ -46,7 +46,7 @@ class RunningConsole:
 
     def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
         """Status, headers in small letters, body; the path goes out as it is."""
-        # A report is made by a process that steps back behind all others: where these keep the cores busy, it takes long.
+        # A report is made by a process that steps back behind all others: where these are busy, it takes long.
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
         try:
             connection.putrequest(method, path, skip_host="host" in headers)
