@@ -121,6 +121,18 @@ class Presence:
         """
         if self._claimed:
             return
+        self.look_again()
+        self._claimed = True
+        watched = alive_key(self._lab, self._own.service, "*")
+        self._declared.append(self._bus.watch(watched, lambda _, alive: self._wake.set() if alive else None))
+        threading.Thread(target=self._watch, name="presence", daemon=True).start()
+
+    def look_again(self) -> None:
+        """Look for an elder, for as long as the bus may take to be linked with everyone who is there.
+
+        Raises:
+            OperationError: one has one of these rigs, or the name.
+        """
         reason = self._look()
         asked_s = 0.0
         while not reason and asked_s < self._bus.settling_s:
@@ -129,10 +141,6 @@ class Presence:
             reason = self._look()
         if reason:
             raise OperationError(reason)
-        self._claimed = True
-        watched = alive_key(self._lab, self._own.service, "*")
-        self._declared.append(self._bus.watch(watched, lambda _, alive: self._wake.set() if alive else None))
-        threading.Thread(target=self._watch, name="presence", daemon=True).start()
 
     def close(self) -> None:
         """Stop answering and watching."""

@@ -177,6 +177,14 @@ class Service:
         """
         self._presence.claim()
 
+    def look_for_elders(self) -> None:
+        """Look once more whether another service of its kind was there before; one that was may be found late.
+
+        Raises:
+            OperationError: as `claim`.
+        """
+        self._presence.look_again()
+
     def ready(self) -> None:
         """Say that the service does its work now: its liveliness token appears; a second call does nothing.
 

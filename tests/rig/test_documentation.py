@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from labs import HILRIG, RunningLab, write_lab
+from labs import HILRIG, RunningLab, hilrig, write_lab
 from waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -77,6 +77,11 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
         yield Place(folder, lab)
 
 
+@pytest.fixture(scope="module")
+def started_from_nothing() -> set[str]:
+    return set()
+
+
 def test_there_are_commands_on_the_front_page() -> None:
     assert {"make demo", "make test", "hilrig up"} <= set(COMMANDS)
 
@@ -97,7 +102,7 @@ def test_what_is_tested_elsewhere_is(beginning: str) -> None:
     [command for command in COMMANDS if not command.startswith(("make ", *TESTED_ELSEWHERE))],
     ids=lambda command: f"{COMMANDS[command]}: {command}",
 )
-def test_a_documented_command_runs(place: Place, command: str) -> None:
+def test_a_documented_command_runs(place: Place, command: str, started_from_nothing: set[str]) -> None:
     words = shlex.split(command)
     if words[:2] == ["hilrig", "up"]:
         # The lab beside us runs by that very command.
@@ -110,16 +115,22 @@ def test_a_documented_command_runs(place: Place, command: str) -> None:
         subprocess.run(words, check=True, capture_output=True, timeout=20)
         return
     assert words[0] == "hilrig", f"say in this test how {words[0]!r} is run, or in TESTED_ELSEWHERE which test runs it"
-    words = [*HILRIG, *words[1:]]
+    words = words[1:]
     if command.startswith(OPENS_A_WINDOW) and "--save" not in words:
         words += ["--save", "shown.rrd"]
     of_a_lab = ("hilrig live", "hilrig record", "hilrig lease", "hilrig impair", "hilrig play")
     if command.startswith(of_a_lab) and "--config" not in words:
         words += ["--config", str(place.lab.config)]
     if command.startswith(FOLLOWS):
-        _follow(words, place.folder)
+        _follow([*HILRIG, *words], place.folder)
         return
-    done = subprocess.run(words, cwd=place.folder, check=False, capture_output=True, text=True, timeout=100)
+    if words[0] in started_from_nothing:
+        done = hilrig(*words, cwd=place.folder, timeout_s=100)
+    else:
+        # Each command once as a user starts it; another time with other options it is spared Python's start.
+        started_from_nothing.add(words[0])
+        whole = [*HILRIG, *words]
+        done = subprocess.run(whole, cwd=place.folder, check=False, capture_output=True, text=True, timeout=100)
     assert done.returncode in (0, 1), done.stderr
     assert "Traceback" not in done.stderr
 

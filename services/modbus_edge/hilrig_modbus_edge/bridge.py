@@ -82,8 +82,13 @@ class Edge:
         try:
             # Sockets listen before the first state is there: whoever connects early is served as soon as it can be
             # done. All or none: a rig without its port must not leave the others' open.
-            for rig, seat in self._seats.items():
-                seat.bind(lab.ports[rig], lab.tls_ports.get(rig))
+            try:
+                for rig, seat in self._seats.items():
+                    seat.bind(lab.ports[rig], lab.tls_ports.get(rig))
+            except OperationError:
+                # Who has the port may be another edge of the lab, with which the bus was not linked yet.
+                service.look_for_elders()
+                raise
             self._state_sessions()
             for seat in self._seats.values():
                 seat.device.begin()
