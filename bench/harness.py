@@ -18,6 +18,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from hilrig_cli.demo import free_ports
+from hilrig_runtime.config import LabConfig, load_lab
+
 HERE = Path(__file__).parent
 BUILD = HERE / "build"
 
@@ -131,6 +134,19 @@ def build_c(source: str, library: str = "libmodbus") -> Path:
         ]
         subprocess.run(command, check=True)
     return program
+
+
+def write_lab(
+    folder: Path, *, rigs: int = 1, step_ms: float = 20.0, session_grace_ms: float = 0.0
+) -> tuple[LabConfig, Path, int]:
+    """A lab whose ports are free and that records into `folder`: the lab, its file there, its first rig's port."""
+    config = folder / "lab.toml"
+    port, bus_port = free_ports(20_000, rigs), free_ports(7447, 8)
+    config.write_text(
+        f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = {session_grace_ms}\n"
+        f"[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = '{folder}'\n[rigs]\ncount = {rigs}\n"
+    )
+    return load_lab(config), config, port
 
 
 def percentile(values: Sequence[float], share: float) -> float:

@@ -25,7 +25,7 @@ from typing import Any
 
 import harness
 import numpy as np
-from harness import Report, build_c, percentile, progress
+from harness import Report, build_c, percentile, progress, write_lab
 from numpy.typing import NDArray
 from stolen import StolenTime
 
@@ -35,7 +35,6 @@ from hilrig_cli.supervisor import WHOLE_LAB, Supervisor
 from hilrig_replay import latency
 from hilrig_replay.run import open_run
 from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import STATE, Traffic, alive_key
@@ -103,7 +102,7 @@ class RigRun:
 
 def rig_run(client: Path, step_ms: float, seconds: float) -> RigRun:
     with tempfile.TemporaryDirectory() as folder:
-        lab, config, port = write_lab(Path(folder), step_ms)
+        lab, config, port = write_lab(Path(folder), step_ms=step_ms)
         with running_lab(lab, config, say, threading.Event()), StolenTime() as stolen:
             figures = run_client(client, port, seconds)
         (recording,) = Path(folder).rglob("*.mcap")
@@ -138,17 +137,6 @@ def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
     return statistics.median(run[group][key] for run in runs)
 
 
-def write_lab(folder: Path, step_ms: float) -> tuple[LabConfig, Path, int]:
-    """A lab of one rig, its file, and the rig's port."""
-    config = folder / "lab.toml"
-    port, bus_port = free_ports(5020), free_ports(7447, 3)
-    config.write_text(
-        f"[sim]\nstep_ms = {step_ms}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
-        f'[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = "{folder}"\n'
-    )
-    return load_lab(config), config, port
-
-
 @dataclass(frozen=True, slots=True)
 class Window:
     """A turn of the controller."""
@@ -164,7 +152,7 @@ def recorder_comes_and_goes(client: Path, step_ms: float, pairs: int, seconds: f
     """Turns without and with a recorder, in pairs, in one lab that runs on."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        lab, config, port = write_lab(Path(folder), step_ms)
+        lab, config, port = write_lab(Path(folder), step_ms=step_ms)
         others = tuple(part for part in WHOLE_LAB if part.service != "recorder")
         recorder = tuple(part for part in WHOLE_LAB if part.service == "recorder")
         with (

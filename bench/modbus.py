@@ -12,14 +12,13 @@ import json
 import logging
 import multiprocessing
 import os
-import socket
 import statistics
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from harness import Report, build_c, progress
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from hilrig_cli.demo import free_ports
 from hilrig_modbus_edge.bridge import run as run_edge
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Connection as ModbusConnection
@@ -189,7 +189,7 @@ def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterato
     """Run a server of ours in a process of its own; it says that it is ready, and ends when told."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    port = free_ports(rigs)
+    port = free_ports(20_000, rigs)
     process = context.Process(target=serve, args=(port, rigs, there))
     process.start()
     there.close()
@@ -204,7 +204,7 @@ def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterato
 
 @contextmanager
 def serving_c(program: Path) -> Iterator[Server]:
-    port = free_ports(1)
+    port = free_ports(20_000)
     with subprocess.Popen([program, str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -323,22 +323,10 @@ def lab_of(port: int, rigs: int) -> LabConfig:
     return LabConfig.model_validate(
         {
             "edge": {"first_port": port, "max_connections": 64, "max_connections_per_host": 64},
-            "bus": {"first_port": free_ports(3)},
+            "bus": {"first_port": free_ports(7447, 3)},
             "rigs": [{"name": f"rig{number + 1}"} for number in range(rigs)],
         }
     )
-
-
-def free_ports(count: int) -> int:
-    """First of `count` neighbouring ports that are free on loopback."""
-    while True:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            first: int = probe.getsockname()[1]
-        with ExitStack() as probes, suppress(OSError, OverflowError):
-            for port in range(first, first + count):
-                probes.enter_context(socket.socket()).bind(("127.0.0.1", port))
-            return first
 
 
 def wait_for_end(control: Connection) -> None:

@@ -10,7 +10,6 @@ import json
 import math
 import os
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from harness import Report, progress, run
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from hilrig_cli.demo import free_ports
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig, load_lab
 from hilrig_runtime.rate import Rate
@@ -265,7 +265,9 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
 def write_lab(folder: Path, rigs: int) -> Path:
     config = folder / "lab.toml"
     names = "".join(f'[[rigs]]\nname = "rig{number}"\n' for number in range(rigs))
-    config.write_text(f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n{names}")
+    config.write_text(
+        f"[bus]\nfirst_port = {free_ports(7447, 3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n{names}"
+    )
     return config
 
 
@@ -296,20 +298,6 @@ def contents(paths: list[Path]) -> tuple[int, int, int]:
                     lost_transport += int(record.metadata["lost_transport"])
                     lost_recorder += int(record.metadata["lost_recorder"])
     return found, lost_transport, lost_recorder
-
-
-def free_ports(count: int) -> int:
-    while True:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            first: int = probe.getsockname()[1]
-        try:
-            for port in range(first, first + count):
-                with socket.socket() as probe:
-                    probe.bind(("127.0.0.1", port))
-        except (OSError, OverflowError):
-            continue
-        return first
 
 
 if __name__ == "__main__":

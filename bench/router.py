@@ -26,12 +26,11 @@ from typing import Any
 import harness
 import numpy as np
 import zenoh
-from harness import Report, build_c, progress, services_log
+from harness import Report, build_c, progress, services_log, write_lab
 
 from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import running_lab
 from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.config import load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas.topics import COMMANDS, HEALTH, LOG, STATES, ServiceTopic
 
@@ -82,13 +81,7 @@ def one_hosts_worth(seconds: float) -> list[Flow]:
             heard.setdefault((topic, service), []).append(len(sample.payload))
 
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
-        config = Path(folder) / "lab.toml"
-        port, bus_port = free_ports(24_000, RIGS), free_ports(7447, 3)
-        config.write_text(
-            f"[edge]\nfirst_port = {port}\n[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = '{folder}'\n"
-            f"[rigs]\ncount = {RIGS}\n"
-        )
-        lab = load_lab(config)
+        lab, config, port = write_lab(Path(folder), rigs=RIGS)
         with (
             services_log(Path(folder) / "log"),
             running_lab(lab, config, lambda _: None, threading.Event()),

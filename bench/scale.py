@@ -24,10 +24,9 @@ from typing import Any
 
 import harness
 import numpy as np
-from harness import Report, build_c, progress
+from harness import Report, build_c, progress, write_lab
 from numpy.typing import NDArray
 
-from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import running_lab
 from hilrig_cli.supervisor import shared
 from hilrig_modbus_edge.bridge import NEAR_NS
@@ -35,7 +34,6 @@ from hilrig_replay.latency import join_commands
 from hilrig_replay.latency import measure as latency_of
 from hilrig_replay.run import Run, open_run
 from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import load_lab
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
@@ -123,13 +121,7 @@ def add(report: Report, found: Found, edges: int) -> None:
 def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
     """Run a lab of `count` rigs on some edges under load; what came of it."""
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
-        config = Path(folder) / "lab.toml"
-        port, bus_port = free_ports(20_000, count), free_ports(7447, 8)
-        config.write_text(
-            f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {port}\nsession_grace_ms = 0\n"
-            f"[bus]\nfirst_port = {bus_port}\n[recorder]\nfolder = '{folder}'\n[rigs]\ncount = {count}\n"
-        )
-        lab = load_lab(config)
+        lab, config, port = write_lab(Path(folder), rigs=count, step_ms=STEP_MS)
         parts = shared([rig.name for rig in lab.rigs], edges=edges)
         healths: dict[str, list[Health]] = {}
 

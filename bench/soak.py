@@ -29,14 +29,13 @@ from pathlib import Path
 
 import harness
 import numpy as np
-from harness import Report, percentile, services_log
+from harness import Report, percentile, services_log, write_lab
 
-from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import POLL_S, running_lab
 from hilrig_cli.supervisor import Supervisor
 from hilrig_replay.run import open_run
 from hilrig_replay.verify import verify
-from hilrig_runtime.config import LabConfig, load_lab
+from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigBatch
@@ -217,13 +216,7 @@ def measure(minutes: float, report: Report, quick: bool) -> None:
         interruptions() as interrupted,
         services_log(Path(folder) / "log"),
     ):
-        config = Path(folder) / "lab.toml"
-        port, bus_port = free_ports(24_000, RIGS), free_ports(7447, 3)
-        config.write_text(
-            f"[edge]\nfirst_port = {port}\nsession_grace_ms = {GRACE_MS}\n[bus]\nfirst_port = {bus_port}\n"
-            f"[recorder]\nfolder = '{folder}'\n[rigs]\ncount = {RIGS}\n"
-        )
-        lab = load_lab(config)
+        lab, config, port = write_lab(Path(folder), rigs=RIGS, session_grace_ms=GRACE_MS)
         with running_lab(lab, config, said.append, threading.Event()) as supervisor:
             before = Watched()
             before.look(supervisor)
