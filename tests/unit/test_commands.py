@@ -136,23 +136,43 @@ def test_times_of_steps_are_kept_for_a_while() -> None:
     assert [times.get(step) for step in range(8)] == [None, None, None, 30, 40, 50, 60, None]
 
 
-def test_what_was_expected_is_latched_as_it_is_and_a_newer_one_instead_of_it() -> None:
+def test_a_command_that_is_overtaken_before_its_tick_has_never_acted() -> None:
     follows = follower()
-    expected, newer = command(seq=1, effort=[9.0, 0.0, 0.0, 0.0]), command(seq=2)
-    follows.expect(None)
-    follows.expect(expected)
-    # Nothing of it acts before the tick.
-    assert (follows.seq, follows.effort, follows.safe) == (0, ZERO_EFFORT, True)
-    follows.latch(expected, 20 * MS)
-    assert (follows.seq, follows.effort, follows.is_new) == (1, (9.0, 0.0, 0.0, 0.0), True)
-    follows.expect(expected)
-    follows.latch(expected, 40 * MS)
-    assert not follows.is_new
-    follows.expect(command(seq=3, effort=[8.0, 0.0, 0.0, 0.0]))
-    follows.latch(newer, 60 * MS)
-    assert (follows.seq, follows.effort) == (2, (1.0, 2.0, 3.0, 4.0))
-    rubbish = Came(b"\xff\xff\xff", MS)
-    follows.expect(rubbish)
-    assert follows.malformed == 0
-    follows.latch(rubbish, 80 * MS)
-    assert (follows.seq, follows.malformed) == (2, 1)
+    follows.latch(command(seq=1, at_ms=15, basis_step=4, effort=[9.0, 0.0, 0.0, 0.0]), 20 * MS)
+    follows.overtake(command(seq=2, at_ms=19, basis_incarnation=8), 20 * MS)
+    assert follows.is_new
+    assert (follows.seq, follows.effort, follows.arrived_ns) == (2, (1.0, 2.0, 3.0, 4.0), 19 * MS)
+    assert follows.basis_step == 0
+
+
+def test_what_is_the_same_nothing_or_a_repeat_overtakes_nothing() -> None:
+    follows = follower()
+    came = command(seq=1, at_ms=15)
+    follows.latch(came, 20 * MS)
+    for later in (came, None, command(seq=1, at_ms=19), Came(b"\xff\xff\xff", 19 * MS)):
+        follows.overtake(later, 20 * MS)
+        assert follows.is_new
+        assert (follows.seq, follows.basis_step, follows.arrived_ns) == (1, 5, 15 * MS)
+    assert follows.malformed == 1
+
+
+def test_a_reset_that_is_overtaken_before_its_tick_is_done_once() -> None:
+    follows = follower()
+    follows.latch(command(seq=1), 20 * MS)
+    follows.latch(command(seq=2, resets=1), 40 * MS)
+    last = command(seq=3, resets=1)
+    follows.overtake(last, 40 * MS)
+    assert follows.reset
+    follows.latch(last, 60 * MS)
+    assert not follows.reset
+
+
+def test_a_command_that_comes_just_before_the_tick_that_would_miss_it_was_never_lost() -> None:
+    follows = follower(timeout_ms=100)
+    came = command()
+    follows.latch(came, 0)
+    follows.latch(came, 120 * MS)
+    assert follows.lost
+    follows.overtake(command(seq=2, at_ms=119), 120 * MS)
+    assert (follows.safe, follows.lost, follows.back) == (False, False, False)
+    assert follows.effort == (1.0, 2.0, 3.0, 4.0)

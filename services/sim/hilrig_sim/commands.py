@@ -96,17 +96,10 @@ class CommandFollower:
     malformed: int = 0
     """Messages that were no commands."""
     _arrival: Arrival | None = None
-    _expected: Arrival | None = None
-    _decoded: _Command | None = None
     _heard_ns: int = 0
     _commanded: Effort = ZERO_EFFORT
     _resets: int | None = None
     _is_plain: bool = True
-
-    def expect(self, arrival: Arrival | None) -> None:
-        """Decode what `latch` will take if nothing newer comes: before a tick there is time, in it there is none."""
-        if arrival is not None and arrival is not self._arrival and arrival is not self._expected:
-            self._expected, self._decoded = arrival, _decode(arrival.payload)
 
     def latch(self, arrival: Arrival | None, now_ns: int) -> None:
         """Take the newest arrival, the same object as before where nothing came; `now_ns` is not before it."""
@@ -124,8 +117,15 @@ class CommandFollower:
             self.silent_ns = now_ns - self._heard_ns
             self.effort = ZERO_EFFORT
 
+    def overtake(self, arrival: Arrival | None, now_ns: int) -> None:
+        """Take what came after `latch`, but before the tick that it was for: what it overtakes has never acted."""
+        if arrival is not self._arrival and arrival is not None:
+            self._is_plain = False
+            self._arrival = arrival
+            self._take(arrival, now_ns)
+
     def _take(self, arrival: Arrival, now_ns: int) -> None:
-        command = self._decoded if arrival is self._expected else _decode(arrival.payload)
+        command = _decode(arrival.payload)
         if command is None:
             self.malformed += 1
             return
@@ -136,17 +136,17 @@ class CommandFollower:
             self.seq, self.session, self.magnet = command.seq, command.session, command.magnet
             self.effort = self._commanded = command.effort
             self.arrived_ns = arrival.arrived_ns
-            if command.basis_incarnation == self.incarnation:
-                self.basis_step = command.basis_step
+            self.basis_step = command.basis_step if command.basis_incarnation == self.incarnation else 0
         if self.safe:
-            # Not at the first command of all: nothing was lost before it.
-            self.back = self._resets is not None
+            # Not at the first command of all: nothing was lost before it. Nor was it where it came just in time.
+            self.back = self._resets is not None and not self.lost
+            self.lost = False
             self.silent_ns = was_silent_ns
             self.safe = False
             self.changed = True
             self.effort = self._commanded
-        # A count that fell is an edge that was started anew.
-        self.reset = self._resets is not None and command.resets > self._resets
+        # A count that fell is an edge that was started anew. A reset that is overtaken is asked for all the same.
+        self.reset |= self._resets is not None and command.resets > self._resets
         self._resets = command.resets
 
 
