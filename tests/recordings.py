@@ -17,7 +17,7 @@ from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
 from hilrig_runtime.config import LabConfig, RigSettings
-from hilrig_schemas import Event, JointState, ModbusRequest, ModbusTraffic, PartState, TorqueCommand
+from hilrig_schemas import Event, JointState, ModbusKind, ModbusTraffic, PartState, TorqueCommand
 from hilrig_schemas.topics import RECORDED
 from hilrig_sim.configured import rig_parameters
 from hilrig_sim.urdf import urdf
@@ -239,27 +239,19 @@ def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int
 
 
 def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
-    batch = ModbusTraffic(rig=rig)
+    read = ModbusKind(function=3, address=4, count=4, controller=CONTROLLER)
+    wrote = ModbusKind(function=16, address=0, count=4, controller=CONTROLLER)
+    batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
     for write in writes:
         command = write.command
-        read = (3, 4, write.asked_ns, command.state_served_ns + 15_000)
-        wrote = (16, 0, command.write_arrived_ns, command.write_arrived_ns + 15_000)
-        for function, address, arrived_ns, answered_ns in (read, wrote):
-            batch.requests.append(
-                ModbusRequest(
-                    function=function,
-                    address=address,
-                    count=4,
-                    arrived_ns=arrived_ns,
-                    answered_ns=answered_ns,
-                    controller=CONTROLLER,
-                )
-            )
-        if len(batch.requests) >= 20 or write is writes[-1]:
+        batch.kind_indexes.extend((0, 1))
+        batch.arrived_ns.extend((write.asked_ns, command.write_arrived_ns))
+        batch.answered_after_ns.extend((command.state_served_ns - write.asked_ns + 15_000, 15_000))
+        if len(batch.arrived_ns) >= 20 or write is writes[-1]:
             batch.closed_ns = command.sent_ns
             batch.wall_ns = command.wall_ns
             yield Made("traffic", batch.wall_ns, batch)
-            batch = ModbusTraffic(rig=rig)
+            batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
 
 
 def write(

@@ -65,13 +65,17 @@ def test_what_was_sent_is_on_the_record_byte_for_byte() -> None:
         client.write(0, 7)
         client.read(4, 4)
         client.write(8, 1)
-        asked = eventually(lambda: len(r := [q for t in rig.traffic for q in t.requests]) == 3 and r)
-        assert [(q.function, q.address, q.count, q.exception) for q in asked] == [
+        asked = eventually(lambda: sum(len(t.arrived_ns) for t in rig.traffic) == 3 and rig.traffic)
+        kinds = [traffic.kinds[index] for traffic in asked for index in traffic.kind_indexes]
+        assert [(kind.function, kind.address, kind.count, kind.exception) for kind in kinds] == [
             (16, 0, 1, 0),
             (3, 4, 4, 0),
             (16, 8, 1, 2),
         ]
-        assert all(q.controller == client.address and q.arrived_ns <= q.answered_ns for q in asked)
+        assert all(kind.controller == client.address for kind in kinds)
+        arrived_ns = [arrived_ns for traffic in asked for arrived_ns in traffic.arrived_ns]
+        assert arrived_ns == sorted(arrived_ns)
+        assert all(0 <= after_ns < 1_000_000_000 for traffic in asked for after_ns in traffic.answered_after_ns)
 
 
 # -- one writer

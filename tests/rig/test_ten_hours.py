@@ -69,9 +69,7 @@ def _move(one: Made, by_ns: int, steps: int, commands: int) -> None:
     elif isinstance(message, ModbusTraffic):
         message.wall_ns += by_ns
         message.closed_ns += by_ns
-        for request in message.requests:
-            request.arrived_ns += by_ns
-            request.answered_ns += by_ns
+        message.arrived_ns[:] = [arrived_ns + by_ns for arrived_ns in message.arrived_ns]
 
 
 @pytest.fixture(scope="module")

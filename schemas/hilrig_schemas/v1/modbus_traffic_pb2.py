@@ -24,15 +24,17 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n&hilrig_schemas/v1/modbus_traffic.proto\x12\thilrig.v1\"l\n\rModbusTraffic\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07wall_ns\x18\x02 \x01(\x03\x12\x11\n\tclosed_ns\x18\x03 \x01(\x03\x12*\n\x08requests\x18\x04 \x03(\x0b\x32\x18.hilrig.v1.ModbusRequest\"\x91\x01\n\rModbusRequest\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x12\n\narrived_ns\x18\x04 \x01(\x03\x12\x13\n\x0b\x61nswered_ns\x18\x05 \x01(\x03\x12\x11\n\texception\x18\x06 \x01(\r\x12\x12\n\ncontroller\x18\x07 \x01(\tb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n&hilrig_schemas/v1/modbus_traffic.proto\x12\thilrig.v1\"\xd7\x01\n\rModbusTraffic\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07wall_ns\x18\x02 \x01(\x03\x12\x11\n\tclosed_ns\x18\x03 \x01(\x03\x12*\n\x08requests\x18\x04 \x03(\x0b\x32\x18.hilrig.v1.ModbusRequest\x12$\n\x05kinds\x18\x05 \x03(\x0b\x32\x15.hilrig.v1.ModbusKind\x12\x14\n\x0ckind_indexes\x18\x06 \x03(\r\x12\x12\n\narrived_ns\x18\x07 \x03(\x10\x12\x19\n\x11\x61nswered_after_ns\x18\x08 \x03(\x04\"e\n\nModbusKind\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x11\n\texception\x18\x04 \x01(\r\x12\x12\n\ncontroller\x18\x05 \x01(\t\"\x91\x01\n\rModbusRequest\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x12\n\narrived_ns\x18\x04 \x01(\x03\x12\x13\n\x0b\x61nswered_ns\x18\x05 \x01(\x03\x12\x11\n\texception\x18\x06 \x01(\r\x12\x12\n\ncontroller\x18\x07 \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.modbus_traffic_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_MODBUSTRAFFIC']._serialized_start=53
-  _globals['_MODBUSTRAFFIC']._serialized_end=161
-  _globals['_MODBUSREQUEST']._serialized_start=164
-  _globals['_MODBUSREQUEST']._serialized_end=309
+  _globals['_MODBUSTRAFFIC']._serialized_start=54
+  _globals['_MODBUSTRAFFIC']._serialized_end=269
+  _globals['_MODBUSKIND']._serialized_start=271
+  _globals['_MODBUSKIND']._serialized_end=372
+  _globals['_MODBUSREQUEST']._serialized_start=375
+  _globals['_MODBUSREQUEST']._serialized_end=520
 # @@protoc_insertion_point(module_scope)

@@ -17,7 +17,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
-from hilrig_schemas import JointState, ModbusTraffic, TorqueCommand
+from hilrig_schemas import JointState, TorqueCommand
 
 Rows: TypeAlias = NDArray[np.void]
 """A structured array: one row a message, fields by name."""
@@ -269,30 +269,6 @@ def command_decoder(commands: Table, names: Names) -> Decode:
             message.magnet,
             message.safe,
         )
-
-    return decode
-
-
-def traffic_decoder(requests: Table, names: Names) -> Decode:
-    """A function that adds the requests of `ModbusTraffic` messages to a `TRAFFIC` table."""
-    message = ModbusTraffic()
-    parse, add, code = message.ParseFromString, requests.append, names.code
-
-    def decode(payload: bytes, sequence: int, log_ns: int) -> None:  # noqa: ARG001
-        parse(payload)
-        wall_from_monotonic = message.wall_ns - message.closed_ns
-        for request in message.requests:
-            arrived_ns = request.arrived_ns
-            add(
-                wall_from_monotonic + arrived_ns,
-                arrived_ns,
-                request.answered_ns,
-                request.address & 0xFFFF,
-                request.count & 0xFFFF,
-                code(request.controller),
-                request.function & 0xFF,
-                request.exception & 0xFF,
-            )
 
     return decode
 

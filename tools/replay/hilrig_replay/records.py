@@ -18,9 +18,9 @@ from hilrig_replay.columns import (
     command_decoder,
     joined,
     state_decoder,
-    traffic_decoder,
 )
 from hilrig_replay.timebase import Timebase
+from hilrig_replay.traffic import traffic_decoder
 from hilrig_schemas import Event
 
 EVENT: Final = np.dtype(
