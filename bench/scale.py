@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from hilrig_cli.lab import running_lab
 from hilrig_cli.supervisor import shared
 from hilrig_modbus_edge.bridge import NEAR_NS
-from hilrig_replay.latency import join_commands
 from hilrig_replay.latency import measure as latency_of
 from hilrig_replay.run import Run, open_run
+from hilrig_replay.samples import join_commands
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Health

@@ -9,8 +9,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_replay.latency import STAGES, measure
+from hilrig_replay.latency import measure
 from hilrig_replay.run import open_run
+from hilrig_replay.samples import STAGES
 from labs import hilrig
 
 pytestmark = pytest.mark.rig

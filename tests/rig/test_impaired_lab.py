@@ -18,8 +18,9 @@ from scipy import stats
 
 from edge_rig import RawClient
 from hilrig_modbus_edge.impairment import Impairment, way_seed
-from hilrig_replay.latency import STAGES, LatencyReport, measure
+from hilrig_replay.latency import LatencyReport, measure
 from hilrig_replay.run import Run, open_run
+from hilrig_replay.samples import STAGES
 from hilrig_runtime.impairment_config import WayImpairment
 from labs import RunningLab, free_ports, hilrig, write_lab
 from waiting import eventually

@@ -1,18 +1,16 @@
 """Loop latency: the stages add up, nothing is negative, and what was scripted is what is found."""
 
-import errno
 import json
-import mmap
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_replay.latency import STAGES, LatencyReport, Matcher, SampleTable, match, measure
+from hilrig_replay.latency import LatencyReport, measure
 from hilrig_replay.latency_plot import save_plot
-from hilrig_replay.run import open_run
+from hilrig_replay.run import Run, open_run
+from hilrig_replay.samples import STAGES, Matcher, SampleTable
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, TorqueCommand
 from recordings import MS, Script, make, record, write
@@ -83,50 +81,30 @@ def test_stages_add_up_exactly_and_none_is_negative(tmp_path: Path) -> None:
         assert (table[stage] >= 0).all(), stage
 
 
+def samples_of(run: Run, rows: int) -> SampleTable:
+    matcher, table = Matcher(), SampleTable()
+    for block in run.blocks(rows=rows):
+        table.add(matcher.add(block.states, block.commands))
+    table.end()
+    assert matcher.unmatched == 0
+    return table
+
+
 def test_blocks_of_any_size_give_the_same_samples(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0, poll_ms=3.0)))
-    whole = match(run.states, run.commands)
+    whole = samples_of(run, 100_000)[:]
     for rows in (7, 100, 1000):
-        matcher, table = Matcher(), SampleTable(len(whole))
-        for block in run.blocks(rows=rows):
-            table.add(matcher.add(block.states, block.commands))
-        assert np.array_equal(table.in_order(), whole), rows
-        assert matcher.unmatched == 0
+        assert np.array_equal(samples_of(run, rows)[:], whole), rows
 
 
-def test_samples_are_put_in_order_whatever_was_expected_of_their_number(tmp_path: Path) -> None:
+def test_samples_whose_commands_came_late_are_put_in_their_order(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
-    whole = match(run.states, run.commands)
-    for most in (0, 10, 10_000):
-        table = SampleTable(most)
-        for piece in (whole[100:], whole[:40], whole[40:100]):
-            table.add(piece)
-        assert np.array_equal(table.in_order(), whole)
-
-
-@pytest.mark.parametrize("room", [True, False])
-def test_samples_of_a_very_long_run_are_kept_in_a_file_where_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, room: bool
-) -> None:
-    def refuse(*_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
-    whole = match(run.states, run.commands)
-    report = measure(run).as_dict()
-    monkeypatch.setattr(SampleTable, "LARGE", 10)
-    if not room:
-        monkeypatch.setattr(os, "posix_fallocate", refuse)
-    found = match(run.states, run.commands)
-    assert np.array_equal(found, whole)
-    assert in_a_file(found) == room
-    assert measure(run).as_dict() == report
-
-
-def in_a_file(rows: object) -> bool:
-    while isinstance(rows, np.ndarray):
-        rows = rows.base
-    return isinstance(rows, mmap.mmap)
+    whole = samples_of(run, 100_000)[:]
+    table = SampleTable()
+    for piece in (whole[100:], whole[:40], whole[40:100]):
+        table.add(piece)
+    table.end()
+    assert np.array_equal(table[:], whole)
 
 
 def test_the_report_has_what_scripts_rely_on(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from hilrig_cli.timekeeping import Timekeeping
-from hilrig_replay.latency import Statistics
+from hilrig_replay.distribution import Statistics
 
 
 def figures(p50: float, p99: float, p999: float, longest: float) -> Statistics:

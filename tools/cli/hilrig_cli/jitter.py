@@ -22,8 +22,9 @@ from hilrig_cli.demo import free_ports
 from hilrig_cli.lab import running_lab
 from hilrig_cli.load import busy_processors
 from hilrig_cli.timekeeping import Timekeeping
+from hilrig_replay.distribution import Statistics
 from hilrig_replay.fitness import behind_ns
-from hilrig_replay.latency import Statistics, measure
+from hilrig_replay.latency import measure
 from hilrig_replay.records import Records
 from hilrig_replay.run import open_run
 from hilrig_runtime.config import LabConfig, load_lab

@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from hilrig_replay.latency import Statistics
+from hilrig_replay.distribution import Statistics
 
 LATE_SHARE: Final = 0.1
 """Of a step, by which 999 ticks of 1,000 may be late."""

@@ -112,12 +112,13 @@ def origin_ns(run: Run, align: str) -> int:
                 return int(run.time_ns(found)[0])
         raise InputError(f"{run.path}: the arm never moves, so it can't be aligned by motion; --align start can")
     wanted = align.upper().replace("-", "_").replace(" ", "_")
-    events = run.events
-    found = events[events["kind"] == wanted][:1]
-    if not len(found):
-        kinds = ", ".join(sorted(set(events["kind"]))) or "none"
-        raise InputError(f"{run.path}: has no event {wanted}; it has {kinds}")
-    return int(run.time_ns(found)[0])
+    kinds: set[str] = set()
+    for block in run.blocks(frozenset({"event"})):
+        found = block.events[block.events["kind"] == wanted][:1]
+        if len(found):
+            return int(run.time_ns(found)[0])
+        kinds.update(block.events["kind"])
+    raise InputError(f"{run.path}: has no event {wanted}; it has {', '.join(sorted(kinds)) or 'none'}")
 
 
 def _difference(reference: RunSummary, other: RunSummary) -> Difference:

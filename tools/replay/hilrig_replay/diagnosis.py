@@ -4,7 +4,7 @@ Every rule is a function from the evidence of a run to a finding, or None where 
 measured, what it looks like, and what to do about it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.columns import Rows
+from hilrig_replay.distribution import Statistics, differences, median, percentiles
+from hilrig_replay.fitness import Stalls
 from hilrig_replay.run import Run
+from hilrig_replay.spool import Spool
 
 MS: Final = 1e6
 EDGE_STALL_NS: Final = 5_000_000
@@ -38,21 +41,18 @@ class Evidence:
     """What the rules look at; times in ns."""
 
     run: Run
-    samples: NDArray[np.void]
-    """Shape (n,), fields as `latency.SAMPLE`."""
+    samples: Spool
+    """In their order, fields as `samples.SAMPLE`."""
+    loop_ms: Statistics | None
+    """Of the samples; None: there are none."""
+    stages_ms: Mapping[str, Statistics]
+    """Of the samples' stages; none where there are no samples."""
     step_ns: int
-    lateness_ns: NDArray[np.int64]
-    """Of every tick, shape (number of states,)."""
-    stalls: tuple[tuple[int, int], ...]
-    """(time in the run, lateness) of each tick that was late by more than a step."""
-    write_ns: NDArray[np.int64]
-    """Arrival of every write at the edge, shape (number of commands,)."""
+    stalls: Stalls
+    """Ticks that were late by more than a step."""
+    cycle_ns: float
+    """From one write to the next, median; 0: there are not two."""
     _windows: list[tuple[Rows, Rows, Rows]] = field(default_factory=list)
-
-    @property
-    def cycle_ns(self) -> float:
-        """From one write to the next, median; 0: there are not two."""
-        return float(np.median(np.diff(self.write_ns))) if len(self.write_ns) > 1 else 0.0
 
     def windows(self) -> list[tuple[Rows, Rows, Rows]]:
         """States, commands and requests of a few windows of the run, evenly spread."""
@@ -82,36 +82,54 @@ def diagnose(evidence: Evidence) -> Iterator[Finding]:
 
 def simulation_stall(evidence: Evidence) -> Finding | None:
     """Ticks that came more than a step late."""
-    if not evidence.stalls:
+    stalls = evidence.stalls
+    if not stalls.count:
         return None
-    at_ns, worst_ns = max(evidence.stalls, key=lambda stall: stall[1])
+    longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return Finding(
         "simulation_stall",
-        f"the simulation stood still {_times(len(evidence.stalls))}, longest {worst_ns / MS:.0f} ms at "
-        f"{at_ns / 1e9:.1f} s: its host was too busy, or suspended",
-        {"stalls": len(evidence.stalls), "longest_ms": worst_ns / MS, "at_s": at_ns / 1e9},
+        f"the simulation stood still {_times(stalls.count)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: its host "
+        "was too busy, or suspended",
+        {"stalls": stalls.count, "longest_ms": longest_ms, "at_s": at_s},
     )
 
 
 def edge_stall(evidence: Evidence) -> Finding | None:
     """Requests that waited in the edge for their answer, or writes before they left as commands."""
-    waits = [(evidence.samples["edge"], evidence.run.time_ns(evidence.samples))]
-    waits += [
-        (requests["answered_ns"] - requests["arrived_ns"], evidence.run.time_ns(requests))
-        for _, _, requests in evidence.windows()
-    ]
-    waited_ns = np.concatenate([wait for wait, _ in waits])
-    if not len(waited_ns):
+    run, samples = evidence.run, evidence.samples
+    requests = [requests for _, _, requests in evidence.windows() if len(requests)]
+
+    def waits() -> Iterator[tuple[NDArray[np.int64], Rows]]:
+        for rows in samples.blocks("edge", "sampled_ns", "incarnation"):
+            yield rows["edge"], rows
+        for rows in requests:
+            yield rows["answered_ns"] - rows["arrived_ns"], rows
+
+    if not len(samples) and not requests:
         return None
-    late = np.flatnonzero(waited_ns > max(EDGE_STALL_NS, 20 * float(np.median(waited_ns))))
-    if not late.size:
+    limit_ns = max(EDGE_STALL_NS, 20 * median(lambda: (waited_ns for waited_ns, _ in waits())))
+    longest_ns, at_ns = limit_ns, 0
+    for waited_ns, rows in waits():
+        worst = int(np.argmax(waited_ns))
+        if waited_ns[worst] > longest_ns:
+            longest_ns, at_ns = float(waited_ns[worst]), int(run.time_ns(rows[worst : worst + 1])[0])
+    if longest_ns == limit_ns:
         return None
-    at_ns = np.concatenate([at for _, at in waits])[late]
-    worst = int(np.argmax(waited_ns[late]))
-    longest_ms = float(waited_ns[late][worst] / MS)
+
+    def late_ns() -> Iterator[NDArray[np.int64]]:
+        """When something waited, samples and requests together in the order of their time."""
+        waits = [run.time_ns(rows)[rows["answered_ns"] - rows["arrived_ns"] > limit_ns] for rows in requests]
+        others = np.sort(np.concatenate([np.empty(0, np.int64), *waits]))
+        for rows in samples.blocks("edge", "sampled_ns", "incarnation"):
+            time_ns = run.time_ns(rows)
+            before = int(np.searchsorted(others, time_ns[-1]))
+            yield np.sort(np.concatenate((time_ns[rows["edge"] > limit_ns], others[:before])))
+            others = others[before:]
+        yield others
+
     # Whatever waited for the same stall waited at the same time.
-    stalls = 1 + int((np.diff(np.sort(at_ns)) > SAME_STALL_NS).sum())
-    at_s = float(at_ns[worst] / 1e9)
+    stalls = 1 + sum(int((apart_ns > SAME_STALL_NS).sum()) for apart_ns in differences(late_ns)())
+    longest_ms, at_s = longest_ns / MS, at_ns / 1e9
     return Finding(
         "edge_stall",
         f"the Modbus edge stood still {_times(stalls)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: what had arrived "
@@ -122,15 +140,14 @@ def edge_stall(evidence: Evidence) -> Finding | None:
 
 def injected_delay(evidence: Evidence) -> Finding | None:
     """Delay that was configured."""
-    injected = evidence.samples["injected"]
-    if not len(injected) or not injected.any():
+    injected = evidence.stages_ms.get("injected")
+    if injected is None or not injected.max:
         return None
-    mean = float(injected.mean() / MS)
     return Finding(
         "injected_delay",
-        f"{mean:.1f} ms of the loop were added on purpose (impairment), both ways together, up to "
-        f"{injected.max() / MS:.1f} ms",
-        {"mean_ms": mean, "max_ms": float(injected.max() / MS)},
+        f"{injected.mean:.1f} ms of the loop were added on purpose (impairment), both ways together, up to "
+        f"{injected.max:.1f} ms",
+        {"mean_ms": injected.mean, "max_ms": injected.max},
     )
 
 
@@ -149,9 +166,9 @@ def slow_polling(evidence: Evidence) -> Finding | None:
 
 def slow_controller(evidence: Evidence) -> Finding | None:
     """A controller that keeps a state for a long time before it writes."""
-    if not len(evidence.samples):
+    if evidence.loop_ms is None:
         return None
-    held, loop = float(np.median(evidence.samples["controller"])), float(np.median(evidence.samples["loop"]))
+    held, loop = evidence.stages_ms["controller"].p50 * MS, evidence.loop_ms.p50 * MS
     if held < max(0.4 * loop, 5 * MS):
         return None
     cycle = evidence.cycle_ns
@@ -171,21 +188,27 @@ def beating(evidence: Evidence) -> Finding | None:
     samples, step = evidence.samples, evidence.step_ns
     if len(samples) < 50:
         return None
-    waits = samples["tick_wait"].astype(np.float64)
-    low, high = np.percentile(waits, (5, 95))
+    waits = samples.column("tick_wait")
+    low, high = percentiles(waits, (5, 95))
     if high - low < 0.5 * step:
         return None
-    # Towards the nearest: a wait that falls below zero comes back a step higher.
-    drift = (np.diff(waits) + step / 2) % step - step / 2
-    typical = float(np.median(drift))
-    if abs(typical) > 0.15 * step or np.median(np.abs(drift - typical)) > 0.05 * step or abs(typical) < 1e-4 * step:
+    changes = differences(waits)
+
+    def drifts() -> Iterator[Floats]:
+        # Towards the nearest: a wait that falls below zero comes back a step higher.
+        return ((change + step / 2) % step - step / 2 for change in changes())
+
+    typical = median(drifts)
+    if abs(typical) > 0.15 * step or abs(typical) < 1e-4 * step:
+        return None
+    if median(lambda: (np.abs(drift - typical) for drift in drifts())) > 0.05 * step:
         return None
     # Most of the way it drifts one way, and comes round at least twice.
-    same_way = float(np.mean(np.sign(drift) == np.sign(typical)))
-    rounds = int((np.abs(np.diff(waits)) > step / 2).sum())
+    same_way = sum(int((np.sign(drift) == np.sign(typical)).sum()) for drift in drifts()) / (len(samples) - 1)
+    rounds = sum(int((np.abs(change) > step / 2).sum()) for change in changes())
     if same_way < 0.75 or rounds < 2:
         return None
-    between_ns = float(np.median(np.diff(samples["write_arrived_ns"])))
+    between_ns = median(differences(samples.column("write_arrived_ns")))
     period_s = step / abs(typical) * between_ns / 1e9
     return Finding(
         "beating",

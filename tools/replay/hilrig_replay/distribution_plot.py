@@ -54,15 +54,14 @@ def _bars(axes: Axes, rows: np.ndarray, values: Sequence[float | None]) -> None:
 
 
 def _boxes(axes: Axes, runs: Sequence[RunSummary]) -> None:
-    measured = [(row, run.latency.table["loop"] / 1e6) for row, run in enumerate(runs) if run.latency.samples]
+    measured = [(row, run.box_ms) for row, run in enumerate(runs) if run.box_ms]
     if not measured:
         return
-    boxes = axes.boxplot(
-        [values for _, values in measured],
+    boxes = axes.bxp(
+        [dict(zip(("whislo", "q1", "med", "q3", "whishi"), box_ms, strict=True)) for _, box_ms in measured],
         positions=[row for row, _ in measured],
         orientation="horizontal",
         widths=0.6,
-        whis=(1, 99),
         showfliers=False,
         patch_artist=True,
         manage_ticks=False,
@@ -71,7 +70,7 @@ def _boxes(axes: Axes, runs: Sequence[RunSummary]) -> None:
         box.set(facecolor=RUN_COLORS[0], alpha=0.6)
     axes.set_xlim(left=0)
     axes.axvline(
-        float(np.median([np.median(values) for _, values in measured])),
+        float(np.median([box_ms[2] for _, box_ms in measured])),
         color=_MEDIAN,
         linewidth=0.8,
         linestyle=(0, (4, 2)),

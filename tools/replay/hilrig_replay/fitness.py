@@ -1,6 +1,6 @@
 """Whether a recording supports claims about latency; otherwise why not, in words."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.columns import Rows
+from hilrig_replay.distribution import Statistics, median
 from hilrig_replay.run import Run
+from hilrig_replay.samples import STAGES
+from hilrig_replay.spool import Spool
 
 ENOUGH_SAMPLES: Final = 500
 """Below, p99 rests on fewer than five samples."""
@@ -17,6 +20,9 @@ BACKLOG_NS: Final = 1_000_000_000
 CLOCK_STEP_NS: Final = 10_000_000
 """Wall clock against monotonic clock from one state to the next: slewing moves it by microseconds."""
 
+_TICK: Final = np.dtype([("behind_ns", "<i8")])
+_WRITE: Final = np.dtype([("cycle_ns", "<i8")])
+
 
 @dataclass(frozen=True, slots=True)
 class Lost:
@@ -24,6 +30,16 @@ class Lost:
 
     transport: int
     recorder: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stalls:
+    """Ticks that were late by more than a step."""
+
+    count: int = 0
+    longest_ns: int = 0
+    at_ns: int = 0
+    """When the longest was, time in the run."""
 
 
 def behind_ns(states: Rows, step_ns: int) -> NDArray[np.int64]:
@@ -39,32 +55,38 @@ class FitnessWatch:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._lateness: list[NDArray[np.int64]] = []
-        self._writes: list[NDArray[np.int64]] = []
-        self.stalls: list[tuple[int, int]] = []
+        self._ticks, self._writes = Spool(_TICK), Spool(_WRITE)
+        self.stalls = Stalls()
+        self._samples = self._negative = 0
         self._gaps = 0
         self._missed = 0
         self._delay_ns: tuple[int, int] | None = None
         self._clock_steps = 0
         self._last_state: Rows | None = None
         self._last_command: Rows | None = None
+        self._last_write_ns = np.empty(0, np.int64)
 
-    def add(self, states: Rows, commands: Rows) -> None:
-        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`."""
+    def add(self, states: Rows, commands: Rows, samples: Rows) -> None:
+        """Take in the next block, fields as `columns.STATE`, `columns.COMMAND` and `samples.SAMPLE`."""
         if len(states):
             self._add_states(states)
         if len(commands):
-            self._writes.append(commands["write_arrived_ns"][~commands["safe"]])
-            self._gaps += _gaps(commands, self._last_command)
-            self._last_command = commands[-1:].copy()
+            self._add_commands(commands)
+        self._samples += len(samples)
+        self._negative += sum(int((samples[stage] < 0).sum()) for stage in STAGES)
+
+    def _add_commands(self, commands: Rows) -> None:
+        self._gaps += _gaps(commands, self._last_command)
+        self._last_command = commands[-1:].copy()
+        write_ns = np.concatenate((self._last_write_ns, commands["write_arrived_ns"][~commands["safe"]]))
+        self._writes.add(np.diff(write_ns).view(_WRITE))
+        self._last_write_ns = write_ns[-1:].copy()
 
     def _add_states(self, states: Rows) -> None:
         behind = behind_ns(states, self._run.step_ns)
-        self._lateness.append(behind)
+        self._ticks.add(behind.view(_TICK))
         self._missed += int(states["missed_steps"].sum())
-        late = np.flatnonzero(behind > self._run.step_ns)
-        times = self._run.time_ns(states[late])
-        self.stalls.extend(zip(times.tolist(), behind[late].tolist(), strict=True))
+        self._add_stalls(states, behind)
         delay = states["log_ns"] - states["wall_ns"]
         low, high = int(delay.min()), int(delay.max())
         if self._delay_ns is not None:
@@ -77,13 +99,21 @@ class FitnessWatch:
         self._gaps += _gaps(states, self._last_state)
         self._last_state = states[-1:].copy()
 
-    def lateness_ns(self) -> NDArray[np.int64]:
-        """Of every tick behind its deadline, shape (number of states,), ns."""
-        return _joined(self._lateness)
+    def _add_stalls(self, states: Rows, behind: NDArray[np.int64]) -> None:
+        stalls, worst = self.stalls, int(np.argmax(behind))
+        count = stalls.count + int((behind > self._run.step_ns).sum())
+        longest_ns, at_ns = stalls.longest_ns, stalls.at_ns
+        if behind[worst] > max(longest_ns, self._run.step_ns):
+            longest_ns, at_ns = int(behind[worst]), int(self._run.time_ns(states[worst : worst + 1])[0])
+        self.stalls = Stalls(count, longest_ns, at_ns)
 
-    def write_ns(self) -> NDArray[np.int64]:
-        """Arrival of every write of a controller at the edge, shape (number of writes,), ns."""
-        return _joined(self._writes)
+    def lateness(self) -> Statistics:
+        """Of every tick behind its deadline."""
+        return Statistics.of(self._ticks.column("behind_ns"))
+
+    def cycle_ns(self) -> float:
+        """From one write of a controller to the next at the edge, median, ns; 0: there are not two."""
+        return median(self._writes.column("cycle_ns")) if len(self._writes) else 0.0
 
     def lost(self) -> Lost:
         """What is missing: as the recorder counted, or as the senders' numbers show, whichever is more."""
@@ -91,10 +121,10 @@ class FitnessWatch:
         transport = max(self._gaps - (said.recorder if said else 0), said.transport if said else 0)
         return Lost(transport, said.recorder if said else 0)
 
-    def reasons(self, samples: Rows, stages: Sequence[str], unmatched: int) -> Iterator[str]:
-        """Why the recording is not fit, once all of it was taken in; none: it is."""
+    def reasons(self, unmatched: int) -> Iterator[str]:
+        """Why the recording is not fit, once all of it was taken in, `unmatched` samples apart; none: it is."""
         run, lost = self._run, self.lost()
-        overruns = max(len(self.stalls), run.number("summary", "overruns") or 0)
+        overruns = max(self.stalls.count, run.number("summary", "overruns") or 0)
         clock_steps = max(self._clock_steps, run.number("summary", "clock_steps") or 0)
         if lost.transport:
             yield f"{_count(lost.transport, 'message')} lost on the way to the recorder"
@@ -103,8 +133,7 @@ class FitnessWatch:
         if run.losses is None:
             yield "the recording does not say whether something was lost (it did not end in order)"
         if overruns:
-            worst = max((late for _, late in self.stalls), default=0) / 1e6
-            steps = f"{self._missed} steps missed, at most {worst:.0f} ms late"
+            steps = f"{self._missed} steps missed, at most {self.stalls.longest_ns / 1e6:.0f} ms late"
             yield f"{_count(overruns, 'overrun')} of the simulation, {steps}"
         if self._delay_ns is not None and self._delay_ns[1] - self._delay_ns[0] > BACKLOG_NS:
             behind = (self._delay_ns[1] - self._delay_ns[0]) / 1e9
@@ -113,11 +142,10 @@ class FitnessWatch:
             yield f"the wall clock was set {clock_steps} times during the run"
         if unmatched:
             yield f"the commands of {_count(unmatched, 'sample')} are not in the recording"
-        negative = int(sum((samples[stage] < 0).sum() for stage in stages))
-        if negative:
-            yield f"{_count(negative, 'stage')} came out negative: the stamps contradict each other"
-        if len(samples) < ENOUGH_SAMPLES:
-            yield f"{_count(len(samples), 'sample')} only: {ENOUGH_SAMPLES} are needed for a 99th percentile"
+        if self._negative:
+            yield f"{_count(self._negative, 'stage')} came out negative: the stamps contradict each other"
+        if self._samples < ENOUGH_SAMPLES:
+            yield f"{_count(self._samples, 'sample')} only: {ENOUGH_SAMPLES} are needed for a 99th percentile"
 
 
 def _gaps(rows: Rows, last: Rows | None) -> int:
@@ -129,7 +157,3 @@ def _gaps(rows: Rows, last: Rows | None) -> int:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _joined(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    return np.concatenate(pieces) if pieces else np.empty(0, np.int64)

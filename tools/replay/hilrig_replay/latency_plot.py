@@ -6,17 +6,19 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from hilrig_replay.latency import STAGES, LatencyReport
+from hilrig_replay.distribution import tail
+from hilrig_replay.latency import LatencyReport
 from hilrig_replay.palette import INK, STAGE_COLORS, STAGE_NAMES
 from hilrig_replay.run import Run
+from hilrig_replay.samples import STAGES
 from hilrig_runtime.errors import InputError, OperationError
 
 FORMATS: Final = (".png", ".svg", ".pdf")
 
 _MARK: Final = "#d62728"
-_POINTS: Final = 20_000
+_STRETCHES: Final = 4000
+"""The course over time has so many points, some to a pixel."""
 
 
 def check_plot_path(path: Path) -> None:
@@ -64,12 +66,11 @@ def save_figure(figure: Figure, path: Path) -> None:
 def latency_figure(report: LatencyReport, run: Run) -> Figure:
     """The picture itself, of a report with samples."""
     figure = Figure(figsize=(11, 7), layout="constrained", dpi=110)
-    (histogram, stages), (tail, history) = figure.subplots(2, 2, width_ratios=(1.3, 1))
-    loop_ms = report.table["loop"] / 1e6
-    _histogram(histogram, loop_ms, report)
+    (histogram, stages), (above, history) = figure.subplots(2, 2, width_ratios=(1.3, 1))
+    _histogram(histogram, report)
     _stages(stages, report)
-    _tail(tail, loop_ms, report)
-    _history(history, run.time_s(report.table), loop_ms, report)
+    _tail(above, report)
+    _history(history, run, report)
     fitness = "fit for latency claims" if report.fit else f"not fit for latency claims: {report.reasons[0]}"
     figure.suptitle(
         f"Loop latency of {report.session}\n"
@@ -80,16 +81,19 @@ def latency_figure(report: LatencyReport, run: Run) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
+def _histogram(axes: Axes, report: LatencyReport) -> None:
     statistics, step = report.loop_ms, report.step_ms
     assert statistics is not None
     # Far outliers would squeeze everything else: they are counted at the edge, and the tail shows them.
     limit = max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step)
     edges = np.arange(0, limit + step / 80, step / 40)
-    axes.hist(np.minimum(loop_ms, limit), bins=edges.tolist(), color=STAGE_COLORS["register_wait"], log=True)
+    counts, beyond = np.zeros(len(edges) - 1, np.int64), 0
+    for loop_ns in report.table.column("loop")():
+        counts += np.histogram(np.minimum(loop_ns / 1e6, limit), edges)[0]
+        beyond += int((loop_ns / 1e6 > limit).sum())
+    axes.hist(edges[:-1], edges.tolist(), weights=counts, color=STAGE_COLORS["register_wait"], log=True)
     for multiple in np.arange(step, limit + step / 2, step):
         axes.axvline(float(multiple), color="#bbbbbb", linewidth=0.8, zorder=0)
-    beyond = int((loop_ms > limit).sum())
     marks = (("p50", statistics.p50), ("p95", statistics.p95), ("p99", statistics.p99), ("p99.9", statistics.p999))
     for row, (name, value) in enumerate(marks):
         axes.axvline(value, color=_MARK, linewidth=0.9, linestyle=(0, (4, 2)))
@@ -133,12 +137,9 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
     _label(axes, "Stages: bar to p50 (figure), line to p99", "ms", "")
 
 
-def _tail(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
-    ordered = np.sort(loop_ms)
-    share_above = 1 - np.arange(len(ordered)) / len(ordered)
-    keep = np.unique(np.concatenate((np.linspace(0, len(ordered) - 1, _POINTS), len(ordered) - 1 - np.arange(200))))
-    keep = keep[keep >= 0].astype(np.intp)
-    axes.step(ordered[keep], share_above[keep], where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
+def _tail(axes: Axes, report: LatencyReport) -> None:
+    loop_ns, share_above = tail(report.table.column("loop"))
+    axes.step(loop_ns / 1e6, share_above, where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
     axes.set_yscale("log")
     axes.grid(color="#e5e5e5", linewidth=0.6)
     for share, name in ((0.5, "p50"), (0.05, "p95"), (0.01, "p99"), (0.001, "p99.9")):
@@ -153,24 +154,32 @@ def _tail(axes: Axes, loop_ms: NDArray[np.float64], report: LatencyReport) -> No
                 fontsize=8,
                 color=_MARK,
             )
-    axes.set_xlim(left=max(0.0, float(ordered[0]) - 0.1 * report.step_ms))
+    axes.set_xlim(left=max(0.0, float(loop_ns[0]) / 1e6 - 0.1 * report.step_ms))
     _label(axes, "Tail (share of samples that took longer)", "loop latency, ms", "share")
 
 
-def _history(axes: Axes, time_s: NDArray[np.float64], loop_ms: NDArray[np.float64], report: LatencyReport) -> None:
+def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
     # The slowest sample of each stretch, so that thinning hides none.
-    stretch = -(-len(loop_ms) // _POINTS)
-    starts = np.arange(0, len(loop_ms), stretch)
+    stretch = -(-report.samples // _STRETCHES)
+    count = -(-report.samples // stretch)
+    time_s, slowest = np.zeros(count), np.zeros(count)
+    at = 0
+    for samples in report.table.blocks("loop", "sampled_ns", "incarnation"):
+        stretches = np.arange(at, at + len(samples)) // stretch
+        np.maximum.at(slowest, stretches, samples["loop"] / 1e6)
+        # Of times that are given to the same stretch the last one is kept.
+        time_s[stretches[::-1]] = run.time_s(samples)[::-1]
+        at += len(samples)
     axes.plot(
-        time_s[starts],
-        np.maximum.reduceat(loop_ms, starts),
+        time_s,
+        slowest,
         linestyle="none",
         marker=".",
         markersize=2.5,
         color=STAGE_COLORS["register_wait"],
         rasterized=True,
     )
-    axes.set_ylim(0, 1.1 * float(loop_ms.max()))
+    axes.set_ylim(0, 1.1 * float(slowest.max()))
     axes.axhline(report.step_ms, color="#bbbbbb", linewidth=0.8, zorder=0)
     _label(axes, "Over time", "time in the run, s", "loop latency, ms")
 

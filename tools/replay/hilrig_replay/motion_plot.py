@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from hilrig_replay.distribution import tail
 from hilrig_replay.palette import EFFORT_SYMBOLS, INK, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
 from hilrig_replay.scene import reach_outline
 from hilrig_replay.summary import Course, RunSummary
@@ -53,18 +54,19 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
         unit = "mm" if joint == 2 else "°"
         label(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")
     figure.axes[0].legend(fontsize=7, frameon=False)
-    top, tail = figure.add_subplot(grid[:2, 1]), figure.add_subplot(grid[2:, 1])
+    top, above = figure.add_subplot(grid[:2, 1]), figure.add_subplot(grid[2:, 1])
     for number, summary in enumerate(runs):
         course = summary.course
         color = RUN_COLORS[number % len(RUN_COLORS)]
         top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=color, linewidth=0.9)
-        ordered = np.sort(summary.latency.table["loop"]) / 1e6
-        tail.step(ordered, 1 - np.arange(len(ordered)) / max(len(ordered), 1), where="post", color=color, linewidth=1.2)
+        if summary.latency.samples:
+            loop_ns, share = tail(summary.latency.table.column("loop"))
+            above.step(loop_ns / 1e6, share, where="post", color=color, linewidth=1.2)
     top.set_aspect("equal", adjustable="datalim")
     label(top, "The tools' ways from above, mm", "", "")
-    tail.set_yscale("log")
-    tail.grid(color="#e5e5e5", linewidth=0.6)
-    label(tail, "Loop latency, ms: share of samples that took longer", "", "")
+    above.set_yscale("log")
+    above.grid(color="#e5e5e5", linewidth=0.6)
+    label(above, "Loop latency, ms: share of samples that took longer", "", "")
     return figure
 
 

@@ -5,31 +5,51 @@ the length. Where a range of time is asked for, the file's index tells which chu
 """
 
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema, Statistics
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    Footer,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
-from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
+from hilrig_replay.columns import Rows, Table
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
 
 SCHEMA_PACKAGE: Final = "hilrig.v1"
 """The messages that this version reads."""
 PART_SUFFIX: Final = ".part"
+_NEVER_NS: Final = (1 << 63) - 1
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+_FOOTER_BYTES: Final = 29
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")
+_CHANNEL_OFFSET: Final = struct.Struct("<HQ")
+CHUNK: Final = np.dtype(
+    [("first_ns", "<i8"), ("last_ns", "<i8"), ("offset", "<u8"), ("length", "<u8"), ("channels", "<u8")]
+)
+"""One row a chunk: arrival of its first and last message, where it stands in the file, and the channels in it, a bit
+each, those 64 apart sharing one; 0: it is not said. At most one a second, so that a day takes 4 MB."""
 _MESSAGE: Final = Opcode.MESSAGE.value
 """Looked up once: an enumeration's value costs as much as reading a message."""
 
@@ -61,7 +81,8 @@ class RecordingFile:
     end_ns: int
     """Arrival of the last, ns, wall clock."""
     _topic_of_channel: dict[int, str]
-    _chunks: tuple[ChunkIndex, ...]
+    _chunks: Rows
+    """In the order of the file, fields as `CHUNK`."""
 
     def messages(
         self, topics: frozenset[str], *, from_ns: int | None = None, until_ns: int | None = None
@@ -73,17 +94,13 @@ class RecordingFile:
         """
         wanted = {channel: topic for channel, topic in self._topic_of_channel.items() if topic in topics}
         low = -1 if from_ns is None else from_ns
-        high = (1 << 64) if until_ns is None else until_ns
+        high = _NEVER_NS if until_ns is None else until_ns
         try:
             with self.path.open("rb") as stream:
-                if self._chunks:
-                    for index in self._chunks:
-                        if index.message_end_time < low or index.message_start_time >= high:
-                            continue
-                        if index.message_index_offsets and wanted.keys().isdisjoint(index.message_index_offsets):
-                            continue
-                        messages = _in_chunk(_read_chunk(stream, index), wanted)
-                        if low <= index.message_start_time and index.message_end_time < high:
+                if len(self._chunks):
+                    for chunk in self._with(wanted, low, high):
+                        messages = _in_chunk(_read_chunk(stream, int(chunk["offset"]), int(chunk["length"])), wanted)
+                        if low <= chunk["first_ns"] and chunk["last_ns"] < high:
                             yield from messages
                         else:
                             yield from (message for message in messages if low <= message.log_ns < high)
@@ -99,6 +116,29 @@ class RecordingFile:
         except (McapError, ZstdError, struct.error, ValueError, RuntimeError, OSError) as error:
             raise damaged(self.path, str(error)) from error
 
+    def _with(self, channels: Iterable[int], low: int, high: int) -> Rows:
+        """The chunks that may have messages of some channels from a range of time."""
+        chunks = self._chunks
+        bits = np.uint64(_bits(channels))
+        holds = (chunks["channels"] == 0) | (chunks["channels"] & bits != 0)
+        found: Rows = chunks[(chunks["last_ns"] >= low) & (chunks["first_ns"] < high) & holds]
+        return found
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What a file says of itself at its end, or where it has no such end, in all of it."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages by channel."""
+    start_ns: int = 0
+    end_ns: int = 0
+    chunks: Table = field(default_factory=lambda: Table(CHUNK))
+
 
 def open_recording(path: Path) -> RecordingFile:
     """Read what a file says of itself; its messages stay on the disk.
@@ -109,10 +149,7 @@ def open_recording(path: Path) -> RecordingFile:
     try:
         with path.open("rb") as stream:
             _check_ends(path, stream)
-            reader = SeekingReader(stream, validate_crcs=True)
-            summary = reader.get_summary() or _summary_by_reading(path)
-            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-            attachments = {record.name: record.data for record in reader.iter_attachments()}
+            contents = _summary(stream) or _by_reading(stream)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -121,22 +158,21 @@ def open_recording(path: Path) -> RecordingFile:
         raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
     except (McapError, ZstdError, struct.error, ValueError, KeyError, RuntimeError, StopIteration) as error:
         raise damaged(path, str(error)) from error
-    topic_of_channel = _topics(path, summary, metadata)
+    topic_of_channel = _topics(path, contents)
     counts = dict.fromkeys(RECORDED, 0)
-    statistics = summary.statistics
-    if statistics is not None:
-        for channel, count in statistics.channel_message_counts.items():
-            if channel in topic_of_channel:
-                counts[topic_of_channel[channel]] += count
+    for channel, count in contents.counts.items():
+        if channel in topic_of_channel:
+            counts[topic_of_channel[channel]] += count
+    chunks = contents.chunks.take()
     return RecordingFile(
         path=path,
-        metadata=metadata,
-        attachments=attachments,
+        metadata=contents.metadata,
+        attachments=contents.attachments,
         counts=counts,
-        start_ns=statistics.message_start_time if statistics else 0,
-        end_ns=statistics.message_end_time if statistics else 0,
+        start_ns=contents.start_ns,
+        end_ns=contents.end_ns,
         _topic_of_channel=topic_of_channel,
-        _chunks=tuple(sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)),
+        _chunks=chunks[np.argsort(chunks["offset"], kind="stable")],
     )
 
 
@@ -158,52 +194,104 @@ def _check_ends(path: Path, stream: IO[bytes]) -> None:
     stream.seek(0)
 
 
-def _summary_by_reading(path: Path) -> Summary:
-    """The summary of a file that has none: a valid MCAP file may leave it out."""
-    summary = Summary()
-    counts: dict[int, int] = {}
-    times: list[int] = []
-    with path.open("rb") as stream:
-        for record in StreamReader(stream).records:
-            if isinstance(record, Schema):
-                summary.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                summary.channels[record.id] = record
-            elif isinstance(record, Message):
-                counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
-                times = (
-                    [min(times[0], record.log_time), max(times[1], record.log_time)]
-                    if times
-                    else [
-                        record.log_time,
-                        record.log_time,
-                    ]
-                )
-    start, end = times or (0, 0)
-    summary.statistics = Statistics(
-        attachment_count=0,
-        channel_count=len(summary.channels),
-        channel_message_counts=counts,
-        chunk_count=0,
-        message_count=sum(counts.values()),
-        message_start_time=start,
-        message_end_time=end,
-        metadata_count=0,
-        schema_count=len(summary.schemas),
-    )
-    return summary
+def _summary(stream: IO[bytes]) -> _Contents | None:
+    """What stands in the summary at the end of a file; None: it has none."""
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
+    start = Footer.read(_record(stream, Opcode.FOOTER)).summary_start
+    if not start:
+        return None
+    contents = _Contents()
+    elsewhere: list[MetadataIndex | AttachmentIndex] = []
+    stream.seek(start)
+    for opcode, data in _records(stream):
+        if opcode == Opcode.CHUNK_INDEX.value:
+            first_ns, last_ns, offset, length, channels = _CHUNK_INDEX.unpack_from(data)
+            listed = data[_CHUNK_INDEX.size : _CHUNK_INDEX.size + channels]
+            bits = _bits(channel for channel, _ in _CHANNEL_OFFSET.iter_unpack(listed))
+            contents.chunks.append(first_ns, last_ns, offset, length, bits)
+            continue
+        record = ReadDataStream(BytesIO(data))
+        if opcode == Opcode.SCHEMA.value:
+            schema = Schema.read(record)
+            contents.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL.value:
+            channel = Channel.read(record)
+            contents.channels[channel.id] = channel
+        elif opcode == Opcode.STATISTICS.value:
+            statistics = Statistics.read(record)
+            contents.counts = statistics.channel_message_counts
+            contents.start_ns, contents.end_ns = statistics.message_start_time, statistics.message_end_time
+        elif opcode == Opcode.METADATA_INDEX.value:
+            elsewhere.append(MetadataIndex.read(record))
+        elif opcode == Opcode.ATTACHMENT_INDEX.value:
+            elsewhere.append(AttachmentIndex.read(record))
+        elif opcode == Opcode.FOOTER.value:
+            break
+    for place in elsewhere:
+        stream.seek(place.offset)
+        if isinstance(place, MetadataIndex):
+            metadata = Metadata.read(_record(stream, Opcode.METADATA))
+            contents.metadata[metadata.name] = dict(metadata.metadata)
+        else:
+            attachment = Attachment.read(_record(stream, Opcode.ATTACHMENT))
+            contents.attachments[attachment.name] = attachment.data
+    return contents
 
 
-def _topics(path: Path, summary: Summary, metadata: dict[str, dict[str, str]]) -> dict[int, str]:
+def _records(stream: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of the records from here on."""
+    begin = stream.tell()
+    left = stream.seek(0, 2) - begin
+    stream.seek(begin)
+    while left >= _RECORD_HEAD.size:
+        opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
+        left -= _RECORD_HEAD.size + length
+        if left < 0:
+            raise EndOfFile
+        yield opcode, stream.read(length)
+
+
+def _record(stream: IO[bytes], expected: Opcode) -> ReadDataStream:
+    """The content of the record that stands here."""
+    for opcode, data in _records(stream):
+        if opcode == expected.value:
+            return ReadDataStream(BytesIO(data))
+        break
+    raise McapError(f"no {expected.name.lower()} is where one should be")
+
+
+def _by_reading(stream: IO[bytes]) -> _Contents:
+    """What a summary would say, for a file that has none: a valid MCAP file may leave it out."""
+    contents = _Contents()
+    stream.seek(0)
+    for record in StreamReader(stream).records:
+        if isinstance(record, Schema):
+            contents.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            contents.channels[record.id] = record
+        elif isinstance(record, Metadata):
+            contents.metadata[record.name] = dict(record.metadata)
+        elif isinstance(record, Attachment):
+            contents.attachments[record.name] = record.data
+        elif isinstance(record, Message):
+            if not contents.counts:
+                contents.start_ns = contents.end_ns = record.log_time
+            contents.counts[record.channel_id] = contents.counts.get(record.channel_id, 0) + 1
+            contents.start_ns = min(contents.start_ns, record.log_time)
+            contents.end_ns = max(contents.end_ns, record.log_time)
+    return contents
+
+
+def _topics(path: Path, contents: _Contents) -> dict[int, str]:
     """Topic of each channel id; channels that are not ours are left out."""
-    version = metadata.get("hilrig.session", {}).get("schema_version", SCHEMA_PACKAGE)
+    version = contents.metadata.get("hilrig.session", {}).get("schema_version", SCHEMA_PACKAGE)
     by_channel = {topic.channel: topic for topic in RECORDED.values()}
     found = {}
-    for channel in summary.channels.values():
+    for channel in contents.channels.values():
         topic = by_channel.get(channel.topic)
         if topic is None:
             continue
-        schema = summary.schemas.get(channel.schema_id)
+        schema = contents.schemas.get(channel.schema_id)
         name = schema.name if schema is not None else "no schema"
         if name != topic.message.DESCRIPTOR.full_name:
             if not name.startswith("hilrig."):
@@ -217,10 +305,17 @@ def _topics(path: Path, summary: Summary, metadata: dict[str, dict[str, str]]) -
     return found
 
 
-def _read_chunk(stream: IO[bytes], index: ChunkIndex) -> bytes:
-    stream.seek(index.chunk_start_offset)
-    record = stream.read(index.chunk_length)
-    if len(record) != index.chunk_length:
+def _bits(channels: Iterable[int]) -> int:
+    bits = 0
+    for channel in channels:
+        bits |= 1 << (channel & 63)
+    return bits
+
+
+def _read_chunk(stream: IO[bytes], offset: int, length: int) -> bytes:
+    stream.seek(offset)
+    record = stream.read(length)
+    if len(record) != length:
         raise EndOfFile
     if record[0] != Opcode.CHUNK.value:
         raise McapError("the index points to something that is no chunk")

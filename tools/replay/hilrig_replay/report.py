@@ -2,7 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from io import BytesIO
 from pathlib import Path
@@ -11,8 +11,8 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 
 from hilrig_replay.assignment import task_of
+from hilrig_replay.distribution import Statistics
 from hilrig_replay.distribution_plot import distribution_figure
-from hilrig_replay.latency import Statistics
 from hilrig_replay.latency_plot import latency_figure
 from hilrig_replay.motion_plot import motion_figure
 from hilrig_replay.palette import EFFORT_SYMBOLS, STAGE_NAMES
@@ -124,6 +124,8 @@ def _page(run: Run, verified: bool, task: TaskConfig | None) -> _Page:
     pictures = [_picture(motion_figure(summary.course, parameters, targets), "positions, efforts and the tool's way")]
     if summary.latency.loop_ms is not None:
         pictures.append(_picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
+    # A class has many runs: the samples of each are let go once they are drawn.
+    summary = replace(summary, latency=summary.latency.without_table())
     return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
 
 

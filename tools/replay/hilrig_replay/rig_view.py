@@ -19,7 +19,6 @@ from rerun.urdf import UrdfTree
 
 from hilrig_replay.columns import Names, Rows
 from hilrig_replay.fitness import behind_ns
-from hilrig_replay.latency import STAGES, Matcher, join_commands
 from hilrig_replay.palette import (
     EFFORT_SYMBOLS,
     EVENT_COLORS,
@@ -35,6 +34,7 @@ from hilrig_replay.palette import (
 from hilrig_replay.records import Records
 from hilrig_replay.request_rates import BIN_NS, Rate, RequestRates
 from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL, arm_path
+from hilrig_replay.samples import STAGES, Matcher, join_commands
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_replay.timebase import Timebase
 from hilrig_runtime.task_config import TaskConfig

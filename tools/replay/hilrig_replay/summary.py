@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.assignment import task_of
 from hilrig_replay.columns import Rows
+from hilrig_replay.distribution import percentiles
 from hilrig_replay.grade import Grade, Grader
 from hilrig_replay.latency import LatencyReport, measure
 from hilrig_replay.records import Records
@@ -78,10 +79,12 @@ class RunSummary:
     """Which parts stand in their places at the end; None: there are no places."""
     grade: Grade | None
     """None: there was no task."""
+    box_ms: tuple[float, ...]
+    """Loop latency: its percentiles 1, 25, 50, 75 and 99; empty: there are no samples."""
     course: Course = field(repr=False, compare=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON: without the course."""
+        """As plain values, for JSON: without what is there to be drawn."""
         return {
             "session": self.session,
             "rig": self.rig,
@@ -124,8 +127,15 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
         events=dict(sorted(collector.events.items())),
         task=collector.task(),
         grade=collector.grade(),
+        box_ms=_box_ms(latency),
         course=collector.course(),
     )
+
+
+def _box_ms(latency: LatencyReport) -> tuple[float, ...]:
+    if not latency.samples:
+        return ()
+    return tuple((percentiles(latency.table.column("loop"), (1, 25, 50, 75, 99)) / 1e6).tolist())
 
 
 class _Collector:
@@ -175,9 +185,10 @@ class _Collector:
         first = -self._seen % self._every
         self._pieces.append(
             (
-                time_s[first :: self._every],
+                # A view would keep the whole block.
+                time_s[first :: self._every].copy(),
                 states[first :: self._every].copy(),
-                tip[first :: self._every],
+                tip[first :: self._every].copy(),
             )
         )
         self._seen += len(states)

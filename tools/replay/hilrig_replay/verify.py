@@ -1,9 +1,10 @@
 """Is a recording what the model makes of its efforts? Re-simulation, bit for bit.
 
-A run is cut into stretches that step side by side as if each were a rig of its own: a rig's numbers do not depend on
-how many step beside it. A stretch begins at a recorded state and takes from then on nothing but the recorded efforts
-and the magnet; its last step must lead to the state at which the next stretch begins, so that stretch by stretch the
-whole run is re-simulated. An hour takes seconds.
+A run is read in pieces, and each is cut into stretches that step side by side as if each were a rig of its own: a
+rig's numbers do not depend on how many step beside it. A stretch begins at a recorded state and takes from then on
+nothing but the recorded efforts and the magnet; its last step must lead to the state at which the next stretch begins,
+and the last stretch of a piece goes on in the next one, so that stretch by stretch the whole run is re-simulated. An
+hour takes seconds.
 """
 
 from collections.abc import Sequence
@@ -30,6 +31,8 @@ PARTS_TOLERANCE: Final = 1e-9
 STRETCHES: Final = 64
 SHORTEST: Final = 50
 """A stretch is not cut shorter than so many steps without need."""
+PIECE: Final = 32_768
+"""States that are in memory at once, count."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -113,119 +116,162 @@ def verify(path: Path, tolerance: float | None = None) -> Verification:
     machine = run.metadata.get("hilrig.config", {}).get("machine", "")
     if tolerance is None:
         tolerance = 0.0 if machine == machine_name() else OTHER_MACHINE_TOLERANCE
-    return _Resimulation(run, parameters, tolerance).run(machine)
+    resimulation = _Resimulation(run, parameters, tolerance)
+    for block in run.blocks(frozenset({"state"}), rows=PIECE):
+        resimulation.add(block.states, block.parts)
+    return resimulation.result(machine)
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """Some of a run's states, row by row."""
+
+    states: Rows
+    parts: Rows
+    held: Ints
+    """Index of the held part in the scene, or `NONE`."""
+    stated: Ints
+    """Row of `parts` at which the state's begin, -1 where it has none."""
+    follows: NDArray[np.bool_]
+    """Whether a step leads to the next state, shape (states - 1,)."""
+
+    def last(self) -> tuple[Rows, Rows]:
+        """The last state, and its parts."""
+        own = self.parts["wall_ns"] == self.states["wall_ns"][-1]
+        return self.states[-1:].copy(), self.parts[own].copy()
 
 
 class _Resimulation:
-    """One recording, its stretches, and what was found so far."""
+    """One recording piece by piece, and what was found so far."""
 
     def __init__(self, run: Run, parameters: RigParameters, tolerance: float) -> None:
-        states, events = run.states, run.events
+        self._names = run.names
         self._parameters = parameters
         self._tolerance = tolerance
-        self._steps = states["step"].astype(np.int64)
-        self._position, self._velocity = states["position"], states["velocity"]
-        self._effort, self._magnet = states["effort"], states["magnet"]
-        names = [part.name for part in parameters.scene.parts]
-        self._held = _indices(states["held_part"], run.names, names)
-        self._parts = run.parts
-        self._stated = _first_part_rows(states, run.parts, len(names))
-        resets = np.array([row["step"] for row in events if row["kind"] == "RESET"], dtype=np.int64)
-        follows = np.diff(self._steps) == 1
-        follows &= states["incarnation"][1:] == states["incarnation"][:-1]
-        self._gaps = int(np.count_nonzero(~follows))
-        # A reset puts the rig somewhere else before its state is sent.
-        follows &= ~np.isin(self._steps[1:], resets)
-        self._follows = follows
+        events = (block.events for block in run.blocks(frozenset({"event"})))
+        self._resets = [int(step) for rows in events for step in rows["step"][rows["kind"] == "RESET"]]
+        self._before: tuple[Rows, Rows] | None = None
+        self._probe, self._ongoing = Plant([parameters]), Plant([parameters])
+        self._goes_on = False
+        """Whether a stretch reached the end of the piece before: `_ongoing` is the rig as it left it there."""
+        self._gaps = self._verified = self._skipped = 0
+        self._exact = True
+        self._first: int | None = None
+        self._largest, self._largest_velocity, self._largest_part = np.zeros(4), np.zeros(4), 0.0
 
-    def run(self, machine: str) -> Verification:
-        """Re-simulate all stretches side by side."""
-        stretches, plant = self._stretches()
+    def add(self, states: Rows, parts: Rows) -> None:
+        """Re-simulate what comes next, its stretches side by side."""
+        if self._before is not None:
+            states, parts = np.concatenate((self._before[0], states)), np.concatenate((self._before[1], parts))
+        piece = self._piece(states, parts)
+        self._before = piece.last()
+        stretches = self._stretches(piece)
         verified = sum(end - begin for begin, end in stretches)
-        skipped = int(np.count_nonzero(self._follows)) - verified
-        largest, largest_velocity, largest_part = np.zeros(4), np.zeros(4), 0.0
-        exact, first = True, len(self._steps)
-        if plant is not None:
-            begins, ends = (np.array(column) for column in zip(*stretches, strict=True))
-            for turn in range(int((ends - begins).max())):
-                rows = np.minimum(begins + turn, ends - 1)
-                plant.step(np.ascontiguousarray(self._effort[rows].T), self._magnet[rows])
-                going = np.flatnonzero(begins + turn < ends)
-                following = rows[going] + 1
-                position, velocity = plant.position[:, going].T, plant.velocity[:, going].T
-                off, off_velocity = (
-                    np.abs(position - self._position[following]),
-                    np.abs(velocity - self._velocity[following]),
-                )
-                worst = np.maximum(off, off_velocity).max(axis=1)
-                exact &= not worst.any()
-                np.maximum(largest, off.max(axis=0), out=largest)
-                np.maximum(largest_velocity, off_velocity.max(axis=0), out=largest_velocity)
-                off_parts = self._part_deviation(plant, going, following)
-                largest_part = max(largest_part, float(off_parts.max()))
-                wrong = ~(worst <= self._tolerance) | ~(off_parts <= PARTS_TOLERANCE)
-                if wrong.any():
-                    first = min(first, int(rows[going][wrong].min()))
+        self._verified += verified
+        self._skipped += int(np.count_nonzero(piece.follows)) - verified
+        goes_on = bool(stretches) and stretches[-1][1] == len(states) - 1
+        if stretches:
+            self._step(piece, stretches, goes_on=goes_on)
+        self._goes_on = goes_on
+
+    def result(self, machine: str) -> Verification:
+        """What was found in all of it."""
         return Verification(
-            steps=verified,
-            skipped=skipped,
+            steps=self._verified,
+            skipped=self._skipped,
             gaps=self._gaps,
-            exact=exact,
+            exact=self._exact,
             tolerance=self._tolerance,
-            largest_deviation=_four(largest),
-            largest_velocity_deviation=_four(largest_velocity),
-            largest_part_deviation=largest_part,
-            first_diverging_step=int(self._steps[first]) if first < len(self._steps) else None,
+            largest_deviation=_four(self._largest),
+            largest_velocity_deviation=_four(self._largest_velocity),
+            largest_part_deviation=self._largest_part,
+            first_diverging_step=self._first,
             machine=machine,
         )
 
-    def _stretches(self) -> tuple[list[tuple[int, int]], Plant | None]:
-        """Rows at which stretches begin and end, and a plant in which each is a rig at its beginning."""
-        breaks = [0, *(np.flatnonzero(~self._follows) + 1).tolist(), len(self._steps)]
-        wanted = max(SHORTEST, len(self._steps) // STRETCHES)
-        probe = Plant([self._parameters])
-        begins: list[int] = []
+    def _piece(self, states: Rows, parts: Rows) -> _Piece:
+        names = [part.name for part in self._parameters.scene.parts]
+        follows = np.diff(states["step"].astype(np.int64)) == 1
+        follows &= states["incarnation"][1:] == states["incarnation"][:-1]
+        self._gaps += int(np.count_nonzero(~follows))
+        # A reset puts the rig somewhere else before its state is sent.
+        follows &= ~np.isin(states["step"][1:], self._resets)
+        held = _indices(states["held_part"], self._names, names)
+        return _Piece(states, parts, held, _first_part_rows(states, parts, len(names)), follows)
+
+    def _step(self, piece: _Piece, stretches: Sequence[tuple[int, int]], *, goes_on: bool) -> None:
+        plant = Plant([self._parameters] * len(stretches))
+        for rig, (begin, _) in enumerate(stretches):
+            if begin == 0 and self._goes_on:
+                plant.adopt(self._ongoing, [rig], [0])
+            else:
+                self._place(plant, rig, piece, begin)
+        begins, ends = (np.array(column) for column in zip(*stretches, strict=True))
+        wrong = len(piece.states)
+        for turn in range(int((ends - begins).max())):
+            rows = np.minimum(begins + turn, ends - 1)
+            plant.step(np.ascontiguousarray(piece.states["effort"][rows].T), piece.states["magnet"][rows])
+            going = np.flatnonzero(begins + turn < ends)
+            wrong = min(wrong, self._compare(piece, plant, going, rows[going] + 1))
+            if goes_on and begins[-1] + turn == ends[-1] - 1:
+                self._ongoing.adopt(plant, [0], [len(stretches) - 1])
+        if self._first is None and wrong < len(piece.states):
+            self._first = int(piece.states["step"][wrong])
+
+    def _compare(self, piece: _Piece, plant: Plant, rigs: Ints, rows: Ints) -> int:
+        """What rigs came to against what was recorded; the first row whose step led elsewhere, or one past the last."""
+        off = np.abs(plant.position[:, rigs].T - piece.states["position"][rows])
+        off_velocity = np.abs(plant.velocity[:, rigs].T - piece.states["velocity"][rows])
+        worst = np.maximum(off, off_velocity).max(axis=1)
+        self._exact &= not worst.any()
+        np.maximum(self._largest, off.max(axis=0), out=self._largest)
+        np.maximum(self._largest_velocity, off_velocity.max(axis=0), out=self._largest_velocity)
+        off_parts = self._part_deviation(piece, plant, rigs, rows)
+        self._largest_part = max(self._largest_part, float(off_parts.max()))
+        wrong = ~(worst <= self._tolerance) | ~(off_parts <= PARTS_TOLERANCE)
+        return int(rows[wrong].min()) - 1 if wrong.any() else len(piece.states)
+
+    def _stretches(self, piece: _Piece) -> list[tuple[int, int]]:
+        """Rows at which stretches begin and end."""
+        breaks = [0, *(np.flatnonzero(~piece.follows) + 1).tolist(), len(piece.states)]
+        wanted = max(SHORTEST, len(piece.states) // STRETCHES)
         stretches: list[tuple[int, int]] = []
         for low, high in pairwise(breaks):
-            begin = self._next_begin(low, high, probe, any_held=True)
+            going_on = low == 0 and self._goes_on
+            begin = 0 if going_on else self._next_begin(piece, low, high, any_held=True)
             while begin is not None:
-                end = self._next_begin(begin + wanted, high, probe, any_held=False)
+                end = self._next_begin(piece, begin + wanted, high, any_held=False)
                 last = high - 1 if end is None else end
                 if last > begin:
                     stretches.append((begin, last))
-                    begins.append(begin)
                 begin = end
-        if not stretches:
-            return [], None
-        plant = Plant([self._parameters] * len(stretches))
-        for rig, row in enumerate(begins):
-            self._place(plant, rig, row)
-        return stretches, plant
+        return stretches
 
-    def _next_begin(self, low: int, high: int, probe: Plant, *, any_held: bool) -> int | None:
+    def _next_begin(self, piece: _Piece, low: int, high: int, *, any_held: bool) -> int | None:
         """First row from `low` on, before `high`, at which all that the next step depends on is recorded."""
-        for offset in np.flatnonzero(self._stated[low:high] >= 0):
+        for offset in np.flatnonzero(piece.stated[low:high] >= 0):
             row = low + int(offset)
-            if not any_held and self._held[row] != NONE:
+            if not any_held and piece.held[row] != NONE:
                 continue
-            self._place(probe, 0, row)
-            if probe.world.at_rest(0):
+            self._place(self._probe, 0, piece, row)
+            if self._probe.world.at_rest(0):
                 return row
         return None
 
-    def _place(self, plant: Plant, rig: int, row: int) -> None:
-        parts = self._parts[self._stated[row] :][: len(self._parameters.scene.parts)]
+    def _place(self, plant: Plant, rig: int, piece: _Piece, row: int) -> None:
+        parts = piece.parts[piece.stated[row] :][: len(self._parameters.scene.parts)]
         poses = list(zip(*(parts[name].tolist() for name in ("x", "y", "z", "yaw")), strict=True))
-        plant.place(rig, self._position[row], self._velocity[row], poses, int(self._held[row]))
+        state = piece.states[row]
+        plant.place(rig, state["position"], state["velocity"], poses, int(piece.held[row]))
 
-    def _part_deviation(self, plant: Plant, rigs: Ints, rows: Ints) -> Floats:
+    def _part_deviation(self, piece: _Piece, plant: Plant, rigs: Ints, rows: Ints) -> Floats:
         """Largest distance of a part from where it was recorded, m, infinite where another part is held, (K,)."""
         world = plant.world
-        off = np.where(world.held[rigs] == self._held[rows], 0.0, np.inf)
-        stated = np.flatnonzero(self._stated[rows] >= 0)
+        off = np.where(world.held[rigs] == piece.held[rows], 0.0, np.inf)
+        stated = np.flatnonzero(piece.stated[rows] >= 0)
         count = len(self._parameters.scene.parts)
         if stated.size and count:
-            recorded = self._parts[self._stated[rows[stated]][:, np.newaxis] + np.arange(count)]
+            recorded = piece.parts[piece.stated[rows[stated]][:, np.newaxis] + np.arange(count)]
             for name, simulated in (("x", world.x), ("y", world.y), ("z", world.z)):
                 distance = np.abs(simulated[:count, rigs[stated]].T - recorded[name]).max(axis=1)
                 off[stated] = np.maximum(off[stated], distance)

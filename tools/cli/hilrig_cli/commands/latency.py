@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +10,8 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
-    from hilrig_replay.latency import LatencyReport, Statistics
+    from hilrig_replay.distribution import Statistics
+    from hilrig_replay.latency import LatencyReport
 
 
 def latency(
@@ -55,7 +55,7 @@ def latency(
         if plot is not None:
             save_plot(report, run, plot)
         # Of many runs only the figures are kept.
-        reports.append(replace(report, table=report.table[:0].copy()))
+        reports.append(report.without_table())
     if as_json:
         many = {"runs": [each.as_dict() for each in reports], "unreadable": unreadable}
         print(json.dumps(reports[0].as_dict() if len(paths) == 1 else many))
