@@ -47,7 +47,8 @@ def test_tables_hold_every_row_with_a_column_a_number(recording: Path, tmp_path:
 
 
 def test_a_table_has_no_column_that_is_a_code(recording: Path) -> None:
-    states = table(open_run(recording), "state")
+    run = open_run(recording)
+    states = table(run, run.states)
     assert {str(states.schema.field(name).type) for name in ("session", "held_part")} == {"string"}
 
 

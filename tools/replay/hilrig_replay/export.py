@@ -1,6 +1,8 @@
 """A recording for other tools: an MCAP that draws itself in Foxglove and rerun, tables for pandas and MATLAB."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,10 +18,13 @@ from numpy.typing import NDArray
 from hilrig_recorder.channels import encode_message, file_descriptor_set
 from hilrig_recorder.writer import RunWriter
 from hilrig_replay import foxglove_messages as foxglove
-from hilrig_replay.columns import Rows
-from hilrig_replay.run import Run
+from hilrig_replay.columns import Names, Rows
+from hilrig_replay.recording_file import RawMessage
+from hilrig_replay.records import Decoder, Records, join_records
+from hilrig_replay.run import ALL, BLOCK_ROWS, Run
 from hilrig_replay.scene import ArmPicture, read_arm
 from hilrig_replay.shapes import Solid, fixed_joints, solids_of
+from hilrig_replay.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event
 
@@ -28,11 +33,11 @@ _STILL_PERIOD: Final = 500
 """What does not move is said again every so many states, for players that start in the middle."""
 _VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
 
-TABLES: Final[dict[str, Callable[[Run], Rows]]] = {
-    "state": lambda run: run.states,
-    "command": lambda run: run.commands,
-    "event": lambda run: run.events,
-    "traffic": lambda run: run.traffic,
+TABLES: Final[dict[str, Callable[[Records], Rows]]] = {
+    "state": lambda records: records.states,
+    "command": lambda records: records.commands,
+    "event": lambda records: records.events,
+    "traffic": lambda records: records.traffic,
 }
 """Tables of a recording, by name."""
 _TEXT_CODES: Final = frozenset({"session", "held_part", "controller", "part"})
@@ -43,12 +48,11 @@ DRAFT_SUFFIX: Final = ".exporting"
 """What an export is called until it is whole."""
 
 
-def table(run: Run, name: str) -> pa.Table:
-    """One of `TABLES` with a column a number: SI units as in the schemas, `time_s` from the run's first state.
+def table(run: Run, rows: Rows) -> pa.Table:
+    """Rows of one of `TABLES` with a column a number: SI units as in the schemas, `time_s` from the run's first state.
 
     A joint vector becomes four columns, named after the joints.
     """
-    rows = TABLES[name](run)
     columns: dict[str, Any] = {"time_s": run.time_s(rows)}
     for field in rows.dtype.names or ():
         values = rows[field]
@@ -72,19 +76,24 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
     Raises:
         OperationError: the folder can't be written.
     """
-    written = []
+    paths = {name: folder / f"{name}.{kind}" for name in TABLES}
+    nothing = join_records([])
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in TABLES:
-            path = folder / f"{name}.{kind}"
-            if kind == "csv":
-                pyarrow.csv.write_csv(table(run, name), path)
-            else:
-                pyarrow.parquet.write_table(table(run, name), path)
-            written.append(path)
+        with ExitStack() as closing:
+            writers: dict[str, Any] = {}
+            for name, rows_of in TABLES.items():
+                schema = table(run, rows_of(nothing)).schema
+                to = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
+                writers[name] = closing.enter_context(to(paths[name], schema))
+            for block in run.blocks():
+                for name, rows_of in TABLES.items():
+                    rows = rows_of(block)
+                    if len(rows):
+                        writers[name].write_table(table(run, rows))
     except OSError as error:
         raise OperationError(f"{folder}: can't be written: {error.strerror or error}") from error
-    return written
+    return list(paths.values())
 
 
 # -- a file that draws itself ---------------------------------------------------------------------------------------
@@ -142,14 +151,16 @@ def export_foxglove(run: Run, path: Path) -> Path:
 
 
 def _copy(run: Run, writer: RunWriter, drawing: "_Drawing", channel_ids: dict[str, int]) -> None:
-    topics = frozenset({"state", "command", "event", "traffic"})
-    for topic, sequence, log_ns, publish_ns, payload in run.file.messages(topics):
-        channel_id = channel_ids[f"/{topic}"]
-        writer.add(encode_message(channel_id, sequence, log_ns, publish_ns, payload))
-        if topic == "state":
-            drawing.state(log_ns)
-        elif topic == "event":
-            drawing.event(log_ns, Event.FromString(payload))
+    messages = run.file.messages(ALL)
+    while block := list(islice(messages, BLOCK_ROWS)):
+        drawing.expect(block)
+        for topic, sequence, log_ns, publish_ns, payload in block:
+            channel_id = channel_ids[f"/{topic}"]
+            writer.add(encode_message(channel_id, sequence, log_ns, publish_ns, payload))
+            if topic == "state":
+                drawing.state(log_ns)
+            elif topic == "event":
+                drawing.event(log_ns, Event.FromString(payload))
 
 
 class _Drawing:
@@ -173,10 +184,18 @@ class _Drawing:
         self._still = fixed_joints(run.urdf)
         self._scene = _scene(solids)
         self._clouds = list(_clouds(solids))
-        positions = run.states["position"]
-        self._moved = [joint.transforms(positions[:, number]) for number, joint in enumerate(arm.joints)]
-        self._stamps = run.states["wall_ns"]
-        self._next = 0
+        self._drawn = 0
+        self._moved: Iterator[Any] = iter(())
+
+    def expect(self, messages: Iterable[RawMessage]) -> None:
+        """Find how the arm stands in each of the states that come next."""
+        decoder = Decoder(Names(), Timebase())
+        for topic, sequence, log_ns, _, payload in messages:
+            if topic == "state":
+                decoder.add(topic, payload, sequence, log_ns)
+        states = decoder.take().states
+        frames = (joint.transforms(states["position"][:, number]) for number, joint in enumerate(self._arm.joints))
+        self._moved = zip(states["wall_ns"].tolist(), *(zip(*both, strict=True) for both in frames), strict=True)
 
     def declare(self) -> None:
         """Write the schemas and channels."""
@@ -199,12 +218,12 @@ class _Drawing:
 
     def state(self, log_ns: int) -> None:
         """Draw the next state."""
-        at, self._next = self._next, self._next + 1
-        stamp = int(self._stamps[at])
+        stamp, *moved = next(self._moved)
         message = foxglove.FrameTransforms()
-        for joint, (translations, quaternions) in zip(self._arm.joints, self._moved, strict=True):
-            _transform(message, stamp, joint.parent, joint.child, translations[at], quaternions[at])
-        if at % _STILL_PERIOD == 0:
+        for joint, (translation, quaternion) in zip(self._arm.joints, moved, strict=True):
+            _transform(message, stamp, joint.parent, joint.child, translation, quaternion)
+        self._drawn += 1
+        if self._drawn % _STILL_PERIOD == 1:
             nowhere, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
             if self._arm.root != WORLD:
                 _transform(message, stamp, WORLD, self._arm.root, nowhere, unturned)
