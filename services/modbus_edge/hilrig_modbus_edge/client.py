@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 from typing import Final
 
-Served = tuple[int, int, int, int, int]
-"""A state that a controller was shown, which is what its next write is based on: the incarnation of the simulation that
-sent it, its step, when it came to the edge and when it was read (ns, monotonic clock), and the delay added on purpose
-on its way (ns). A plain tuple, for one is made with each read."""
+Basis = tuple[int, int, int, int]
+"""Which state a write is based on: the incarnation of the simulation that sent it, its step, when it came to the edge
+(ns, monotonic clock), and the delay added on purpose on its way (ns). Who are shown one state share one such tuple."""
 
-NO_BASIS: Final[Served] = (0, 0, 0, 0, 0)
+Served = tuple[Basis, int]
+"""A state that a controller was shown, and when (ns, monotonic clock). A plain tuple, for each read makes one."""
+
+NO_BASIS: Final[Served] = ((0, 0, 0, 0), 0)
 """Nothing was shown."""
 
 

@@ -46,7 +46,8 @@ class Commander:
         self._way: Line[tuple[TorqueCommand, bytes]] | None = None
         """Commands on an impaired way, each with its torque registers; None: every command leaves at once."""
         self._standing_torque = bytes(8)
-        self._session_told = ""
+        self._seq = 0
+        self._session_is_told = True
         # Whose word it is and what it was based on: most writes change neither.
         self._writer: Client | None = None
         self._basis: Served = NO_BASIS
@@ -73,7 +74,9 @@ class Commander:
 
     @session.setter
     def session(self, session: str) -> None:
-        self._message.session = session
+        if session != self._message.session:
+            self._message.session = session
+            self._session_is_told = False
 
     def zero(self) -> None:
         """No torque, from the next command on."""
@@ -101,17 +104,14 @@ class Commander:
         before = self._basis
         if basis is not before:
             self._basis = basis
-            if basis[:3] == before[:3] and basis[4] == before[4]:
-                # The same state, read again.
-                message.state_served_ns = basis[3]
-            else:
+            state, message.state_served_ns = basis
+            if state is not before[0]:
                 (
                     message.basis_incarnation,
                     message.basis_step,
                     message.state_arrived_ns,
-                    message.state_served_ns,
                     message.state_injected_ns,
-                ) = basis
+                ) = state
         message.write_arrived_ns = arrived_ns
         if self._way is not None:
             return self._set_out(self._way)
@@ -133,7 +133,7 @@ class Commander:
 
     def say_session(self) -> None:
         """Let the simulation know of a session that began with a write that moved nothing."""
-        if self._message.session != self._session_told:
+        if not self._session_is_told:
             self.say()
 
     def repeat_if_due(self, now_ns: int) -> None:
@@ -203,8 +203,9 @@ class Commander:
     def _fill(self) -> None:
         message = self._message
         self._effort[:] = codec.effort_of(self.torque)
-        message.seq += 1
-        self._session_told = message.session
+        self._seq += 1
+        message.seq = self._seq
+        self._session_is_told = True
 
     def _send(self) -> None:
         self._fill()

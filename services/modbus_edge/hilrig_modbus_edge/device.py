@@ -18,7 +18,7 @@ from hilrig_modbus_edge.errors import ModbusError
 from hilrig_modbus_edge.image import StateImage
 from hilrig_modbus_edge.impaired_loop import ImpairedLoop
 from hilrig_modbus_edge.journal import Journal, times
-from hilrig_modbus_edge.registers import Status, Table
+from hilrig_modbus_edge.registers import PAPER_END, POSITION, Status, Table
 from hilrig_modbus_edge.session import Session
 from hilrig_modbus_edge.settings import MS, DeviceSettings, Outlet
 from hilrig_modbus_edge.tenure import Tenure
@@ -27,6 +27,8 @@ from hilrig_runtime.clock import Clock
 from hilrig_runtime.service import Arrival
 from hilrig_schemas import Event, LeaseStatus
 
+# A name in an enumeration is looked up by a function; what each request asks for is looked up once.
+_INPUT_REGISTER: Final = Table.INPUT_REGISTER
 HOSTS_KEPT: Final = 64
 """Hosts remembered though they have no connection now."""
 
@@ -102,15 +104,17 @@ class Device:
             ModbusError: 02 where there is no such register, 04 where no state has come yet.
         """
         end = address + count
-        if table is Table.INPUT_REGISTER:
+        if table is _INPUT_REGISTER:
             if end > registers.INPUT_END:
                 raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
             return self._input_image(client)[2 * address : 2 * end]
-        if end <= registers.POSITION:
+        if end <= POSITION:
             return bytes(self._commander.torque[2 * address : 2 * end])
-        if end <= registers.PAPER_END:
+        if end <= PAPER_END:
             positions = self._show(client).position_words
-            return (bytes(self._commander.torque) + positions)[2 * address : 2 * end]
+            if address >= POSITION:
+                return positions[2 * (address - POSITION) : 2 * (end - POSITION)]
+            return bytes(self._commander.torque[2 * address :]) + positions[: 2 * (end - POSITION)]
         if address >= registers.ECHO and end <= registers.EXTENDED_END:
             image = self._commander.echo.to_bytes(2, "big") + (self.watchdog.timeout_ns // MS).to_bytes(2, "big")
             return image[2 * (address - registers.ECHO) : 2 * (end - registers.ECHO)]
@@ -140,9 +144,9 @@ class Device:
             ModbusError: 02 where there is no such register, 04 where no state has come yet.
         """
         end = address + count
-        if end > registers.PAPER_END and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
+        if end > PAPER_END and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        if registers.POSITION < end <= registers.PAPER_END and self._look().arrival is None:
+        if POSITION < end <= PAPER_END and self._look().arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
 
     # -- writes
@@ -154,7 +158,7 @@ class Device:
             ModbusError: 02 otherwise.
         """
         end = address + count
-        if end > registers.POSITION and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
+        if end > POSITION and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
     def write_registers(self, client: Client, address: int, words: bytes, arrived_ns: int) -> None:
@@ -165,7 +169,7 @@ class Device:
                 06 another controller holds the rig, 01 this one may only read.
         """
         end = address + len(words) // 2
-        if end <= registers.POSITION:
+        if end <= POSITION:
             fed_ns = self.watchdog.fed_ns
             self._tenure.accept(client, arrived_ns)
             self._commander.torque[2 * address : 2 * end] = words
@@ -265,7 +269,7 @@ class Device:
         if state.arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
         # Stamped after the look at the bus: a state is never shown before it came.
-        client.shown((state.incarnation, state.step, state.arrived_ns, self._monotonic_ns(), state.injected_ns))
+        client.shown((state.basis, self._monotonic_ns()))
         return state
 
     def _input_image(self, client: Client) -> bytes:

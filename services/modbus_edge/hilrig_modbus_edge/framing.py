@@ -13,6 +13,7 @@ MIN_LENGTH: Final = 2
 """Unit and function code."""
 MAX_LENGTH: Final = 254
 """Unit and the longest PDU, 253 bytes."""
+MIN_FRAME: Final = 6 + MIN_LENGTH
 MAX_FRAME: Final = 6 + MAX_LENGTH
 
 

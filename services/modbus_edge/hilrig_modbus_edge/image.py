@@ -9,6 +9,7 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_modbus_edge import codec
+from hilrig_modbus_edge.client import NO_BASIS, Basis
 from hilrig_modbus_edge.registers import MAP_VERSION, Status
 from hilrig_runtime.service import Arrival
 from hilrig_schemas import JointState
@@ -26,10 +27,9 @@ class StateImage:
         self.arrival: Arrival | None = None
         """What it was made from; None: no state has come yet, and all else is zero."""
         self.arrived_ns = 0
-        self.injected_ns = 0
-        """Delay added on purpose since it arrived, ns."""
-        self.incarnation = 0
         self.step = 0
+        self.basis: Basis = NO_BASIS[0]
+        """What a write is based on whose controller was shown this."""
         self.position_words = bytes(8)
         self._message = JointState()
         self._saturated = False
@@ -49,9 +49,8 @@ class StateImage:
         self.arrival = arrival
         self._message = message
         self.arrived_ns = arrival.arrived_ns
-        self.injected_ns = arrival.injected_ns
-        self.incarnation = message.incarnation
         self.step = message.step
+        self.basis = message.incarnation, self.step, arrival.arrived_ns, arrival.injected_ns
         self.position_words, self._saturated = codec.words_of_position(position)
         if message.loop_latency_ns:
             self._latency_us = min(message.loop_latency_ns // 1000, 0xFFFFFFFF)

@@ -28,6 +28,10 @@ MAX_WRITE_REGISTERS: Final = 123
 MAX_READ_WRITE_REGISTERS: Final = 121
 """Quantity limits of the specification; the last is of the written registers in function 23."""
 
+# A name in an enumeration is looked up by a function; what each request asks for is looked up once.
+_HOLDING_REGISTER: Final = Table.HOLDING_REGISTER
+_INPUT_REGISTER: Final = Table.INPUT_REGISTER
+_FUNCTION_SIZE: Final = struct.Struct(">BB")
 _ADDRESS_WORD: Final = struct.Struct(">BHH")
 _ADDRESS_BLOCK: Final = struct.Struct(">BHHB")
 _MASK: Final = struct.Struct(">BHHH")
@@ -51,9 +55,9 @@ IDENTITY: Final = {
 def answer(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     """Execute a request's PDU (at least the function code) and give the answer's; a refusal is an answer too."""
     handler = _HANDLERS.get(request[0])
+    if handler is None:
+        return exception(request[0], ExcCodes.ILLEGAL_FUNCTION)
     try:
-        if handler is None:
-            raise ModbusError(ExcCodes.ILLEGAL_FUNCTION)
         return handler(device, client, request, arrived_ns)
     except ModbusError as error:
         return exception(request[0], error.code)
@@ -66,8 +70,8 @@ def exception(function: int, code: int) -> bytes:
 
 def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_REGISTERS)
-    table = Table.HOLDING_REGISTER if function == 0x03 else Table.INPUT_REGISTER
-    return bytes((function, 2 * count)) + device.read_registers(client, table, address, count)
+    table = _HOLDING_REGISTER if function == 0x03 else _INPUT_REGISTER
+    return _FUNCTION_SIZE.pack(function, 2 * count) + device.read_registers(client, table, address, count)
 
 
 def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001

@@ -17,7 +17,7 @@ from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.client import Client, address_of
 from hilrig_modbus_edge.device import Device
-from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, MAX_LENGTH, MIN_LENGTH, Request, split
+from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, MIN_FRAME, Request, split
 from hilrig_modbus_edge.pdu import answer, exception
 from hilrig_modbus_edge.registers import UNIT_IDS
 from hilrig_modbus_edge.throttle import Throttle
@@ -34,7 +34,11 @@ SLICE: Final = 16
 """Requests of one connection before the others have their turn; the TCP guide's limit of transactions, too."""
 BACKLOG: Final = 128
 REFUSAL_PERIOD_NS: Final = 1_000_000_000
+_PDU: Final = HEADER.size
+"""Where it begins in a frame."""
 _TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
+
+_pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
 
 logger = logging.getLogger(__name__)
 
@@ -167,6 +171,8 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = transport
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
+        self._note = server.traffic.note
+        self._counters = server.counters
         self._buffer = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buffer)
         self._filled = 0
@@ -189,20 +195,20 @@ class Connection(asyncio.BufferedProtocol):
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
         """See `asyncio.BufferedProtocol`."""
-        return self._view[self._filled :]
+        return self._view[self._filled :] if self._filled else self._view
 
     def buffer_updated(self, nbytes: int) -> None:
         """See `asyncio.BufferedProtocol`."""
         now_ns = self._monotonic_ns()
-        filled = self._filled + nbytes
-        if filled >= HEADER.size and not self._filled and not self._waiting:
+        if MIN_FRAME <= nbytes <= MAX_FRAME and not self._filled and not self._waiting:
             # By far the most common: exactly one request. It takes the short way; what it means is the same.
-            transaction, protocol, length, unit = HEADER.unpack_from(self._buffer)
-            if filled == 6 + length and not protocol and MIN_LENGTH <= length <= MAX_LENGTH:
+            transaction, protocol, length, unit = _unpack_header(self._buffer)
+            if nbytes == 6 + length and not protocol:
                 self.client.heard(now_ns)
-                pdu = bytes(self._view[HEADER.size : filled])
+                pdu = self._view[_PDU:nbytes].tobytes()
                 self._transport.write(self._reply(transaction, unit, pdu, now_ns))
                 return
+        filled = self._filled + nbytes
         requests, used, malformed = split(self._buffer[:filled])
         self._filled = filled - used
         if self._filled:
@@ -269,10 +275,9 @@ class Connection(asyncio.BufferedProtocol):
         client = self.client
         reply = answer(self._device, client, pdu, arrived_ns) if unit in UNIT_IDS else exception(pdu[0], _TARGET_SILENT)
         code = reply[1] if reply[0] & 0x80 else 0
-        server = self._server
-        server.traffic.note(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
-        server.counters.requests += 1
-        return HEADER.pack(transaction, 0, len(reply) + 1, unit) + reply
+        self._note(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
+        self._counters.requests += 1
+        return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
 
     def _close_malformed(self, why: str) -> None:
         self._server.count_malformed(self.client, why)

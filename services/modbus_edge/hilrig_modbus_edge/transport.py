@@ -1,27 +1,27 @@
 """TCP connections that the loop's selector serves itself, without asyncio's way around each event.
 
 asyncio puts a handle into a queue for every socket that is ready, then runs it in a context, then asks the transport,
-then the protocol: as much time as a Modbus request takes. Here a socket that is ready is read, answered and looked at
-again where the selector finds it; only what is asyncio's own goes back to asyncio.
+then the protocol: as much time as a Modbus request takes. Here a socket that is ready is read and answered where the
+selector finds it, and the selector waits on; asyncio has its turn when there is something for it to do.
 """
 
 import asyncio
 import logging
-import math
 import os
 import select
 import selectors
 import socket
 from collections.abc import Callable
+from contextvars import Context
 from selectors import EVENT_READ, EVENT_WRITE
-from typing import Any, Final
+from time import monotonic
+from typing import Any, Final, TypeVarTuple
 
-TURN: Final = 16
-"""Events served in a row before asyncio's own have their turn."""
 HIGH_WATER: Final = 65_536
 LOW_WATER: Final = 16_384
 """Bytes that wait to be sent: above the one the protocol is told to pause, below the other to go on."""
 
+_Args = TypeVarTuple("_Args")
 _Events = list[tuple[selectors.SelectorKey, int]]
 _Ready = list[tuple[int, int]]
 """Handles and what they are ready for, as the system says it."""
@@ -34,6 +34,8 @@ class DirectSelector(selectors.DefaultSelector):
 
     def __init__(self) -> None:
         super().__init__()
+        self.asyncio_has_work = False
+        """Something was asked of asyncio since it began to wait: it must have its turn before it waits on."""
         self._calls: dict[int, Callable[[int], None]] = {}
         """By handle, what to call with the events."""
         self._poll: Callable[[float], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
@@ -53,13 +55,13 @@ class DirectSelector(selectors.DefaultSelector):
         return key
 
     def select(self, timeout: float | None = None) -> _Events:
-        """See `selectors.BaseSelector.select`."""
+        """See `selectors.BaseSelector.select`; what is called meanwhile does not end the wait."""
         poll, call_of = self._poll, self._calls.get
-        # Never too early: asyncio would come back at once, and again.
-        ready = poll(-1 if timeout is None else math.ceil(timeout * 1e3) * 1e-3 if timeout > 0 else 0)
-        served = 0
-        while ready:
-            others: _Events = []
+        deadline_s = None if timeout is None else monotonic() + timeout
+        others: _Events = []
+        self.asyncio_has_work = False
+        while True:
+            ready = poll(-1 if timeout is None else timeout if timeout > 0 else 0)
             for handle, mask in ready:
                 call = call_of(handle)
                 # By far the most often there is something to read and nothing else.
@@ -68,11 +70,12 @@ class DirectSelector(selectors.DefaultSelector):
                     call(events)
                 elif (key := self.get_map().get(handle)) is not None and events & key.events:
                     others.append((key, events & key.events))
-            served += len(ready)
-            if others or served >= TURN:
+            if others or self.asyncio_has_work or not ready:
                 return others
-            ready = poll(0)
-        return []
+            if deadline_s is not None:
+                timeout = deadline_s - monotonic()
+                if timeout <= 0:
+                    return others
 
     def _super_poll(self, timeout: float) -> _Ready:
         return [(key.fd, events) for key, events in super().select(None if timeout < 0 else timeout)]
@@ -100,6 +103,20 @@ class DirectLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         self.direct = DirectSelector()
         super().__init__(self.direct)
+
+    def call_soon(
+        self, callback: Callable[[*_Args], object], *args: *_Args, context: Context | None = None
+    ) -> asyncio.Handle:
+        """See `asyncio.loop.call_soon`."""
+        self.direct.asyncio_has_work = True
+        return super().call_soon(callback, *args, context=context)
+
+    def call_at(
+        self, when: float, callback: Callable[[*_Args], object], *args: *_Args, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """See `asyncio.loop.call_at`; `call_later` is this, too."""
+        self.direct.asyncio_has_work = True
+        return super().call_at(when, callback, *args, context=context)
 
 
 class DirectTransport(asyncio.Transport):
