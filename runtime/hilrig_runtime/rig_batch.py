@@ -26,6 +26,8 @@ class BatchSender:
         self._counters = counters
         self._source = source
         self._rigs: list[str] = []
+        self._head = b""
+        """What all batches begin with, encoded."""
         self._keys: list[str] = []
         self._puts: list[Callable[[bytes], None]] = []
         self._sequences: list[int] = []
@@ -36,17 +38,22 @@ class BatchSender:
         self._keys.append(key)
         self._puts.append(publisher.put)
         self._sequences.append(0)
+        self._regroup()
 
     def remove(self, index: int) -> None:
         """Send no more for a rig; those behind it move up."""
         del self._rigs[index], self._keys[index], self._puts[index], self._sequences[index]
+        self._regroup()
+
+    def _regroup(self) -> None:
+        self._head = RigBatch(source=self._source, rigs=self._rigs).SerializeToString()
 
     def send(self, payloads: Sequence[bytes]) -> None:
         """Publish and record the encoded messages of all rigs, in the order in which the rigs were added."""
         # Anew each time: what a protobuf message has once held it keeps until it is gone itself.
-        batch = RigBatch(source=self._source, rigs=self._rigs, messages=payloads)
+        batch = RigBatch(messages=payloads)
         wall_ns = self._wall_ns()
-        self._put_together(batch.SerializeToString())
+        self._put_together(self._head + batch.SerializeToString())
         for put, payload in zip(self._puts, payloads, strict=True):
             put(payload)
         self._sequences = [sequence + 1 for sequence in self._sequences]

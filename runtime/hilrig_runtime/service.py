@@ -9,6 +9,8 @@ through typed ends made here: `sender` encodes once and gives the same bytes to 
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
+from itertools import repeat
 from types import MappingProxyType, TracebackType
 from typing import Final, Generic, NamedTuple, Self, TypeVar
 
@@ -40,6 +42,10 @@ class Arrival(NamedTuple):
     """For how long it was held up on purpose after that, ns."""
 
 
+# Of an iterable of its values. The class's own ways are functions of the interpreter, which take three times as long.
+_arrival_of: Final[Callable[[tuple[bytes, int, int]], Arrival]] = partial(tuple.__new__, Arrival)
+
+
 class LatestOfBatches:
     """The newest message of each rig, out of batches.
 
@@ -66,18 +72,19 @@ class LatestOfBatches:
         except DecodeError:
             self._counters.malformed += 1
             return
-        if len(batch.rigs) != len(batch.messages):
+        # Taken as lists at once: to go through repeated fields one by one takes longer than all the rest.
+        rigs, messages = batch.rigs[:], batch.messages[:]
+        if len(rigs) != len(messages):
             self._counters.malformed += 1
             return
-        arrivals = (
-            (rig, Arrival(message, arrived_ns)) for rig, message in zip(batch.rigs, batch.messages, strict=True)
-        )
+        arrivals = zip(rigs, map(_arrival_of, zip(messages, repeat(arrived_ns), repeat(0), strict=False)), strict=True)
         if self._permitted:
-            rigs = self._permitted.get(key.rpartition("/")[2], ())
-            arrivals = ((rig, arrival) for rig, arrival in arrivals if rig in rigs)
-        self._by_rig.update(arrivals)
+            permitted = self._permitted.get(key.rpartition("/")[2], ())
+            self._by_rig.update((rig, arrival) for rig, arrival in arrivals if rig in permitted)
+        else:
+            self._by_rig.update(arrivals)
         self.arrived_ns = arrived_ns
-        self._counters.received += len(batch.messages)
+        self._counters.received += len(messages)
 
 
 class Sender(Generic[MessageT]):

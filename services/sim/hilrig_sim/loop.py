@@ -26,7 +26,7 @@ from hilrig_sim.rig_state import RigState, loop_bytes, motion_bytes
 
 MANY: Final = 16
 """Rigs from which on it pays to wake up before the tick."""
-AHEAD: Final = (8, 32)
+AHEAD: Final = (4, 12, 40)
 """Which parts of a step before it: first for all, then for those whose commands came meanwhile."""
 ENOUGH: Final = 100
 """So small a part of a step before the tick nothing more is begun: the tick must not be late."""
@@ -149,14 +149,18 @@ class Simulation:
 
     def _after_sending(self, latencies_ns: Mapping[int, int]) -> None:
         """Hand the efforts to the plant, and tell of commands that were lost."""
+        changed = []
         for rig in self._rigs:
             follower = rig.follower
             rig.sent(latencies_ns[rig.basis_step])
             if follower.changed:
-                self._effort[:, rig.index] = follower.effort
-                self._magnet[rig.index] = follower.magnet
+                changed.append((rig.index, follower.effort, follower.magnet))
             if follower.lost or follower.back or follower.reset:
                 self._reporter.tell_of_commands(rig.index, follower, self._step)
+        if changed:
+            indices, efforts, magnets = zip(*changed, strict=True)
+            self._effort[:, indices] = np.array(efforts).T
+            self._magnet[[*indices]] = magnets
 
     @property
     def parameters(self) -> tuple[RigParameters, ...]:
