@@ -65,3 +65,13 @@ def test_controllers_beyond_the_first_are_counted_together() -> None:
     found = counted([np.concatenate(rows)], names)
     assert len(found) == MOST + 1
     assert found[OTHERS, "reads"] == {0: 50}
+
+
+def test_texts_beyond_what_a_code_can_tell_apart_share_the_last_one() -> None:
+    names = Names()
+    codes = [names.code(f"192.0.2.7:{port}") for port in range(70_000)]
+    assert codes[:3] == [1, 2, 3]
+    assert max(codes) == 0xFFFF
+    assert (names[codes[65_533]], names[codes[65_534]]) == ("192.0.2.7:65533", Names.OTHERS)
+    assert names.code("192.0.2.7:5") == codes[5]
+    assert codes[65_534:] == [0xFFFF] * (70_000 - 65_534)

@@ -119,18 +119,28 @@ PART: Final = np.dtype(
 
 
 class Names:
-    """Texts that repeat in a recording, as numbers: code 0 is the empty text."""
+    """Texts that repeat in a recording, as numbers: code 0 is the empty text.
+
+    There are as many as a code of 16 bits can tell apart; later ones share the last. A controller that connects anew
+    for each request has another address each time.
+    """
+
+    MOST: Final = 1 << 16
+    OTHERS: Final = "others"
 
     def __init__(self) -> None:
         self._codes: dict[str, int] = {"": 0}
         self._texts: list[str] = [""]
 
     def code(self, text: str) -> int:
-        """Number of a text; a new text gets the next one."""
+        """Number of a text; a new text gets the next one, or the last one where none is left."""
         code = self._codes.get(text)
         if code is None:
-            code = self._codes[text] = len(self._texts)
-            self._texts.append(text)
+            code = len(self._texts)
+            if code == self.MOST:
+                return code - 1
+            self._codes[text] = code
+            self._texts.append(text if code < self.MOST - 1 else self.OTHERS)
         return code
 
     def __getitem__(self, code: int) -> str:

@@ -70,10 +70,12 @@ class Decoder:
         self._decoders = self._fresh()
 
     def _fresh(self) -> dict[str, Decode]:
+        # Not by way of `self`: a decoder that held itself would keep its tables until the next collection.
+        events = self._events
         return {
             "state": state_decoder(self._states, self._parts, self._names),
             "command": command_decoder(self._commands, self._names),
-            "event": lambda payload, *_: self._events.append(_event_row(payload)),
+            "event": lambda payload, *_: events.append(_event_row(payload)),
             "traffic": traffic_decoder(self._traffic, self._names),
         }
 

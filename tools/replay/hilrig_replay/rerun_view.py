@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import rerun as rr
 
@@ -12,6 +13,9 @@ from hilrig_replay.rig_view import Drawn, RigView
 from hilrig_replay.run import Run
 from hilrig_replay.streams import to_file
 from hilrig_runtime.errors import InputError
+
+ROWS: Final = 40_000
+"""Messages that are written at once, count: the fewer the pieces, the smaller the index that rerun makes of a file."""
 
 
 def drawn(run: Run) -> Drawn:
@@ -47,7 +51,7 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
 def write_run(stream: rr.RecordingStream, run: Run, *, root: str = "", color: str | None = None) -> None:
     """Write one run into a rerun recording, a block at a time."""
     view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
-    for block in run.blocks():
+    for block in run.blocks(rows=ROWS):
         view.add(block)
     view.end()
 

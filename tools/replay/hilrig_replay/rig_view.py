@@ -32,7 +32,7 @@ from hilrig_replay.palette import (
     rgb,
 )
 from hilrig_replay.records import Records
-from hilrig_replay.request_rates import BIN_NS, Rate, RequestRates
+from hilrig_replay.request_rates import BIN_NS, MOST, OTHERS, Rate, RequestRates
 from hilrig_replay.rerun_layout import SIM_TIME, STEP, WALL, arm_path
 from hilrig_replay.samples import STAGES, Matcher, join_commands
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
@@ -334,13 +334,18 @@ class RigView:
             self._holder = str(source[-1])
         source[states["command_seq"] == 0] = _NOBODY
         source[states["safe"]] = _SAFE
-        self._color_holders(source)
+        self._tell_apart(source)
         return source
 
-    def _color_holders(self, holders: NDArray[np.object_]) -> None:
-        new = set(holders) - {""} - self._holders.keys()
+    def _tell_apart(self, holders: NDArray[np.object_]) -> None:
+        """Give each holder a colour; those beyond the first `MOST` are one, as their requests are."""
+        new = sorted(set(holders) - {""} - self._holders.keys())
+        room = max(MOST - len(self._holders), 0)
+        if new[room:]:
+            holders[[holder in new[room:] for holder in holders]] = OTHERS
+            new = new[:room] if OTHERS in self._holders else [*new[:room], OTHERS]
         if new:
-            for holder in sorted(new):
+            for holder in new:
                 self._holders[holder] = RUN_COLORS[len(self._holders) % len(RUN_COLORS)]
             self._lane_legend("torque", self._holders)
 

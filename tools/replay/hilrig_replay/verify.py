@@ -31,7 +31,7 @@ PARTS_TOLERANCE: Final = 1e-9
 STRETCHES: Final = 64
 SHORTEST: Final = 50
 """A stretch is not cut shorter than so many steps without need."""
-PIECE: Final = 32_768
+PIECE: Final = 16_384
 """States that are in memory at once, count."""
 
 Floats = NDArray[np.float64]

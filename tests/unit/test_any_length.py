@@ -1,0 +1,102 @@
+"""A run of three times the length takes no more memory: every command works on blocks, here made small.
+
+What Python and numpy hold is counted, the most of it at any time; `tests/rig/test_ten_hours.py` looks at processes.
+"""
+
+import gc
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hilrig_replay import (
+    compare,
+    diagnosis,
+    distribution,
+    export,
+    latency_plot,
+    rerun_view,
+    samples,
+    spool,
+    summary,
+    verify,
+)
+from hilrig_replay.index import RunIndex
+from hilrig_replay.latency import measure
+from hilrig_replay.latency_plot import latency_figure
+from hilrig_replay.run import Run, open_run
+from recordings import Script, record
+
+SHORT_S, TIMES = 30.0, 3
+ROWS = 300
+
+
+def drawn(path: Path) -> None:
+    run = open_run(path)
+    latency_figure(measure(run), run)
+
+
+COMMANDS: dict[str, Callable[[Path], object]] = {
+    "latency": lambda path: measure(open_run(path)),
+    "latency --plot": drawn,
+    # Without its pictures, which take what their lines are made of: both runs are thinned to the same points.
+    "report": lambda path: summary.summarise(open_run(path)),
+    "compare": lambda path: compare.compare([open_run(path), open_run(path)]),
+    "compare --align": lambda path: compare.origin_ns(open_run(path), "SESSION_END"),
+    "replay --save": lambda path: rerun_view.save_rrd(open_run(path), path.with_suffix(".rrd")),
+    "verify": verify.verify,
+    "export --csv": lambda path: export.export_tables(open_run(path), path.parent / path.stem, "csv"),
+    "export --parquet": lambda path: export.export_tables(open_run(path), path.parent / path.stem, "parquet"),
+    "runs --loop": lambda path: RunIndex(path.parent).measure(RunIndex(path.parent).load()),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    def made(name: str, seconds: float) -> Path:
+        return record(tmp_path_factory.mktemp(name) / "run.mcap", Script(seconds=seconds, poll_ms=20.0, delay_ms=3.0))
+
+    return made("short", SHORT_S), made("long", TIMES * SHORT_S)
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for function, name in (
+        (Run.blocks, "rows"),
+        (spool.Spool.__init__, "block"),
+        (distribution.percentiles, "gathered"),
+    ):
+        assert function.__kwdefaults__ is not None
+        monkeypatch.setitem(function.__kwdefaults__, name, ROWS)
+    monkeypatch.setattr(samples, "WINDOW", ROWS)
+    monkeypatch.setattr(verify, "PIECE", ROWS)
+    monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
+    monkeypatch.setattr(rerun_view, "ROWS", ROWS)
+    monkeypatch.setattr(summary, "COURSE_POINTS", ROWS)
+    monkeypatch.setattr(latency_plot, "_STRETCHES", ROWS)
+    monkeypatch.setattr(diagnosis, "WINDOW_S", 1.0)
+
+
+def peak(command: Callable[[Path], object], path: Path) -> int:
+    gc.collect()
+    tracemalloc.start()
+    try:
+        command(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_memory_does_not_grow_with_the_length(command: str, runs: tuple[Path, Path]) -> None:
+    # What is imported, and what libraries keep once, is not the run's.
+    COMMANDS[command](runs[0])
+    short, long = (peak(COMMANDS[command], path) for path in runs)
+    print(f"{command}: {short / 1e6:.2f} MB, {TIMES} times as long {long / 1e6:.2f} MB")
+    assert long < 1.1 * short + 50_000
+
+
+def test_what_holds_a_whole_run_would_be_found(runs: tuple[Path, Path]) -> None:
+    short, long = (peak(lambda path: open_run(path).states, path) for path in runs)
+    assert long > 1.5 * short
