@@ -51,6 +51,6 @@ if __name__ == "__main__":
     # What is there is shared with the forks, until somebody writes to it.
     gc.freeze()
     if serve():
-        from hilrig_cli.main import main
+        from hilrig_cli.__main__ import main
 
         sys.exit(main())

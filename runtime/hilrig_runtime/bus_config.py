@@ -5,7 +5,7 @@ from typing import Final, Literal
 
 from pydantic import Field, model_validator
 
-from hilrig_runtime.sections import Name, Port, Section
+from hilrig_runtime.sections import Flag, Name, Port, Section
 
 IDENTITIES: Final = ("router", "sim", "edge", "recorder", "operator", "viewer")
 """Common names of the certificates that every secured bus has; a lab may add edges of its own."""
@@ -39,7 +39,7 @@ class BusConfig(Section):
     """mesh: port of the simulation; the edge and the recorder take the next two."""
     router: str = "tcp/127.0.0.1:7447"
     """router: endpoint of the zenoh router; with [bus.tls] it begins with tls/."""
-    express: bool = False
+    express: Flag = False
     """Send each control message by itself, at the price of processor time, instead of with others that wait."""
     tls: BusTlsConfig | None = None
     """Let in only who has a certificate of the lab's."""

@@ -16,7 +16,7 @@ from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.impairment_config import ImpairmentConfig
 from hilrig_runtime.scene_config import SceneConfig
-from hilrig_runtime.sections import Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_runtime.sections import PATTERNS, Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
@@ -54,9 +54,9 @@ class ArmConfig(Section):
 class SimConfig(Section):
     """How the plant is stepped."""
 
-    step_ms: Annotated[float, Field(ge=0.5, le=1000)] = 20.0
+    step_ms: Annotated[float, Field(strict=True, ge=0.5, le=1000)] = 20.0
     """Length of a step, ms."""
-    substeps: Annotated[int, Field(ge=1, le=100)] = 1
+    substeps: Annotated[int, Field(strict=True, ge=1, le=100)] = 1
     """Integration steps in one step of the loop."""
     integrator: Literal["rkf45", "rk4", "euler"] = "rkf45"
     command_timeout_ms: NotNegative = 600.0
@@ -95,11 +95,11 @@ class EdgeConfig(Section):
     """Address to listen on; 0.0.0.0 opens the rigs to the network."""
     first_port: Port = 5020
     """Port of the first rig; the others follow, unless a rig names its own."""
-    watchdog_ms: Annotated[float, Field(ge=0, le=65535)] = 1000.0
+    watchdog_ms: Annotated[float, Field(strict=True, ge=0, le=65535)] = 1000.0
     """With the controller not writing for so long the torque goes to zero; 0: never."""
-    watchdog_min_ms: Annotated[float, Field(ge=1, le=65535)] = 100.0
+    watchdog_min_ms: Annotated[float, Field(strict=True, ge=1, le=65535)] = 100.0
     """The shortest time-out that a controller may set by register."""
-    watchdog_max_ms: Annotated[float, Field(ge=1, le=65535)] = 10_000.0
+    watchdog_max_ms: Annotated[float, Field(strict=True, ge=1, le=65535)] = 10_000.0
     """The longest."""
     lease_timeout_ms: Positive = 5000.0
     """A controller silent for so long loses the rig to whoever writes next."""
@@ -107,13 +107,13 @@ class EdgeConfig(Section):
     """A session goes on when its controller is back within so long."""
     repeat_ms: Positive = 200.0
     """How often the standing command is repeated to the simulation."""
-    max_connections: Annotated[int, Field(ge=1)] = 32
+    max_connections: Annotated[int, Field(strict=True, ge=1)] = 32
     """Connections that a rig takes."""
-    max_connections_per_host: Annotated[int, Field(ge=1)] = 16
+    max_connections_per_host: Annotated[int, Field(strict=True, ge=1)] = 16
     """Connections that a rig takes from one host."""
     idle_timeout_s: NotNegative = 60.0
     """A connection without a request for so long is closed; 0: never."""
-    plain: bool = True
+    plain: Flag = True
     """Listen without TLS; false leaves the rigs to clients with a certificate."""
     tls: TlsConfig | None = None
     """Listen with TLS too."""
@@ -134,9 +134,9 @@ class RecorderConfig(Section):
     """Recordings are `<folder>/<lab>/<rig>/<session>.mcap`."""
     preroll_s: NotNegative = 2.0
     """What a recording holds from before its session's start, s."""
-    queue_entries: Annotated[int, Field(ge=1)] = 500_000
+    queue_entries: Annotated[int, Field(strict=True, ge=1)] = 500_000
     """Messages that may wait for the disk; more are dropped and counted. The default is 20 s of 500 rigs."""
-    rotate_mib: Annotated[int, Field(ge=0)] = 1024
+    rotate_mib: Annotated[int, Field(strict=True, ge=0)] = 1024
     """A session goes on in a next file when its file is this large, MiB; 0: never."""
     rotate_min: NotNegative = 0.0
     """The same when it is this old, min; 0: never."""
@@ -144,7 +144,7 @@ class RecorderConfig(Section):
     """Recordings older than this are deleted, but never a rig's last, days; 0: none."""
     keep_gib: NotNegative = 0.0
     """The oldest are deleted when all are larger than this, but never a rig's last, GiB; 0: none."""
-    min_free_mib: Annotated[int, Field(ge=0)] = 64
+    min_free_mib: Annotated[int, Field(strict=True, ge=0)] = 64
     """With less space free on the disk recordings end, MiB."""
 
 
@@ -172,7 +172,7 @@ class RigSettings(Section):
 class RigsTable(Section):
     """A class of rigs that are alike, `[rigs]`, and single ones beside them, `[[rigs.single]]`."""
 
-    count: Annotated[int, Field(ge=1, le=MOST_RIGS)] = 1
+    count: Annotated[int, Field(strict=True, ge=1, le=MOST_RIGS)] = 1
     """How many there are; they are called <prefix>1, <prefix>2, …"""
     prefix: Name = "rig"
     allow: tuple[Network, ...] = ()
@@ -206,7 +206,7 @@ class LabConfig(Section):
     """A whole lab, as `lab.toml` describes it."""
 
     name: Name = "lab"
-    realtime: bool = True
+    realtime: Flag = True
     """Let simulation and edge go before all ordinary programs, where the system grants it (docs/operations.md)."""
     sim: SimConfig = SimConfig()
     edge: EdgeConfig = EdgeConfig()
@@ -379,7 +379,12 @@ def _sentence(mistake: Any) -> str:
     place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"]).lstrip(".")
     if mistake["type"] == "extra_forbidden":
         return f"{place}: unknown key"
+    if mistake["type"] == "missing":
+        return f"{place}: is missing"
     if mistake["type"] == "value_error":
         return f"{place}: {mistake['ctx']['error']}" if place else str(mistake["ctx"]["error"])
-    expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    if mistake["type"] == "string_pattern_mismatch":
+        expected = PATTERNS[mistake["ctx"]["pattern"]]
+    else:
+        expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
     return f"{place}: expected {expected}, found {mistake['input']!r}"

@@ -5,20 +5,25 @@ The first signal sets the wish to stop and the loop ends itself; a second one fo
 this way, so that this module imports nothing that takes time.
 """
 
+import errno
+import io
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from hilrig_runtime.errors import HilrigError
+from hilrig_runtime.errors import HilrigError, OperationError
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
 TURN_S: Final = 0.5
 """Of waiting for a signal."""
+_NO_ROOM: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""What a full or broken disk says to whoever writes."""
 
 
 def stop_on_signals(stopping: threading.Event) -> None:
@@ -73,8 +78,13 @@ def end_when_closing_hangs(stopping: threading.Event, timeout_s: float) -> None:
 
 def run_main(main: Callable[[], int | None]) -> int:
     """Run a command; turn what a person should read into one line on standard error, and an exit code."""
+    _open_output()
     try:
-        return main() or 0
+        try:
+            return main() or 0
+        finally:
+            # While its failure can still be told.
+            sys.stdout.flush()
     except HilrigError as error:
         for line in str(error).splitlines():
             print(f"hilrig: error: {line}", file=sys.stderr)
@@ -83,5 +93,27 @@ def run_main(main: Callable[[], int | None]) -> int:
         return 130
     except BrokenPipeError:
         # Whoever read our output has seen enough.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _drop_output()
         return 0
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        _drop_output()
+        where = error.filename or "the output"
+        print(f"hilrig: error: {where}: can't be written: {error.strerror}", file=sys.stderr)
+        return OperationError.exit_code
+
+
+def _open_output() -> None:
+    """Have somewhere to write, whatever the shell closed, and a sign for what its encoding can't say."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 (it stays open)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _drop_output() -> None:
+    """What is still buffered goes nowhere, so that the end of the process is quiet."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -9,15 +9,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hilrig_runtime.sections import Name, Number, Positive, Section, Vector2
-
-Colour = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")]
+from hilrig_runtime.sections import Colour, Flag, Name, Number, Positive, Section, Vector2
 
 
 class TableConfig(Section):
     """The table that the arm's pedestal and all else stands on."""
 
-    height_mm: Annotated[float, Field(lt=0, ge=-1000, allow_inf_nan=False)] = -60.0
+    height_mm: Annotated[float, Field(strict=True, lt=0, ge=-1000, allow_inf_nan=False)] = -60.0
     """World z of its top; negative, for the arm's base plane lies above it."""
     centre_mm: Vector2 = (0.0, 0.0)
     """Middle of its top: x, y."""
@@ -42,7 +40,7 @@ class PartConfig(Section):
     size_mm: tuple[Positive, Positive, Positive] = (40.0, 40.0, 30.0)
     """Length, width, height; a cylinder's length and width are both its diameter."""
     mass_kg: Positive = 0.2
-    ferromagnetic: bool = True
+    ferromagnetic: Flag = True
     """Whether the magnet holds it."""
     colour: Colour = "#c8ccd0"
     position_mm: Vector2
@@ -72,9 +70,9 @@ class TrayConfig(Section):
     yaw_deg: Number = 0.0
     size_mm: tuple[Positive, Positive, Positive] = (150.0, 150.0, 8.0)
     """Length, width, height above the table."""
-    rows: Annotated[int, Field(ge=1, le=20)] = 2
+    rows: Annotated[int, Field(strict=True, ge=1, le=20)] = 2
     """Places along its length."""
-    columns: Annotated[int, Field(ge=1, le=20)] = 2
+    columns: Annotated[int, Field(strict=True, ge=1, le=20)] = 2
     """Places along its width."""
     pitch_mm: Positive = 70.0
     """Distance between neighbouring places."""

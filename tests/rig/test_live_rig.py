@@ -47,7 +47,7 @@ def test_a_rig_is_followed_through_a_restart_of_its_simulation(tmp_path: Path) -
 def test_where_nothing_runs_it_says_so(tmp_path: Path) -> None:
     result = hilrig("live", "--config", write_lab(tmp_path), "--save", tmp_path / "live.rrd")
     assert result.returncode == 3
-    assert "no simulation of rig 'rig1' in lab 'lab' answers on the bus" in result.stderr
+    assert "no simulation of rig 'rig1' answers for lab 'lab': is it running" in result.stderr
     assert "Traceback" not in result.stderr
 
 

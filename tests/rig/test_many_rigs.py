@@ -108,9 +108,17 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
 
 
 def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusTcpClient) -> None:
-    done = hilrig("rig", "add", "guest", "--config", lab.config)
+    with socket.socket() as stranger:
+        try:
+            stranger.bind(("127.0.0.1", lab.port + 4))
+            stranger.listen()
+        except OSError:
+            # Another one has the port behind the lab's already.
+            pass
+        done = hilrig("rig", "add", "guest", "--config", lab.config)
     assert done.returncode == 0, done.stderr
     port = int(done.stdout.strip().rpartition(":")[2])
+    assert port > lab.port + 4
     with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
         assert client.connect()
         for _ in range(20):
@@ -118,6 +126,8 @@ def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusT
         eventually(lambda: client.read_holding_registers(4, count=1).registers[0] > 100, timeout_s=5)
         listed = json.loads(hilrig("rig", "list", "--json", "--config", lab.config).stdout)
         assert [(row["rig"], row["in_file"]) for row in listed][-1] == ("guest", False)
+        held = json.loads(hilrig("lease", "guest", "--json", "--config", lab.config).stdout)
+        assert held["holder"].startswith("127.0.0.1:")
         assert hilrig("rig", "reset", "guest", "--config", lab.config).returncode == 0
         assert client.connected
         assert hilrig("rig", "remove", "guest", "--config", lab.config).returncode == 0

@@ -245,7 +245,7 @@ def test_runs_of_a_class_are_ranked_by_their_grades(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("[task]\ntitle = 'x'", "task: a task needs poses, a path or parts to place"),
-        ("[[task.poses]]\nname = 'a'", "task.poses[0].position_mm: expected"),
+        ("[[task.poses]]\nname = 'a'", "task.poses[0].position_mm: is missing"),
         ("[[task.poses]]\nname = 'a'\nposition_mm = [1, 2, 3]\n" * 2, "two poses are called 'a'"),
         ("[task.path]\npoints_mm = [[1, 2, 3]]", "task.path.points_mm"),
         ("[task.path]\npoints_mm = [[1, 2, 3], [1, 2, 3]]", "points 1 and 2 of the path are the same"),

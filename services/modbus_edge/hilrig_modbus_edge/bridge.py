@@ -6,7 +6,7 @@ and events leave at once. A tick every 20 ms does what can wait that long.
 
 import asyncio
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Final
 
@@ -34,6 +34,8 @@ MANY: Final = 16
 """Rigs that are looked after at once; more than that in turns, so that no request waits for all of them."""
 MOST_TURNS: Final = 4
 """In which every rig is looked after once in a tick."""
+PORTS_TRIED: Final = 100
+"""For a rig that is added without one."""
 
 
 def run(service: Service) -> None:
@@ -108,19 +110,20 @@ class Edge:
     # -- rigs come and go
 
     def add(self, rig: RigSettings) -> str:
-        """Serve one more rig; what was done, for people.
+        """Serve one more rig, without a port of its own at the next free one; what was done, for people.
 
         Raises:
             OperationError: it is served already, or its address can't be had.
         """
         if rig.name in self._seats:
             raise OperationError(f"{rig.name!r} is served already")
-        if rig.port is None:
-            raise OperationError(f"{rig.name!r} needs a port of its own")
         seat = self._seat(rig)
         with ExitStack() as undo:
             undo.callback(seat.closing.close)
-            seat.bind(rig.port, None)
+            if rig.port is None:
+                self._bind_behind_the_others(seat)
+            else:
+                seat.bind_alone(rig.port)
             undo.pop_all()
         self._seats[rig.name] = seat
         self._answer_people(seat)
@@ -150,6 +153,18 @@ class Edge:
         """
         self._seat_of(rig).device.reset()
         return f"{rig} goes back to its start pose"
+
+    def _bind_behind_the_others(self, seat: Seat) -> None:
+        """Take the first port behind all that the lab's file gives, which nobody has: neither a rig that was added
+        before, at whichever edge, nor a stranger."""
+        lab = self._service.lab
+        first = max([*lab.ports.values(), *lab.tls_ports.values()]) + 1
+        last = min(first + PORTS_TRIED, 0x10000) - 1
+        for port in range(first, last + 1):
+            with suppress(OperationError):
+                seat.bind_alone(port)
+                return
+        raise OperationError(f"no port from {first} to {last} is free: give one with --port")
 
     def _seat_of(self, rig: str) -> Seat:
         if rig not in self._seats:

@@ -132,6 +132,10 @@ class Seat:
             self._sockets.append((listening, TlsPolicy(edge.tls)))
         self.address = ", ".join(f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in self._sockets)
 
+    def bind_alone(self, port: int) -> None:
+        """Have one address: without TLS, or with TLS where the lab listens in no other way. Raises as `bind`."""
+        self.bind(port, None if self._edge.plain else port)
+
     async def listen(self) -> None:
         """Serve controllers."""
         for listening, policy in self._sockets:

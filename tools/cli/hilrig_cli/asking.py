@@ -5,8 +5,10 @@ from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
+from hilrig_runtime.bus import Bus
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.presence import rosters
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas.topics import RigTopic
 
@@ -23,11 +25,11 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
         InputError: the lab has no such rig.
         OperationError: nobody answers, or the edge refuses.
     """
-    if rig:
-        lab.rig(rig)
     payload = question.SerializeToString()
-    deadline_s = time.monotonic() + ANSWER_WITHIN_S
     with ZenohBus(lab.bus, "tool") as bus:
+        if rig:
+            check_rig(bus, lab, rig)
+        deadline_s = time.monotonic() + ANSWER_WITHIN_S
         while not (answers := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
             time.sleep(0.05)
     for answer in answers:
@@ -36,3 +38,18 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
     if not answers:
         raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
     return [topic.decode(answer.payload) for answer in answers]
+
+
+def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
+    """See that a lab has a rig: in its file, or added since.
+
+    Raises:
+        InputError: it has not.
+    """
+    deadline_s = time.monotonic() + ANSWER_WITHIN_S
+    while all(rig != known.name for known in lab.rigs):
+        if any(rig in roster.rigs for roster in rosters(bus, lab.name)):
+            return
+        if time.monotonic() > deadline_s:
+            lab.rig(rig)
+        time.sleep(0.05)

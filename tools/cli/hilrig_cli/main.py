@@ -4,8 +4,6 @@ A command's module imports what does the work inside its function, so that `hilr
 that has one service's parts only can run that service.
 """
 
-import sys
-
 import typer
 
 from hilrig_cli.commands import (
@@ -38,7 +36,6 @@ from hilrig_cli.commands import (
     up,
     verify,
 )
-from hilrig_runtime.ending import run_main
 
 app = typer.Typer(
     name="hilrig",
@@ -98,12 +95,3 @@ def _options(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     pass
-
-
-def main() -> int:
-    """Entry point of the `hilrig` command; gives the exit code."""
-    return run_main(app)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -17,6 +17,9 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from hilrig_console.patience import Patience
+from hilrig_runtime.clock import SYSTEM_CLOCK, Clock
+
 SHORTEST_PASSWORD: Final = 8
 PAGE_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -71,9 +74,11 @@ class Guard:
 class Guarded:
     """An application behind a guard, with the headers that keep its pages to themselves."""
 
-    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+    def __init__(self, app: ASGIApp, guard: Guard, clock: Clock = SYSTEM_CLOCK) -> None:
         self._app = app
         self._guard = guard
+        self._patience = Patience()
+        self._monotonic_ns = clock.monotonic_ns
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse (ASGI)."""
@@ -89,10 +94,11 @@ class Guarded:
                 headers.update(HEADERS)
             await send(message)
 
-        refusal = self._refusal(scope["path"], Headers(scope=scope))
+        client = scope.get("client") or ("", 0)
+        refusal = self._refusal(scope["path"], Headers(scope=scope), client[0])
         await (refusal or self._app)(scope, receive, send_with_headers)
 
-    def _refusal(self, path: str, headers: Headers) -> PlainTextResponse | None:
+    def _refusal(self, path: str, headers: Headers, address: str) -> PlainTextResponse | None:
         guard = self._guard
         if not guard.is_ours(headers.get("host", "")):
             what = "this console is not called so; ask for it by its address, or start it with --name\n"
@@ -100,10 +106,20 @@ class Guarded:
         # Browsers say where a question comes from; what another site's page embeds is not for it.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             return PlainTextResponse("not for other sites\n", HTTPStatus.FORBIDDEN)
-        if path != HEALTH_PATH and not guard.knows(headers.get("authorization", "")):
-            asks = {"WWW-Authenticate": 'Basic realm="hilrig console", charset="UTF-8"'}
-            return PlainTextResponse("a password is needed\n", HTTPStatus.UNAUTHORIZED, asks)
-        return None
+        return None if path == HEALTH_PATH else self._stranger(headers.get("authorization", ""), address)
+
+    def _stranger(self, authorization: str, address: str) -> PlainTextResponse | None:
+        now_ns = self._monotonic_ns()
+        if authorization and (wait_ns := self._patience.wait_ns(address, now_ns)):
+            later = {"Retry-After": str(-(-wait_ns // 1_000_000_000))}
+            what = "too many wrong passwords from this address; try again later\n"
+            return PlainTextResponse(what, HTTPStatus.TOO_MANY_REQUESTS, later)
+        if self._guard.knows(authorization):
+            return None
+        if authorization:
+            self._patience.wrong(address, now_ns)
+        asks = {"WWW-Authenticate": 'Basic realm="hilrig console", charset="UTF-8"'}
+        return PlainTextResponse("a password is needed\n", HTTPStatus.UNAUTHORIZED, asks)
 
 
 def is_loopback(host: str) -> bool:

@@ -133,7 +133,7 @@ class FitnessWatch:
         if run.losses is None:
             yield "the recording does not say whether something was lost (it did not end in order)"
         if overruns:
-            steps = f"{self._missed} steps missed, at most {self.stalls.longest_ns / 1e6:.0f} ms late"
+            steps = f"{_count(self._missed, 'step')} missed, at most {self.stalls.longest_ns / 1e6:.0f} ms late"
             yield f"{_count(overruns, 'overrun')} of the simulation, {steps}"
         if self._delay_ns is not None and self._delay_ns[1] - self._delay_ns[0] > BACKLOG_NS:
             behind = (self._delay_ns[1] - self._delay_ns[0]) / 1e9

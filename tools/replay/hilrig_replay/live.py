@@ -83,8 +83,8 @@ class Follower:
                 return True
             if self._clock.monotonic_ns() >= deadline_ns:
                 raise OperationError(
-                    f"no simulation of rig {self._rig!r} in lab {self._lab!r} answers on the bus: "
-                    "start it (`hilrig up`), or name its lab with --config"
+                    f"no simulation of rig {self._rig!r} answers for lab {self._lab!r}: "
+                    "is it running (hilrig up), with this lab.toml?"
                 )
             stopping.wait(0.05)
         return False

@@ -24,6 +24,7 @@ def check(
 
     from hilrig_replay.assignment import check_task
     from hilrig_runtime.config import load_lab
+    from hilrig_runtime.errors import InputError
     from hilrig_runtime.template import lab_template
     from hilrig_sim.configured import rig_parameters
 
@@ -31,10 +32,13 @@ def check(
         print(lab_template(), end="")
         return
     lab = load_lab(file)
-    for rig in lab.rigs:
-        parameters = rig_parameters(lab, rig)
-        if lab.task is not None:
-            check_task(lab.task, parameters)
+    try:
+        for rig in lab.rigs:
+            parameters = rig_parameters(lab, rig)
+            if lab.task is not None:
+                check_task(lab.task, parameters)
+    except InputError as error:
+        raise InputError(f"{file or 'defaults'}: {error}") from error
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return

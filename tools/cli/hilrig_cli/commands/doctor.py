@@ -56,7 +56,9 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
     from hilrig_cli.checkup import good, host
     from hilrig_cli.checkup import services as on_bus
 
-    findings = [good("lab", f"{lab.name!r}: {len(lab.rigs)} rigs, step {lab.sim.step_ms:g} ms")]
+    findings = [
+        good("lab", f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms")
+    ]
     findings += host.check_software()
     of_bus, heard = on_bus.check_bus(lab)
     findings += of_bus
@@ -116,4 +118,6 @@ def _print(findings: "list[Finding]") -> None:
         table.add_row(f"[{colours[level]}]{level}[/]", found.check, found.text.replace("[", r"\[") + mend)
     Console().print(table)
     wrong = sum(found.level.value == "wrong" for found in findings)
-    Console().print("[green]all is well[/]" if not wrong else f"[bold red]{wrong} to mend[/]")
+    notices = sum(found.level.value == "notice" for found in findings)
+    well = "all is well" if not notices else f"nothing is wrong; {notices} to look at"
+    Console().print(f"[green]{well}[/]" if not wrong else f"[bold red]{wrong} to mend[/]")

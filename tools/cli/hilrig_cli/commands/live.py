@@ -22,6 +22,7 @@ def live(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
 ) -> None:
     """Follow a running rig: the same view as of a recording, as it happens; until it is closed, or Ctrl-C."""
+    from hilrig_cli.asking import check_rig
     from hilrig_replay.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
     from hilrig_replay.rerun_layout import layout
     from hilrig_replay.streams import to_file, to_viewer
@@ -35,7 +36,7 @@ def live(
     if save is not None and web:
         raise InputError("--save writes a file and --web serves a browser: choose one")
     lab = load_lab(config)
-    name = lab.rig(rig).name if rig is not None else lab.rigs[0].name
+    name = rig or lab.rigs[0].name
     stopping = threading.Event()
     stop_on_signals(stopping)
 
@@ -44,6 +45,8 @@ def live(
 
     blueprint = layout(live=True)
     with ExitStack() as closing:
+        bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
+        check_rig(bus, lab, name)
         if save is not None:
             stream = to_file(save, f"live-{name}", blueprint)
 
@@ -60,6 +63,5 @@ def live(
                 return viewer.poll() is not None
 
         closing.callback(stream.disconnect)
-        bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S
         follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say, lab.task), over, stopping, period_s)

@@ -51,7 +51,7 @@ def _ask(config: "Path | None", request: "Event") -> "Event":
         while not (recorders := rosters(bus, lab.name, "recorder")):
             if time.monotonic() > deadline_s:
                 raise OperationError(
-                    f"no recorder answers in lab {lab.name}: is `hilrig up` running with this lab.toml?"
+                    f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
                 )
         # Rigs that were added since are the one's that has the first of the lab's file.
         has = next((one for one in recorders if request.rig in one.rigs), None)

@@ -48,7 +48,8 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
 def add(
     rig: Name,
     port: Annotated[
-        int | None, typer.Option(help="Modbus TCP port; without: the next one behind all others.", show_default=False)
+        int | None,
+        typer.Option(help="Modbus TCP port; without: the next free one behind the others.", show_default=False),
     ] = None,
     settings: Annotated[
         Path | None,
@@ -68,7 +69,7 @@ def add(
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
         rosters = _rosters(bus, lab)
-        new = _settings(lab, rosters, rig, port, settings)
+        new = _settings(rosters, rig, port, settings)
         simulation = _least_loaded(rosters, "sim", lab)
         edge = _least_loaded(rosters, "edge", lab)
         request = Event(kind=Event.RIG_ADDED, rig=rig)
@@ -149,9 +150,7 @@ def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
     return rows
 
 
-def _settings(
-    lab: "LabConfig", rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None
-) -> "RigSettings":
+def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
     import tomllib
 
     from hilrig_runtime.config import read_lab_text, read_rig
@@ -165,10 +164,6 @@ def _settings(
         raise InputError(f"{settings}: no valid TOML: {error}") from error
     if port is not None:
         said["port"] = port
-    if "port" not in said:
-        reached = [part for roster in rosters for at in roster.addresses for part in at.split(", ") if part]
-        taken = [int(part.rpartition(":")[2]) for part in reached]
-        said["port"] = max([*taken, *lab.ports.values(), *lab.tls_ports.values()]) + 1
     return read_rig(json.dumps(said | {"name": rig}))
 
 

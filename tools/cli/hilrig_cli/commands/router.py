@@ -23,7 +23,7 @@ def router(
     ] = False,
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Run the zenoh router of a lab, with access control by certificate where the lab has [bus.tls]."""
+    """Run the zenoh router of a lab, with access control by certificate where the lab has \\[bus.tls]."""
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.router import router_endpoint, run_router
     from hilrig_runtime.zenoh_config import router_config

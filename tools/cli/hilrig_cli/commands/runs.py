@@ -41,8 +41,10 @@ def runs(
     config: Config = None,
     rig: Annotated[str, typer.Option(help="Only this rig's.")] = "",
     controller: Annotated[str, typer.Option(help="Only controllers whose address begins so.")] = "",
-    since: Annotated[datetime | None, typer.Option(help="Only those begun at or after this time, UTC.")] = None,
-    until: Annotated[datetime | None, typer.Option(help="Only those begun before this time, UTC.")] = None,
+    since: Annotated[
+        str, typer.Option(metavar="TIME", help="Only those begun then or later, UTC: 2026-01-31 or 2026-01-31T14:30.")
+    ] = "",
+    until: Annotated[str, typer.Option(metavar="TIME", help="Only those begun before, UTC.")] = "",
     fit: Annotated[
         bool | None, typer.Option("--fit/--unfit", help="Only those whose latencies can, or can't, be relied on.")
     ] = None,
@@ -57,15 +59,17 @@ def runs(
     from hilrig_replay.index import RunIndex
     from hilrig_runtime.config import load_lab
 
+    since_ns, until_ns = _wall_ns("--since", since), _wall_ns("--until", until)
     index = RunIndex(load_lab(config).recorder.folder if folder is None else folder)
     entries = index.load(rebuild=rebuild)
+    read = len(entries)
     entries = [
         entry
         for entry in entries
         if (not rig or entry.rig == rig)
         and (not controller or entry.controller.startswith(controller))
-        and (since is None or entry.start_wall_ns >= _wall_ns(since))
-        and (until is None or entry.start_wall_ns < _wall_ns(until))
+        and (since_ns is None or entry.start_wall_ns >= since_ns)
+        and (until_ns is None or entry.start_wall_ns < until_ns)
     ]
     by_loop = sort in (SortKey.P50, SortKey.P99)
     if fit is not None or by_loop:
@@ -80,10 +84,18 @@ def runs(
     if as_json:
         _print_json(index.folder, entries, total)
     else:
-        _print_table(index.folder, entries, total)
+        _print_table(index.folder, entries, total, read)
 
 
-def _wall_ns(time: datetime) -> int:
+def _wall_ns(option: str, text: str) -> int | None:
+    from hilrig_runtime.errors import InputError
+
+    if not text:
+        return None
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"{option} {text!r}: expected a date or a time, as 2026-01-31 or 2026-01-31T14:30") from error
     return int(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1e9)
 
 
@@ -132,10 +144,13 @@ def _date(wall_ns: int, form: str) -> str:
     return datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime(form) if wall_ns else ""
 
 
-def _print_table(folder: Path, entries: "list[RunEntry]", total: int) -> None:
+def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    if not entries:
+        print(f"no such recordings in {folder}" if read else f"no recordings in {folder}")
+        return
     console = Console() if sys.stdout.isatty() else Console(width=200)
     wide = console.width >= WIDE
     table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
