@@ -39,6 +39,7 @@ DISTRIBUTIONS: dict[str, Any] = {
     "exponential:3,10": stats.expon(10, 3),
 }
 COMMAND_RIGS = {f"{text.partition(':')[0]}-way": text for text in DISTRIBUTIONS}
+STATE_WAY = "uniform:1,6"
 RIGS = ("free", *COMMAND_RIGS, "trace", "state-way", "lossy", "scheduled")
 
 
@@ -63,7 +64,7 @@ def write_impaired_lab(folder: Path) -> Path:
     trace.write_text("".join(f"{delay}\n" for delay in TRACE_MS))
     ways = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
     ways["trace"] = f"command = 'trace:{trace}'"
-    ways["state-way"] = "state = 'uniform:1,6'"
+    ways["state-way"] = f"state = '{STATE_WAY}'"
     ways["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
     ways["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
     text = f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {free_ports(len(RIGS))}\nsession_grace_ms = 0\n"
@@ -180,21 +181,22 @@ def test_a_trace_is_injected_in_its_order(sessions: dict[str, Session]) -> None:
 
 
 def test_injected_on_the_states_way_is_what_was_asked_for(sessions: dict[str, Session]) -> None:
-    """Each state is answered when it shows, and before the next tick: so each is a sample, once."""
+    """Each state that was answered had the delay that its seed gives it, and those that it gives are spread as asked.
+
+    Not judged is how those that were answered are spread: where the machine stalls, a state is overtaken by the next
+    and never answered, and more often one that was held up long. The delays begin anew with a session, while some are
+    on their way: the very ends are left out.
+    """
     session = sessions["state-way"]
     assert_stages_add_up(session)
     assert session.report.samples > 250
-    found = stats.kstest(session.injected_ms, stats.uniform(1, 5).cdf)
-    assert found.pvalue > 0.01, found
-
-
-def test_each_state_has_the_delay_that_its_seed_gives_it(sessions: dict[str, Session]) -> None:
-    """But for those answered at the very ends: the delays begin anew with a session, while some are on their way."""
-    table = sessions["state-way"].report.table[5:-5]
-    drawn, _ = Impairment(WayImpairment.model_validate("uniform:1,6"), way_seed(SEED, "state-way", "state")).draw(3000)
+    table = session.report.table[5:-5]
+    drawn, _ = Impairment(WayImpairment.model_validate(STATE_WAY), way_seed(SEED, "state-way", "state")).draw(3000)
     (first,) = np.flatnonzero(drawn == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
     assert table["injected"].tolist() == drawn[first + after].tolist()
+    found = stats.kstest(drawn[first : first + after[-1] + 1] / 1e6, stats.uniform(1, 5).cdf)
+    assert found.pvalue > 0.01, found
 
 
 @pytest.mark.parametrize("rig", [*COMMAND_RIGS, "trace"])

@@ -63,8 +63,9 @@ def test_live_points_do_what_virtual_time_says(tmp_path: Path) -> None:
         live, virtual = point["live"], point["virtual"]
         assert live["loop_p50_ms"] == pytest.approx(virtual["loop_p50_ms"], abs=20.5)
         assert live["error_rms_deg"] == pytest.approx(virtual["error_rms_deg"], rel=0.2, abs=0.1)
-    assert points[0]["live"]["loop_p50_ms"] == pytest.approx(20, abs=1)
-    assert points[2]["live"]["loop_p50_ms"] == pytest.approx(60, abs=1)
+    # Of its steps the loop is what was asked for; within one, a tick that the machine held up is seen.
+    assert points[0]["live"]["loop_p50_ms"] == pytest.approx(20, abs=5)
+    assert points[2]["live"]["loop_p50_ms"] == pytest.approx(60, abs=5)
     # The recording of a point is a recording like any other: what gains would it have borne?
     judged = hilrig("study", "--from", points[1]["recording"], "--json")
     assert judged.returncode == 0, judged.stderr
