@@ -5,6 +5,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import time
 import urllib.request
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 
 from browser import share_of
-from hilrig_replay.rerun_view import save_rrd
+from hilrig_replay.rerun_view import save_rrd, send_runs
 from hilrig_replay.run import open_run
 from hilrig_replay.viewer import environment, executable, free_port, running_viewer
 from labs import HILRIG
@@ -51,15 +52,18 @@ def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> Non
     assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10
 
 
-def test_the_browsers_viewer_is_served_on_this_machine_alone(rrd: Path) -> None:
+def test_the_browsers_viewer_is_served_on_this_machine_alone_and_rests(rrd: Path) -> None:
     grpc_port, web_port = free_port(), free_port()
-    with running_viewer(str(rrd), grpc_port=grpc_port, web_port=web_port) as viewer:
+    with running_viewer(grpc_port, web_port) as viewer:
+        send_runs([open_run(rrd.with_name("run.mcap"))], grpc_port, over=lambda: False)
         with urllib.request.urlopen(f"http://127.0.0.1:{web_port}/", timeout=10) as page:
             assert b"<canvas" in page.read()
         for port in (grpc_port, web_port):
             with socket.socket() as other:
                 # Nothing listens on another address of this machine, so it is still free.
                 other.bind(("127.0.0.2", port))
+        # What has all its data and no browser has nothing to do.
+        eventually(lambda: cpu_s_of(viewer.pid, while_s=0.5) < 0.1)
         assert viewer.poll() is None
     assert viewer.poll() is not None
 
@@ -78,6 +82,18 @@ def test_replay_to_a_browser_ends_with_its_viewer_on_a_signal(rrd: Path) -> None
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.stderr.close()
+
+
+def cpu_s_of(process: int, while_s: float) -> float:
+    """Processor time that a process takes meanwhile."""
+
+    def taken_s() -> float:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    before_s = taken_s()
+    time.sleep(while_s)
+    return taken_s() - before_s
 
 
 def session_of(leader: int) -> list[int]:

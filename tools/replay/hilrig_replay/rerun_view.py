@@ -1,17 +1,18 @@
 """Runs into the rerun viewer: a file, a window, or a browser on this machine."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from hilrig_replay.assignment import task_of
 from hilrig_replay.palette import RUN_COLORS
 from hilrig_replay.rerun_layout import layout
 from hilrig_replay.rig_view import Drawn, RigView
 from hilrig_replay.run import Run
-from hilrig_replay.streams import to_file
+from hilrig_replay.streams import to_file, to_viewer
 from hilrig_runtime.errors import InputError
 
 ROWS: Final = 40_000
@@ -38,22 +39,19 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    name = "+".join(run.session for run in chosen)
-    roots = root_names(chosen)
-    stream = to_file(path, name, layout(roots))
-    with stream:
-        for number, (run, root) in enumerate(zip(chosen, roots, strict=True)):
-            color = None if len(chosen) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
-            write_run(stream, run, root=root, color=color)
-    stream.disconnect()
+    _write(to_file(path, _name(chosen), _layout(chosen)), chosen)
 
 
-def write_run(stream: rr.RecordingStream, run: Run, *, root: str = "", color: str | None = None) -> None:
-    """Write one run into a rerun recording, a block at a time."""
-    view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
-    for block in run.blocks(rows=ROWS):
-        view.add(block)
-    view.end()
+def send_runs(runs: Sequence[Run], grpc_port: int, over: Callable[[], bool]) -> None:
+    """Send runs to a viewer on this machine as `save_rrd` writes them; ends early when it is `over`.
+
+    A viewer that serves a file keeps a core busy for as long as it runs (https://github.com/rerun-io/rerun/pull/10944);
+    one that is sent the same waits.
+
+    Raises:
+        InputError: a run can't be read.
+    """
+    _write(to_viewer(grpc_port, _name(runs), _layout(runs)), runs, over)
 
 
 def root_names(runs: Sequence[Run]) -> list[str]:
@@ -62,3 +60,24 @@ def root_names(runs: Sequence[Run]) -> list[str]:
         return [""]
     names = [run.session for run in runs]
     return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, start=1)]
+
+
+def _name(runs: Sequence[Run]) -> str:
+    return "+".join(run.session for run in runs)
+
+
+def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
+    return layout(root_names(runs))
+
+
+def _write(stream: rr.RecordingStream, runs: Sequence[Run], over: Callable[[], bool] = lambda: False) -> None:
+    with stream:
+        for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
+            color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
+            view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
+            for block in run.blocks(rows=ROWS):
+                if over():
+                    return
+                view.add(block)
+            view.end()
+    stream.disconnect()

@@ -41,18 +41,17 @@ def executable() -> Path:
     raise OperationError(f"the rerun viewer is not installed in {folder}")
 
 
-def open_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) -> "subprocess.Popen[bytes]":
-    """Start the viewer: a window, or with `web_port` a server for a browser on this machine.
+def open_viewer(grpc_port: int, web_port: int | None = None) -> "subprocess.Popen[bytes]":
+    """Start the viewer, which waits for data: a window, or with `web_port` a server for a browser on this machine.
 
     Args:
-        arguments: what it opens, files or addresses; none: it waits for what is sent to `grpc_port`.
         grpc_port: where it listens for data.
         web_port: where it serves the browser.
 
     Raises:
         OperationError: it can't be started.
     """
-    command = [str(executable()), *arguments, "--bind", LOOPBACK, "--port", str(grpc_port)]
+    command = [str(executable()), "--bind", LOOPBACK, "--port", str(grpc_port)]
     if web_port is None:
         command += ["--memory-limit", MEMORY_LIMIT, "--hide-welcome-screen"]
     else:
@@ -64,14 +63,14 @@ def open_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) ->
 
 
 @contextmanager
-def running_viewer(*arguments: str, grpc_port: int, web_port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
+def running_viewer(grpc_port: int, web_port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
     """`open_viewer`, ready to take data, and ended on leaving; a browser gets its page from behind a fence.
 
     Raises:
         OperationError: it does not start; the display may be missing.
     """
     page_port = None if web_port is None else free_port()
-    process = open_viewer(*arguments, grpc_port=grpc_port, web_port=page_port)
+    process = open_viewer(grpc_port, page_port)
     try:
         wait_until_served(process, [grpc_port, *([] if page_port is None else [page_port])])
         with ExitStack() as fence:

@@ -54,7 +54,7 @@ def live(
                 return False
         else:
             grpc_port, web_port = free_port(), free_port() if web else None
-            viewer = closing.enter_context(running_viewer(grpc_port=grpc_port, web_port=web_port))
+            viewer = closing.enter_context(running_viewer(grpc_port, web_port))
             if web_port is not None:
                 say(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it")
             stream = to_viewer(grpc_port, f"live-{name}", blueprint)

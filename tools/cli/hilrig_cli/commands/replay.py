@@ -19,9 +19,7 @@ def replay(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
 ) -> None:
     """Show what happened: the arm in 3D, its curves, the loop latency and its stages, events; until it is closed."""
-    import tempfile
-
-    from hilrig_replay.rerun_view import save_rrd
+    from hilrig_replay.rerun_view import save_rrd, send_runs
     from hilrig_replay.run import open_run
     from hilrig_replay.viewer import browser_address, free_port, running_viewer, wait_for_end
     from hilrig_runtime.ending import stop_on_signals
@@ -35,11 +33,13 @@ def replay(
         return
     stopping = threading.Event()
     stop_on_signals(stopping)
-    with tempfile.TemporaryDirectory(prefix="hilrig-") as folder:
-        file = Path(folder) / "run.rrd"
-        save_rrd(opened, file)
-        grpc_port, web_port = free_port(), free_port() if web else None
-        with running_viewer(str(file), grpc_port=grpc_port, web_port=web_port) as viewer:
-            if web_port is not None:
-                print(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it", file=sys.stderr, flush=True)
-            wait_for_end(viewer, stopping)
+    grpc_port, web_port = free_port(), free_port() if web else None
+    with running_viewer(grpc_port, web_port) as viewer:
+        if web_port is not None:
+            print(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it", file=sys.stderr, flush=True)
+
+        def over() -> bool:
+            return stopping.is_set() or viewer.poll() is not None
+
+        send_runs(opened, grpc_port, over)
+        wait_for_end(viewer, stopping)
