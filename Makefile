@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Compiled sources are kept whatever the environment says: a lab is four processes, and tests start hundreds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test check gen bench system clean
+.PHONY: help demo test together alone check gen bench system clean
 .DEFAULT_GOAL := help
 
 help: ## what there is
@@ -33,16 +33,21 @@ system: ## the system parts that tests and benchmarks use (apt, as root)
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
 
-# What judges real time runs alone, one test after the other; all else shares the cores, with a worker more than two cores
-# have, for real processes are often waited for; so no process spreads its matrices over all cores. Where the host of a
-# virtual machine takes its processors away for a moment, a test of real processes can fail for it: what failed is made
-# once more, with nothing beside it, and both are to be read. What fails for a reason fails again.
-AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
-test: export OPENBLAS_NUM_THREADS = 1
 test: .venv/bin/python ## everything that CI runs
-	@$(MAKE) --no-print-directory --jobs=2 system check
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
-	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig
+	@$(MAKE) --no-print-directory --jobs=2 system .venv/dev
+	@$(MAKE) --no-print-directory --jobs=2 check together
+	@$(MAKE) --no-print-directory alone
+
+# What judges real time runs alone, one test after the other; all else shares the cores, with more workers than there are
+# cores, for real processes are often waited for; so no process spreads its matrices over all cores. Where the host of a
+# virtual machine takes its processors away for a moment, a test of real processes can fail for it: what failed is made
+# again, with nothing beside it, and all is there to be read. What fails for a reason fails again.
+AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
+together alone: export OPENBLAS_NUM_THREADS = 1
+together: .venv/dev
+	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
+alone: .venv/dev
+	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
 
 check: .venv/dev ## format, lint, types, floors
 	$(BIN)/ruff format --check .

@@ -46,7 +46,7 @@ class Browser:
         try:
             # The browser writes there which port it took.
             told = self._profile / "DevToolsActivePort"
-            eventually(lambda: told.exists() and len(told.read_text().splitlines()) == 2, timeout_s=60)
+            eventually(lambda: told.exists() and len(told.read_text().splitlines()) == 2)
             port, path = told.read_text().splitlines()
             self._socket = self._closing.enter_context(
                 connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None)
@@ -103,7 +103,7 @@ class Browser:
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self._ask("Emulation.setDeviceMetricsOverride", **metrics)
         self._ask("Page.navigate", url=address)
-        eventually(lambda: self.run("document.readyState") == "complete", timeout_s=60)
+        eventually(lambda: self.run("document.readyState") == "complete")
 
     @property
     def requests(self) -> list[str]:

@@ -17,7 +17,7 @@ from hilrig_replay.run import open_run
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError
 from namespaces import Network
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 TIMEOUT_NS = 600_000_000
@@ -68,7 +68,7 @@ class LabOfHosts:
     def kill(self, host: str) -> int:
         """Kill it as a power cut would; gives the time, ns."""
         self.processes[host].kill()
-        self.processes[host].wait(5)
+        self.processes[host].wait(PATIENT_S)
         return time.monotonic_ns()
 
     def run(self, host: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -115,9 +115,9 @@ class Session:
         self._before = set(lab.recordings(rig.name))
 
     def __enter__(self) -> "Session":
-        eventually(lambda: self.lab.simulation_is_alive(self.rig), timeout_s=30, every_s=0.1)
+        eventually(lambda: self.lab.simulation_is_alive(self.rig), every_s=0.1)
         self.controller = self.lab.controller(self.rig)
-        eventually(lambda: self.lab.unfinished(self.rig.name), timeout_s=20)
+        eventually(lambda: self.lab.unfinished(self.rig.name))
         time.sleep(1.0)
         return self
 
@@ -127,7 +127,7 @@ class Session:
         self.end_ns = time.monotonic_ns()
         assert self.controller.stdin is not None
         self.controller.stdin.close()
-        self.controller.wait(10)
+        self.controller.wait(PATIENT_S)
         assert self.controller.stdout is not None
         said = self.controller.stdout.read()
         self.answered = int(said) if said else 0
@@ -140,7 +140,7 @@ class Session:
                 return []
             return [path for path in self.lab.recordings(self.rig.name) if path not in self._before]
 
-        return eventually(finished, timeout_s=30, every_s=0.1)
+        return eventually(finished, every_s=0.1)
 
     def states(self) -> np.ndarray:
         """States of the recordings of this session, by time; shape (n,)."""

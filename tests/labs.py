@@ -8,7 +8,8 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -131,7 +132,7 @@ class RunningLab:
         """Process ids of all children of `up`."""
         return _children(self.process.pid)
 
-    def stop(self, number: signal.Signals = signal.SIGTERM, *, timeout_s: float = 10.0) -> int:
+    def stop(self, number: signal.Signals = signal.SIGTERM, *, timeout_s: float = 30.0) -> int:
         """Send a signal to `up` and wait for its end; gives the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(number)
@@ -150,7 +151,7 @@ class RunningLab:
             return "running; Ctrl-C ends it" in self.output()
 
         try:
-            eventually(up, timeout_s=60)
+            eventually(up)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -167,6 +168,19 @@ class RunningLab:
             self.process.wait()
             for pid in children:
                 os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def steady_controller(port: int) -> Iterator[None]:
+    """A controller that turns joint 1, fifty times a second, with a connection of its own."""
+    program = Path(__file__).with_name("steady_controller.py")
+    process = subprocess.Popen(
+        [sys.executable, str(program), "127.0.0.1", str(port)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
+    try:
+        yield
+    finally:
+        process.communicate()
 
 
 def _children(parent: int) -> list[int]:

@@ -24,7 +24,7 @@ from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
 from labs import HILRIG, free_ports, write_lab
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 Key = tuple[str, int, bytes]
 """Channel, sequence of the sender, bytes."""
@@ -179,7 +179,7 @@ def router() -> Iterator[str]:
         yield endpoint
     finally:
         process.stdin.close()
-        process.wait(10)
+        process.wait(PATIENT_S)
         process.stdout.close()
 
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 
+READ = struct.pack(">HHHBBHH", 2, 0, 6, 1, 3, 4, 4)
 WRITE = struct.pack(">HHHBBHHB4h", 1, 0, 15, 1, 16, 0, 4, 8, 300, 0, 0, 0)
 
 
@@ -26,6 +27,10 @@ def main() -> None:
                     if not answer:
                         break
                     answered += not answer[7] & 0x80
+                    # Each torque is based on a state, as in any loop; whether there is one is not asked here.
+                    connection.sendall(READ)
+                    if not connection.recv(64):
+                        break
                     time.sleep(0.02)
         except OSError:
             time.sleep(0.1)

@@ -13,7 +13,7 @@ from hilrig_runtime.errors import OperationError
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas.topics import Traffic
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 OpenBus = Callable[[str], Bus]
 
@@ -83,7 +83,7 @@ def test_a_reader_that_was_held_up_goes_on_with_the_newest(open_bus: OpenBus, re
         got.append(int(payload))
         if "zenoh" in request.node.name:
             entered.set()
-            go_on.wait(10)
+            go_on.wait(PATIENT_S)
 
     subscription = edge.subscribe_newest("hil/lab/rig1/state", held_up, 2)
     publisher = sim.publisher("hil/lab/rig1/state", Traffic.CONTROL)

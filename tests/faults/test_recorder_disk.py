@@ -87,10 +87,10 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
             try:
                 for rig in rigs:
                     senders.begin(rig)
-                eventually(lambda: all(holds_messages(lab, rig) for rig in rigs), timeout_s=30)
+                eventually(lambda: all(holds_messages(lab, rig) for rig in rigs))
                 fill(ballast)
                 for rig in rigs:
-                    eventually(lambda rig=rig: files_of(lab, rig), timeout_s=30)
+                    eventually(lambda rig=rig: files_of(lab, rig))
                 eventually(lambda: any("No space left" in text for text in troubles.heard))
                 full = {rig: files_of(lab, rig)[0] for rig in rigs}
                 for rig in rigs:
@@ -105,12 +105,12 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
                 ballast.unlink()
                 # Tried again ten seconds after it failed.
                 for rig in rigs:
-                    eventually(lambda rig=rig: files_of(lab, rig, "*.part"), timeout_s=30)
+                    eventually(lambda rig=rig: files_of(lab, rig, "*.part"))
                 eventually(lambda: troubles.heard and not troubles.heard[-1])
                 for rig in rigs:
                     senders.end(rig)
                 for rig in rigs:
-                    eventually(lambda rig=rig: len(files_of(lab, rig)) == 2, timeout_s=30)
+                    eventually(lambda rig=rig: len(files_of(lab, rig)) == 2)
             finally:
                 troubles.close()
         for rig in rigs:
@@ -132,7 +132,7 @@ def test_a_disk_that_is_full_before_the_first_chunk_is_written_holds_what_came_u
             senders.begin("rig1")
             eventually(lambda: files_of(lab, "rig1", "*.part"), every_s=0.002)
             fill(folder / "ballast")
-            [path] = eventually(lambda: files_of(lab, "rig1"), timeout_s=30)
+            [path] = eventually(lambda: files_of(lab, "rig1"))
         found = metadata(path)
         assert found["hilrig.summary"]["ended"] == "disk full"
         assert found["hilrig.session"]["rig"] == "rig1"
@@ -149,7 +149,7 @@ def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path:
             senders.begin("rig1")
             eventually(lambda: files_of(lab, "rig1", "*.part"))
             (folder / "ballast").write_bytes(bytes(2_600_000))
-            [path] = eventually(lambda: files_of(lab, "rig1"), timeout_s=15)
+            [path] = eventually(lambda: files_of(lab, "rig1"))
             assert recorder.process.poll() is None
         assert metadata(path)["hilrig.summary"]["ended"] == "disk full"
         assert "nearly full" in metadata(path)["hilrig.summary"]["reason"]

@@ -62,7 +62,7 @@ def test_kill_9_at_random_moments_loses_nothing_that_was_sent(tmp_path: Path) ->
             for rig in rigs:
                 senders.end(rig)
             for rig in rigs:
-                eventually(lambda rig=rig: files_of(lab, rig) and not files_of(lab, rig, "*.part"), timeout_s=20)
+                eventually(lambda rig=rig: files_of(lab, rig) and not files_of(lab, rig, "*.part"))
     for rig in rigs:
         paths = files_of(lab, rig)
         found = recorded(paths)

@@ -72,13 +72,13 @@ def test_a_service_that_is_killed_leaves_a_whole_recording(tmp_path: Path, victi
         try:
             with controller(lab.port):
                 folder = lab.lab.recorder.folder / lab.lab.name / "rig1"
-                eventually(lambda: list(folder.glob("*.part")), timeout_s=20)
+                eventually(lambda: list(folder.glob("*.part")))
                 before = len(witness.states)
-                eventually(lambda: len(witness.states) > before + 100, timeout_s=20)
+                eventually(lambda: len(witness.states) > before + 100)
                 os.kill(lab.service_pid(victim), signal.SIGKILL)
                 count = len(witness.states)
-                eventually(lambda: len(witness.states) > count + 100, timeout_s=30)
-            eventually(lambda: lab.recordings and not list(folder.glob("*.part")), timeout_s=40)
+                eventually(lambda: len(witness.states) > count + 100)
+            eventually(lambda: lab.recordings and not list(folder.glob("*.part")))
         finally:
             witness.close()
         paths = lab.recordings

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from hilrig_schemas import Event, JointState, TorqueCommand
 from labs import HILRIG, RunningLab, hilrig, write_lab
 from namespaces import Network, require_namespaces
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
 LATE_MS = 15
@@ -141,7 +141,7 @@ def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
     with Network(["rig", "pc"]) as network:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
-        eventually(lambda: "running" in (tmp_path / "up.log").read_text(), timeout_s=30)
+        eventually(lambda: "running" in (tmp_path / "up.log").read_text())
         from hilrig_runtime.config import load_lab
 
         port = load_lab(lab).ports["rig1"]
@@ -157,7 +157,7 @@ def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
 
         eventually(lambda: tripped(status()))
         up.send_signal(signal.SIGTERM)
-        assert up.wait(10) == 0
+        assert up.wait(PATIENT_S) == 0
         log.close()
     [recording] = (tmp_path / "recordings").rglob("*.mcap")
     judge(recording, "is silent")

@@ -19,7 +19,7 @@ from hilrig_modbus_edge.certificates import Identity, issue_peer
 from hilrig_runtime.config import load_lab
 from lab_of_hosts import HILRIG, SLACK_NS, TIMEOUT_NS, LabOfHosts, Rig, Session, zero_after
 from namespaces import Network, require_namespaces
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = [pytest.mark.hosts, pytest.mark.rig]
 
@@ -141,9 +141,9 @@ def test_a_host_with_a_wrong_certificate_hears_and_moves_nothing(
         with (tmp_path / "said").open("w") as said:
             command = [HILRIG, "sim", "-c", str(config)]
             stranger = lab.network.popen("stranger", command, stdin=subprocess.PIPE, stderr=said)
-        eventually(lambda: "waiting: no zenoh router answers" in Path(said.name).read_text(), timeout_s=20)
+        eventually(lambda: "waiting: no zenoh router answers" in Path(said.name).read_text())
         stranger.terminate()
-        assert stranger.wait(10) == 0
+        assert stranger.wait(PATIENT_S) == 0
     states = session.states()
     during = states[(states["sampled_ns"] > begin_ns) & (states["sampled_ns"] < session.end_ns)]
     assert len(np.unique(states["incarnation"])) == 1, "the lab's own simulation, and no other"

@@ -15,7 +15,7 @@ import yaml
 from hilrig_runtime.config import load_lab
 from labs import hilrig
 from namespaces import Network, require_namespaces
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 ROOT = Path(__file__).parents[2]
 LAB_FILE = ROOT / "compose/lab.toml"
@@ -211,7 +211,7 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
     for edge, port in (("east", 5020), ("west", 5023)):
         before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=90, every_s=0.2)
         assert after > before
-    assert all(eventually(lambda name=name: containers.is_well(name), timeout_s=30) for name in SERVICES)
+    assert all(eventually(lambda name=name: containers.is_well(name)) for name in SERVICES)
 
     told = re.search(r"password: (\S+)", (folder / "console.log").read_text())
     assert told is not None
@@ -226,12 +226,12 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
     containers.processes["sim"].wait()
     assert not containers.is_well("sim")
     containers.start("sim")
-    assert eventually(lambda: containers.is_well("sim"), timeout_s=30)
+    assert eventually(lambda: containers.is_well("sim"))
 
     for name in ("console", "east", "west", "sim", "recorder", "router"):
         process = containers.processes[name]
         assert process.poll() is None, f"{name} ended by itself"
         process.terminate()
-        assert process.wait(5) == 0, f"{name} did not end well on SIGTERM"
+        assert process.wait(PATIENT_S) == 0, f"{name} did not end well on SIGTERM"
     assert {path.parent.name for path in (folder / "recordings").rglob("*.mcap")} == {"rig1", "rig4"}
     assert not list((folder / "recordings").rglob("*.part"))

@@ -17,7 +17,7 @@ from hilrig_runtime.config import load_lab
 from hilrig_runtime.logstream import LONGEST_KEPT_S
 from lab_of_hosts import HILRIG, SLACK_NS, STEP_S, TIMEOUT_NS, LabOfHosts, Session, zero_after
 from namespaces import Network, require_namespaces
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = [pytest.mark.hosts, pytest.mark.rig]
 
@@ -129,7 +129,7 @@ def test_the_recorder_dies_and_the_loop_does_not_feel_it(lab: LabOfHosts) -> Non
         killed_ns = lab.kill("recorder")
         time.sleep(1.5)
         lab.start("recorder")
-        eventually(lab.unfinished, timeout_s=20)
+        eventually(lab.unfinished)
     states = session.states()
     after = states[(states["sampled_ns"] > killed_ns) & (states["sampled_ns"] < session.end_ns)]
     assert len(after) > 50
@@ -146,10 +146,10 @@ def test_two_labs_on_one_router_do_not_see_each_other(lab: LabOfHosts) -> None:
         done = lab.run("pc", "top", "-c", str(config), "--json")
         return [] if done.returncode else [row["service"] for row in json.loads(done.stdout)["services"]]
 
-    eventually(lambda: services(other) == ["sim"], timeout_s=20, every_s=0.2)
+    eventually(lambda: services(other) == ["sim"], every_s=0.2)
     assert services(lab.config) == ["edge", "recorder", "sim"]
     second = lab.run("sim", "sim", "-c", str(lab.config), "--instance", "2")
     assert second.returncode == 3
     assert "serves rig1 already; a rig has one sim" in second.stderr
     simulation.terminate()
-    assert simulation.wait(10) == 0
+    assert simulation.wait(PATIENT_S) == 0

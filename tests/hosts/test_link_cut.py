@@ -44,14 +44,14 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
                     found += path.stat().st_size
             return found
 
-        eventually(lambda: size() > 20_000, timeout_s=50)
+        eventually(lambda: size() > 20_000)
         network.set_link("store", False)
         time.sleep(cut_s)
         during = size()
         network.set_link("store", True)
-        eventually(lambda: size() > during + 10_000, timeout_s=60)
+        eventually(lambda: size() > during + 10_000)
         say("end rig1")
-        eventually(lambda: files_of(lab, "rig1") and not files_of(lab, "rig1", "*.part"), timeout_s=30)
+        eventually(lambda: files_of(lab, "rig1") and not files_of(lab, "rig1", "*.part"))
         sender.stdin.close()
         assert sender.wait(20) == 0
         assert recorder.poll() is None

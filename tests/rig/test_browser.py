@@ -14,6 +14,7 @@ from browser import CHROMIUM, Browser, share_of
 from hilrig_replay.palette import JOINT_COLORS, rgb
 from labs import HILRIG, hilrig
 from recordings import Script, make, record, write
+from waiting import PATIENT_S
 
 pytestmark = [pytest.mark.rig, pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")]
 
@@ -103,7 +104,7 @@ def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path
             elsewhere = [one for one in browser.requests if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", one)]
             assert elsewhere == [], elsewhere
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(PATIENT_S) == 0
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

@@ -9,7 +9,6 @@ import signal
 import socket
 import ssl
 import subprocess
-import sys
 import threading
 import urllib.request
 from collections.abc import Iterator
@@ -27,13 +26,11 @@ from hilrig_console.guard import Guard
 from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
 from hilrig_runtime.config import load_lab
 from hilrig_runtime.errors import OperationError
-from labs import HILRIG, RunningLab, hilrig, write_lab
+from labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
 from recordings import Script, record
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
-
-STEADY = Path(__file__).parents[1] / "steady_controller.py"
 
 
 @dataclass
@@ -74,7 +71,7 @@ def console(config: Path, *options: str, listen: str = "127.0.0.1:0") -> Iterato
         told = re.search(r"https?://\S+:(\d+)/", line)
         assert told is not None, (line, process.stderr and process.stderr.read())
         running = RunningConsole(process, int(told[1]), line)
-        eventually(lambda: is_up(running), timeout_s=20)
+        eventually(lambda: is_up(running))
         yield running
     finally:
         if process.poll() is None:
@@ -146,18 +143,6 @@ class Watcher:
         self._thread.join(10)
 
 
-@contextmanager
-def controller(port: int) -> Iterator[None]:
-    """A torque on joint 1, fifty times a second."""
-    process = subprocess.Popen(
-        [sys.executable, str(STEADY), "127.0.0.1", str(port)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
-    )
-    try:
-        yield
-    finally:
-        process.communicate()
-
-
 @dataclass
 class Beside:
     lab: RunningLab
@@ -173,9 +158,9 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     with ExitStack() as closing:
         running = closing.enter_context(console(config))
         with Watcher(running.port) as watcher:
-            eventually(lambda: "lab" in watcher.newest, timeout_s=20)
+            eventually(lambda: "lab" in watcher.newest)
             without = watcher.newest["lab"]
-            eventually(lambda: "no such folder" in running.json("/runs")["trouble"], timeout_s=20)
+            eventually(lambda: "no such folder" in running.json("/runs")["trouble"])
         lab = closing.enter_context(RunningLab(config))
         yield Beside(lab, running, without)
 
@@ -188,8 +173,8 @@ def test_a_console_without_a_lab_says_so_and_finds_the_lab_when_it_comes(beside:
             lambda: [rig["state"] for rig in watcher.newest.get("lab", {}).get("rigs", [])] == ["free", "free"],
             timeout_s=20,
         )
-        eventually(lambda: watcher.rig("rig1")["address"] == f"127.0.0.1:{beside.lab.port}", timeout_s=20)
-        eventually(lambda: watcher.pose("rig1") and watcher.pose("rig2"), timeout_s=20)
+        eventually(lambda: watcher.rig("rig1")["address"] == f"127.0.0.1:{beside.lab.port}")
+        eventually(lambda: watcher.pose("rig1") and watcher.pose("rig2"))
     (scene,) = beside.console.json("/scenes")
     assert scene["span"] == 600
 
@@ -199,23 +184,23 @@ def test_a_rig_in_use_shows_who_holds_it_how_it_moves_and_what_happened(beside: 
     # One that never reads holds up nobody.
     with Watcher(port) as watcher, Watcher(port) as other, socket.create_connection(("127.0.0.1", port)) as asleep:
         asleep.sendall(b"GET /live HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        eventually(lambda: watcher.pose("rig1"), timeout_s=20)
+        eventually(lambda: watcher.pose("rig1"))
         before = watcher.pose("rig1")
-        with controller(beside.lab.port):
-            held = eventually(lambda: (rig := watcher.rig("rig1"))["recording"] and rig, timeout_s=20)
+        with steady_controller(beside.lab.port):
+            held = eventually(lambda: (rig := watcher.rig("rig1"))["recording"] and rig)
             assert held["state"] == "in use"
             assert held["controller"].startswith("127.0.0.1:")
             assert "-rig1-" in held["session"]
-            eventually(lambda: watcher.pose("rig1") != before and other.pose("rig1") != before, timeout_s=20)
+            eventually(lambda: watcher.pose("rig1") != before and other.pose("rig1") != before)
         kinds = {"lease_granted", "session_start", "lease_lost", "session_end"}
-        eventually(lambda: kinds <= {event["kind"] for event in watcher.events if event["rig"] == "rig1"}, timeout_s=20)
-        eventually(lambda: other.events == watcher.events, timeout_s=5)
+        eventually(lambda: kinds <= {event["kind"] for event in watcher.events if event["rig"] == "rig1"})
+        eventually(lambda: other.events == watcher.events)
         numbers = [event["id"] for event in watcher.events]
         assert numbers == sorted(set(numbers))
         assert watcher.rig("rig2")["state"] == "free"
     # A browser that comes back gets what it has not seen.
     with Watcher(beside.console.port, last_event_id=str(numbers[-2])) as returned:
-        eventually(lambda: returned.events, timeout_s=10)
+        eventually(lambda: returned.events)
         assert returned.events[0]["id"] == numbers[-1]
 
 
@@ -226,14 +211,14 @@ def test_recordings_are_listed_given_out_and_reported(beside: Beside) -> None:
     good = record(shown / "good <&> run.mcap", Script(seconds=3.0))
     (shown / "torn.mcap").write_bytes(good.read_bytes()[:20_000])
     (folder / "secret.txt").write_text("not for browsers")
-    (shown / "away.mcap").symlink_to(STEADY)
+    (shown / "away.mcap").symlink_to(Path(__file__))
 
     def listed() -> dict[str, dict[str, Any]] | None:
         runs = {run["path"]: run for run in beside.console.json("/runs?words=RIG9")["runs"]}
         return runs if len(runs) == 3 and runs["lab/rig9/good <&> run.mcap"]["loop_p50_ms"] else None
 
     with Watcher(beside.console.port):
-        runs = eventually(listed, timeout_s=30, every_s=0.2)
+        runs = eventually(listed, every_s=0.2)
     assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["trouble"]
     status, headers, body = beside.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert (status, body) == (200, good.read_bytes())
@@ -308,16 +293,16 @@ def test_there_are_only_so_many_places_and_who_leaves_makes_room(beside: Beside)
 
 def test_a_simulation_that_starts_anew_is_seen_to_go_and_to_come(beside: Beside) -> None:
     with Watcher(beside.console.port) as watcher:
-        eventually(lambda: watcher.pose("rig2"), timeout_s=20)
+        eventually(lambda: watcher.pose("rig2"))
         sim = beside.lab.service_pid("sim")
         os.kill(sim, signal.SIGSTOP)
         try:
-            eventually(lambda: watcher.rig("rig2")["state"] == "no simulation", timeout_s=20)
-            eventually(lambda: watcher.pose("rig2") is None, timeout_s=20)
+            eventually(lambda: watcher.rig("rig2")["state"] == "no simulation")
+            eventually(lambda: watcher.pose("rig2") is None)
             assert any("sim/1" in trouble for trouble in watcher.newest["lab"]["troubles"])
         finally:
             os.kill(sim, signal.SIGKILL)
-        eventually(lambda: watcher.rig("rig2")["state"] == "free" and watcher.pose("rig2"), timeout_s=30)
+        eventually(lambda: watcher.rig("rig2")["state"] == "free" and watcher.pose("rig2"))
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
@@ -330,13 +315,13 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
             return str(browser.run(f"(card => card ? {what} : '')({found})"))
 
         text, arm = "card.innerText", "(card.querySelector('.one')?.getAttribute('y2') ?? '')"
-        eventually(lambda: "free" in card(text) and card(arm), timeout_s=30)
+        eventually(lambda: "free" in card(text) and card(arm))
         before = float(card(arm))
-        with controller(beside.lab.lab.ports["rig2"]):
-            eventually(lambda: "in use" in card(text) and "127.0.0.1:" in card(text), timeout_s=20)
-            eventually(lambda: abs(float(card(arm)) - before) > 20, timeout_s=20)
-        eventually(lambda: "session" in browser.run("document.getElementById('events').innerText"), timeout_s=20)
-        eventually(lambda: browser.run("document.querySelectorAll('#runs tbody tr').length") >= 1, timeout_s=20)
+        with steady_controller(beside.lab.lab.ports["rig2"]):
+            eventually(lambda: "in use" in card(text) and "127.0.0.1:" in card(text))
+            eventually(lambda: abs(float(card(arm)) - before) > 20)
+        eventually(lambda: "session" in browser.run("document.getElementById('events').innerText"))
+        eventually(lambda: browser.run("document.querySelectorAll('#runs tbody tr').length") >= 1)
         assert browser.run("document.getElementById('link').innerText") == "live"
         browser.run("document.getElementById('as-table').click()")
         assert browser.run("document.querySelector('#rows tbody tr').innerText.includes('rig1')")
@@ -346,11 +331,9 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
         assert sorted(browser.run("location.hash")[1:].split("&")) == ["rigs=rig2", "view=table"]
         for width in (1400, 400):
             browser.open(f"http://127.0.0.1:{beside.console.port}/", width=width, height=900)
-            eventually(lambda: "rig2" in browser.run("document.body.innerText"), timeout_s=20)
+            eventually(lambda: "rig2" in browser.run("document.body.innerText"))
             assert browser.run("document.documentElement.scrollWidth") <= width
-            eventually(
-                lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2, timeout_s=20
-            )
+            eventually(lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2)
         assert browser.errors == []
         assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", asked).partition("?")[0] for asked in browser.requests} <= {
             "",
@@ -377,11 +360,11 @@ def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with
         assert running.ask("/live", authorization=basic("guess"))[0] == 401
         assert running.ask("/health")[0] == 200
         with Watcher(running.port, authorization=basic(told[1])) as watcher:
-            eventually(lambda: "lab" in watcher.newest, timeout_s=20)
+            eventually(lambda: "lab" in watcher.newest)
             assert answers(Address("", running.port), None)
             running.process.send_signal(signal.SIGINT)
-            assert running.process.wait(10) == 0
-            eventually(lambda: watcher.ended, timeout_s=5)
+            assert running.process.wait(PATIENT_S) == 0
+            eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
         assert "can be overheard" in running.process.stderr.read()
 
@@ -393,7 +376,7 @@ def test_with_a_certificate_it_speaks_https(tmp_path: Path) -> None:
     with ConsoleServer(load_lab(write_lab(tmp_path)), Address.of("127.0.0.1:0"), Guard(), tls) as server:
         assert server.url.startswith("https://127.0.0.1:")
         address = Address.of(server.url.removeprefix("https://").rstrip("/"))
-        eventually(lambda: answers(address, tls), timeout_s=10)
+        eventually(lambda: answers(address, tls))
         with urllib.request.urlopen(server.url, timeout=10, context=trusting) as page:
             assert b"console.js" in page.read()
         assert not answers(address, None)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
+from waiting import PATIENT_S
 
 pytestmark = pytest.mark.rig
 
@@ -93,7 +94,7 @@ def test_without_its_router_a_lab_is_not_well_and_with_it_nothing_runs(routed: P
         assert with_it.returncode == 0, with_it.stdout
         assert "nothing of lab 'lab' runs" in findings(with_it)["services"][0]["text"]
         router.terminate()
-        assert router.wait(5) == 0
+        assert router.wait(PATIENT_S) == 0
     assert hilrig("doctor", "--service", "router", "--config", routed).returncode == 1
 
 

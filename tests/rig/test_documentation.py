@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from labs import HILRIG, RunningLab, hilrig, write_lab
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -139,9 +139,9 @@ def _follow(words: list[str], folder: Path) -> None:
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             shown = folder / "shown.rrd"
-            eventually(lambda: process.poll() is not None or (shown.exists() and shown.stat().st_size), timeout_s=30)
+            eventually(lambda: process.poll() is not None or (shown.exists() and shown.stat().st_size))
             assert process.poll() is None, process.stdout and process.stdout.read()
             process.send_signal(signal.SIGINT)
-            assert process.wait(10) == 0
+            assert process.wait(PATIENT_S) == 0
         finally:
             process.kill()

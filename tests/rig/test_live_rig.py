@@ -10,7 +10,7 @@ import pytest
 
 from labs import HILRIG, RunningLab, hilrig, write_lab
 from rrd_files import RrdFile
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -30,16 +30,16 @@ def live(config: Path, save: Path, log: Path) -> Iterator["subprocess.Popen[byte
 def test_a_rig_is_followed_through_a_restart_of_its_simulation(tmp_path: Path) -> None:
     save, log = tmp_path / "live.rrd", tmp_path / "live.log"
     with RunningLab(write_lab(tmp_path)) as lab, live(lab.config, save, log) as process:
-        eventually(lambda: save.exists() and save.stat().st_size > 400_000, timeout_s=30)
+        eventually(lambda: save.exists() and save.stat().st_size > 400_000)
         lab_sim = lab.service_pid("sim")
         subprocess.run(["kill", "-STOP", str(lab_sim)], check=True)
-        eventually(lambda: "nothing comes from rig1: waiting for it" in log.read_text(), timeout_s=20)
+        eventually(lambda: "nothing comes from rig1: waiting for it" in log.read_text())
         subprocess.run(["kill", "-KILL", str(lab_sim)], check=True)
-        eventually(lambda: "rig1 is back" in log.read_text(), timeout_s=30)
+        eventually(lambda: "rig1 is back" in log.read_text())
         size = save.stat().st_size
-        eventually(lambda: save.stat().st_size > size + 100_000, timeout_s=20)
+        eventually(lambda: save.stat().st_size > size + 100_000)
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0, log.read_text()
+        assert process.wait(PATIENT_S) == 0, log.read_text()
     shown = RrdFile(save)
     assert shown.rows("/position") == shown.rows("/scene/joints/theta1") > 50
 

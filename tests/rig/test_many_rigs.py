@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
-from waiting import eventually
+from labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -65,21 +65,16 @@ def test_every_rig_is_served_by_one_of_the_edges(lab: RunningLab) -> None:
     assert all(rig["served"] and rig["simulated"] for rig in shown["rigs"])
 
 
-def test_top_shows_who_holds_a_rig_its_loop_and_that_it_is_recorded(
-    lab: RunningLab, controller: ModbusTcpClient
-) -> None:
+def test_top_shows_who_holds_a_rig_its_loop_and_that_it_is_recorded(lab: RunningLab) -> None:
     def shown() -> dict[str, Any] | None:
-        for _ in range(5):
-            controller.read_holding_registers(4, count=4)
-            controller.write_registers(0, [100, 0, 0, 0])
         rig = rig_of(lab, "rig4")
         return rig if rig["controller"] and rig["recording"] and rig["loop_samples"] else None
 
-    # Each look is a command of its own, which takes seconds on a busy machine.
-    rig = eventually(shown, timeout_s=60)
+    with steady_controller(lab.lab.ports["rig4"]):
+        rig = eventually(shown)
+        table = hilrig("top", "--once", "--config", lab.config).stdout
     assert rig["controller"].startswith("127.0.0.1:")
     assert rig["loop_p50_ms"] >= 15
-    table = hilrig("top", "--once", "--config", lab.config).stdout
     assert re.search(r"rig4\s+127\.0\.0\.1:\d+", table)
     assert "edge/2" in table
 
@@ -97,11 +92,11 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
 
         try:
             # Each service says once a second how it is: simulation, two edges and two recorders.
-            eventually(lambda: text().count("hilrig_up{") == 5, timeout_s=10, every_s=0.2)
+            eventually(lambda: text().count("hilrig_up{") == 5, every_s=0.2)
             assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
         finally:
             process.terminate()
-        assert process.wait(10) == 0
+        assert process.wait(PATIENT_S) == 0
     taken = hilrig("metrics", "--config", lab.config, "--listen", f"127.0.0.1:{lab.port}")
     assert taken.returncode == 3
     assert "choose another address with --listen" in taken.stderr
@@ -123,7 +118,7 @@ def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusT
         assert client.connect()
         for _ in range(20):
             assert not client.write_registers(0, [800, 0, 0, 0]).isError()
-        eventually(lambda: client.read_holding_registers(4, count=1).registers[0] > 100, timeout_s=5)
+        eventually(lambda: client.read_holding_registers(4, count=1).registers[0] > 100)
         listed = json.loads(hilrig("rig", "list", "--json", "--config", lab.config).stdout)
         assert [(row["rig"], row["in_file"]) for row in listed][-1] == ("guest", False)
         held = json.loads(hilrig("lease", "guest", "--json", "--config", lab.config).stdout)
@@ -173,14 +168,14 @@ def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab,
         if b"rig1,rig2" in Path(f"/proc/{pid}/cmdline").read_bytes() and _is(pid, "edge")
     )
     os.kill(first, signal.SIGKILL)
-    eventually(lambda: "edge is started again" in lab.output(), timeout_s=10)
+    eventually(lambda: "edge is started again" in lab.output())
     assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
 
     def back() -> bool:
         with closing(ModbusTcpClient("127.0.0.1", port=lab.port, timeout=1)) as client:
             return client.connect() and not client.read_holding_registers(4, count=4).isError()
 
-    eventually(back, timeout_s=15, every_s=0.1)
+    eventually(back, every_s=0.1)
 
 
 def test_logs_are_one_json_object_a_line(lab: RunningLab) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from labs import HILRIG, free_ports, hilrig
 from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, router, sending, wait_ready
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 
 @pytest.mark.rig
@@ -22,7 +22,7 @@ def test_a_recorder_that_is_told_to_end_finishes_its_files(tmp_path: Path, numbe
         eventually(lambda: senders.count("rig1") > 150)
         eventually(lambda: files_of(lab, "rig1", "*.part"))
         recorder.process.send_signal(number)
-        assert recorder.process.wait(5) == 0
+        assert recorder.process.wait(PATIENT_S) == 0
         [path] = files_of(lab, "rig1")
         assert not files_of(lab, "rig1", "*.part")
         found = recorded([path])
@@ -82,7 +82,7 @@ def test_a_session_by_hand_and_its_refusals(tmp_path: Path) -> None:
             ended = hilrig("record", "stop", "rig1", "--config", config)
             assert ended.returncode == 0, ended.stderr
             assert session in ended.stdout
-            [first, last] = eventually(lambda: len(files_of(lab, "rig1")) == 2 and files_of(lab, "rig1"), timeout_s=20)
+            [first, last] = eventually(lambda: len(files_of(lab, "rig1")) == 2 and files_of(lab, "rig1"))
             assert first.name == f"{session}.mcap"
             assert metadata(last)["hilrig.session"]["session"] == session
             assert metadata(last)["hilrig.summary"]["reason"] == "ended by hand"
@@ -177,7 +177,7 @@ def test_rotation_loses_nothing_at_the_seams(tmp_path: Path) -> None:
     with RecorderProcess(config) as recorder, sending(lab, ["rig1"]) as senders:
         wait_ready(lab, recorder)
         senders.begin("rig1")
-        eventually(lambda: len(files_of(lab, "rig1")) >= 3, timeout_s=20)
+        eventually(lambda: len(files_of(lab, "rig1")) >= 3)
         senders.end("rig1")
         eventually(lambda: not files_of(lab, "rig1", "*.part"))
         paths = files_of(lab, "rig1")

@@ -20,7 +20,7 @@ from hilrig_runtime.service import Service
 from hilrig_schemas import Event, RigConfig
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
 from log_streams import FakeSource
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 SESSION = "20260101T000000Z-rig1-abcd"
 
@@ -209,7 +209,7 @@ def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
 
     def crawl(writer: RunWriter) -> None:
         if slow.is_set():
-            go_on.wait(10)
+            go_on.wait(PATIENT_S)
         close_chunk(writer)
 
     monkeypatch.setattr(RunWriter, "close_chunk", crawl)
@@ -256,7 +256,7 @@ def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost
             lab.send(sim)
             return len(lab.recordings()) >= 2
 
-        eventually(three_files, timeout_s=20)
+        eventually(three_files)
         edge.end("rig1", SESSION, now())
         lab.send(edge)
         sim.state("rig1", now())

@@ -14,7 +14,7 @@ from hilrig_schemas import Event, JointState, RigBatch, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, CONFIG, EVENT, STATE
 from hilrig_sim.model import RigParameters
 from labs import HILRIG, hilrig, write_lab
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -64,7 +64,7 @@ class SimProcess:
 def sim(tmp_path: Path) -> Iterator[SimProcess]:
     running = SimProcess(write_lab(tmp_path))
     try:
-        eventually(lambda: running.states, timeout_s=20)
+        eventually(lambda: running.states)
         yield running
     finally:
         running.close()
@@ -103,7 +103,7 @@ def test_a_command_moves_the_arm_closes_the_loop_and_is_missed_when_it_stops(sim
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_it_ends_with_0_when_it_is_told_to(sim: SimProcess, how: signal.Signals) -> None:
     os.kill(sim.process.pid, how)
-    assert sim.process.wait(timeout=5) == 0
+    assert sim.process.wait(PATIENT_S) == 0
     assert "Traceback" not in sim.log.read_text()
 
 

@@ -42,7 +42,7 @@ def test_mbpoll_turns_joint_1_reads_it_back_and_friction_stops_it(lab: RunningLa
     start = mbpoll_read(lab.port, register=5, count=4)
     assert start == [0, 0, 0, 0] or start[:2] == [0, 0]
     mbpoll_write(lab.port, register=1, value=1500)
-    turned = eventually(lambda: (now := mbpoll_read(lab.port, 5, 4))[0] > start[0] + 200 and now, timeout_s=5)
+    turned = eventually(lambda: (now := mbpoll_read(lab.port, 5, 4))[0] > start[0] + 200 and now)
     mbpoll_write(lab.port, register=1, value=0)
 
     def stands() -> bool:
@@ -50,7 +50,7 @@ def test_mbpoll_turns_joint_1_reads_it_back_and_friction_stops_it(lab: RunningLa
         time.sleep(0.1)
         return mbpoll_read(lab.port, 5, 4)[0] == first >= turned[0]
 
-    eventually(stands, timeout_s=5)
+    eventually(stands)
 
 
 def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
@@ -59,7 +59,7 @@ def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
     assert mbpoll_read(lab.port, 1, 1, kind="coil") == [1]
     mbpoll_write(lab.port, register=1, value=0, kind="coil")
     assert mbpoll_read(lab.port, 1, 1, kind="coil") == [0]
-    eventually(lambda: lab.recordings, timeout_s=15)
+    eventually(lambda: lab.recordings)
     lab.stop()
     magnet = open_run(lab.recordings[0]).states["magnet"]
     assert magnet.any()
@@ -133,7 +133,7 @@ def test_any_other_service_is_restarted_too(lab: RunningLab, name: str) -> None:
         with ModbusTcpClient("127.0.0.1", port=lab.port, timeout=1, retries=0) as client:
             return client.connected and not client.read_holding_registers(4, count=4).isError()
 
-    eventually(answers, timeout_s=20, every_s=0.1)
+    eventually(answers, every_s=0.1)
 
 
 def test_services_end_when_up_itself_is_killed(lab: RunningLab) -> None:

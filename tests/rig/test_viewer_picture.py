@@ -19,7 +19,7 @@ from hilrig_replay.run import open_run
 from hilrig_replay.viewer import environment, executable, free_port, running_viewer
 from labs import HILRIG
 from recordings import Script, record
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -76,8 +76,8 @@ def test_replay_to_a_browser_ends_with_its_viewer_on_a_signal(rrd: Path) -> None
         line = process.stderr.readline()
         assert line.startswith("open http://127.0.0.1:"), line
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
-        eventually(lambda: not session_of(process.pid), timeout_s=5)
+        assert process.wait(PATIENT_S) == 0
+        eventually(lambda: not session_of(process.pid))
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

@@ -11,7 +11,7 @@ from typing import Any
 
 from hilrig_recorder.disk import Disk
 from hilrig_runtime.clock import SYSTEM_CLOCK
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 
 @dataclass(eq=False)
@@ -142,6 +142,6 @@ def test_at_the_end_every_file_gets_its_name_if_need_be_without_syncing() -> Non
 
     thread.end(slow, finish_slowly)  # type: ignore[arg-type]
     thread.end(quick, quick.finish)  # type: ignore[arg-type]
-    assert begun.wait(5)
+    assert begun.wait(PATIENT_S)
     assert thread.close(0.05)
     assert (slow.done, quick.done) == (["publish"], ["finish", "publish"])
