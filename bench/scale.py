@@ -10,6 +10,9 @@ the simulation lie between two ticks. A controller whose phase is anything meets
 (sum of these) / step, and then takes two steps, by nature and not by a fault. So the 99th percentile of many
 controllers is two steps, and the share within one step tells machines apart: 94 % are 1.2 ms for all of it. The three
 parts are measured one by one, which is possible as all processes share this machine's monotonic clock.
+
+Where the host of a virtual machine takes processors away, a loop waits for what is no part of the rig. What is promised
+is judged by the loops that closed with no stolen time near them, if there are enough of these; said are all.
 """
 
 import json
@@ -26,6 +29,7 @@ import harness
 import numpy as np
 from harness import Report, build_c, progress, write_lab
 from numpy.typing import NDArray
+from stolen import StolenTime
 
 from hilrig_cli.lab import running_lab
 from hilrig_cli.supervisor import shared
@@ -48,6 +52,8 @@ EDGES = tuple(map(int, os.environ.get("HILRIG_BENCH_EDGES", "1").split(",")))
 """Numbers of edges that share the rigs, each tried."""
 SETTLE_S = 2.0
 """Sessions begin, files are opened: the first so many seconds of a run are not its steady state."""
+ENOUGH = 5_000
+"""Loops with no stolen time near that tell a share to half a percent."""
 
 
 @dataclass
@@ -59,6 +65,10 @@ class Found:
     steps: NDArray[np.int64]
     """From a command's basis to the step at which it took effect, one a sample."""
     loop_ms: NDArray[np.float64]
+    undisturbed: NDArray[np.bool_]
+    """Of each sample, whether nothing was stolen near it."""
+    stolen: float
+    """Taken away by the host, processors."""
     ways_ms: dict[str, NDArray[np.float64]]
     """Parts of the way from a tick round to the simulation again, one value a sample each."""
     lost: int
@@ -87,10 +97,16 @@ def measure(report: Report, quick: bool) -> None:
 
 def add(report: Report, found: Found, edges: int) -> None:
     case = f"{found.rigs} rigs" if edges == 1 else f"{found.rigs} rigs, {edges} edges"
+    is_judged = found.undisturbed if found.undisturbed.sum() >= ENOUGH else np.ones_like(found.undisturbed)
+    judged = found.steps[is_judged]
     within = float((found.steps <= 1).mean())
     report.add(case, "loop p50", float(np.percentile(found.loop_ms, 50)), "ms")
     report.add(case, "loop p99", float(np.percentile(found.loop_ms, 99)), "ms")
     report.add(case, "within one step", 100 * within, "%")
+    if not is_judged.all():
+        report.add(case, "within one step, with no stolen time near", 100 * float((judged <= 1).mean()), "%")
+    report.add(case, "samples with no stolen time near", int(found.undisturbed.sum()), "count")
+    report.add(case, "taken away by the host", found.stolen, "processors")
     for way, times_ms in found.ways_ms.items():
         for share in (50, 99):
             report.add(case, f"{way} p{share}", float(np.percentile(times_ms, share)), "ms")
@@ -112,8 +128,8 @@ def add(report: Report, found: Found, edges: int) -> None:
         case, "processor a rig, all services", 1e3 * sum(found.cpu_s.values()) / found.wall_s / found.rigs, "mcore"
     )
     if found.rigs == PROMISED:
-        report.bar(f"{case}: 99th percentile of the loop, in steps", float(np.percentile(found.steps, 99)), "<=", 2)
-        report.bar(f"{case}: loop within one step", 100 * within, ">=", 94, "%")
+        report.bar(f"{case}: 99th percentile of the loop, in steps", float(np.percentile(judged, 99)), "<=", 2)
+        report.bar(f"{case}: loop within one step", 100 * float((judged <= 1).mean()), ">=", 94, "%")
         report.bar(f"{case}: messages lost", found.lost, "<=", 0)
         report.bar(f"{case}: recordings of rigs", found.recordings / found.rigs, ">=", 1)
 
@@ -132,6 +148,7 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
         with (
             running_lab(lab, config, lambda line: print(line, file=sys.stderr), threading.Event(), parts),
             ZenohBus(lab.bus, "tool") as bus,
+            StolenTime() as stolen,
         ):
             bus.subscribe(HEALTH.key(lab.name, "*", "*"), hear)
             wall_ns = SYSTEM_CLOCK.wall_ns()
@@ -139,7 +156,7 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
             output = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=seconds + 60).stdout
         figures = json.loads(output)
         begin_ns, end_ns = wall_ns + round(SETTLE_S * 1e9), wall_ns + round((SETTLE_S + figures["seconds"]) * 1e9)
-        found = in_recordings(Path(folder), count, figures, begin_ns)
+        found = in_recordings(Path(folder), count, figures, begin_ns, stolen)
     for service, reports in healths.items():
         # A service that got no time to report in is seen by its first and last word.
         steady = [health for health in reports if begin_ns <= health.wall_ns <= end_ns] or reports
@@ -153,8 +170,8 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
     return found
 
 
-def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: int) -> Found:
-    steps, loops, lost, recordings = [], [], 0, set()
+def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: int, stolen: StolenTime) -> Found:
+    steps, loops, undisturbed, lost, recordings = [], [], [], 0, set()
     ways: dict[str, list[NDArray[np.float64]]] = {}
     for path in folder.rglob("*.mcap"):
         run = open_run(path)
@@ -163,6 +180,7 @@ def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: i
         table = one.table[one.table["wall_ns"] >= begin_ns]
         steps.append(table["step"].astype(np.int64) - table["basis_step"].astype(np.int64))
         loops.append(table["loop"] / 1e6)
+        undisturbed.append(stolen.undisturbed(table["wall_ns"]))
         lost += one.lost.transport + one.lost.recorder
         for way, times_ms in ways_of(run, begin_ns).items():
             ways.setdefault(way, []).append(times_ms)
@@ -171,6 +189,8 @@ def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: i
         load=figures,
         steps=np.concatenate(steps),
         loop_ms=np.concatenate(loops),
+        undisturbed=np.concatenate(undisturbed),
+        stolen=stolen.share,
         ways_ms={way: np.concatenate(parts) for way, parts in ways.items()},
         lost=lost,
         recordings=len(recordings),
