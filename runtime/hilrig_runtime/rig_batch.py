@@ -64,7 +64,7 @@ class BatchSender:
 class Gatherer:
     """Sends messages of single rigs as they come; where there are many, those of a short while together.
 
-    `later` is asked to call a function in that while; `urgent` says that even so nothing may wait now.
+    `later` is asked to call a function in that while.
     """
 
     MANY: Final = 32
@@ -75,11 +75,9 @@ class Gatherer:
         source: str,
         together: Publisher,
         later: Callable[[Callable[[], None]], object],
-        urgent: Callable[[], bool],
     ) -> None:
         self._put = together.put
         self._later = later
-        self._urgent = urgent
         self._source = source
         self._rigs: list[str] = []
         self._messages: list[bytes] = []
@@ -91,7 +89,7 @@ class Gatherer:
         self._rigs.append(rig)
         self._messages.append(payload)
         self._count += 1
-        if not self._waits or self._urgent():
+        if not self._waits:
             self.flush()
         elif len(self._rigs) == 1:
             self._later(self.flush)

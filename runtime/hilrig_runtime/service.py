@@ -230,12 +230,11 @@ class Service:
         self,
         topic: ServiceTopic[RigBatch],
         later: Callable[[Callable[[], None]], object],
-        urgent: Callable[[], bool],
     ) -> Gatherer:
         """An end that sends single messages, together where they are many; see `Gatherer`."""
         key = topic.key(self.lab.name, self.name, self.instance)
         together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return Gatherer(self.source, together, later, urgent)
+        return Gatherer(self.source, together, later)
 
     def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
         """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""

@@ -107,3 +107,40 @@ def test_a_loop_without_a_timer_waits_for_what_comes() -> None:
             loop.direct.unregister(here)
     finally:
         loop.close()
+
+
+def test_what_waits_for_quiet_is_called_as_soon_as_nothing_is_ready() -> None:
+    loop = DirectLoop()
+    try:
+        told: list[int] = []
+        loop.call_later(3_600, pytest.fail, "a timer came first")
+        loop.direct.call_when_quiet(lambda: told.append(1), 3_600)
+        loop.direct.call_when_quiet(lambda: told.append(2) or loop.call_soon(loop.stop), 3_600)  # type: ignore[func-returns-value]
+        loop.run_forever()
+        assert told == [1, 2]
+    finally:
+        loop.close()
+
+
+def test_what_waits_for_quiet_does_not_wait_for_ever() -> None:
+    with flooded() as (loop, flood):
+        loop.direct.call_when_quiet(lambda: loop.call_soon(loop.stop), 0.005)
+        loop.run_forever()
+        assert flood.served > 1
+
+
+def test_what_waits_for_quiet_waits_while_there_is_something_to_do() -> None:
+    with flooded() as (loop, flood):
+        served_then: list[int] = []
+
+        def asked() -> None:
+            if flood.served == 1:
+                loop.direct.call_when_quiet(lambda: served_then.append(flood.served), 3_600)
+            if flood.served == 100:
+                # Nothing is ready any more.
+                flood.here.recv(1)
+                loop.call_later(0.001, loop.stop)
+
+        flood.asked = asked  # type: ignore[method-assign]
+        loop.run_forever()
+        assert served_then == [100]

@@ -85,9 +85,8 @@ class Gathering:
         hub = MemoryHub()
         self.heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
         self.waiting: list[Callable[[], None]] = []
-        self.urgent = False
         publisher = MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic)
-        self.gatherer = Gatherer("edge/1", publisher, self.waiting.append, lambda: self.urgent)
+        self.gatherer = Gatherer("edge/1", publisher, self.waiting.append)
         self.rigs = {f"rig{number}": partial(self.gatherer.add, f"rig{number}") for number in range(Gatherer.MANY)}
 
     def speak_often(self) -> None:
@@ -134,15 +133,6 @@ def test_of_one_controller_that_writes_very_often_every_command_leaves_in_its_or
     fast.waiting.pop()()
     (batch,) = map(RigBatch.FromString, fast.heard.payloads)
     assert (list(batch.rigs), list(batch.messages)) == (["rig1"] * 3, [b"a", b"b", b"c"])
-
-
-def test_what_is_urgent_does_not_wait_and_takes_along_what_waits() -> None:
-    many = Gathering()
-    many.speak_often()
-    many.rigs["rig1"](b"a")
-    many.urgent = True
-    many.rigs["rig2"](b"b")
-    assert many.heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
 
 
 def test_sending_for_long_takes_no_memory() -> None:

@@ -28,8 +28,10 @@ FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 GATHER_S: Final = 0.002
 """For so long commands wait for each other where there are many, if the next tick is far enough."""
 NEAR_NS: Final = 6_000_000
-"""So long before the simulation's next tick none waits: two milliseconds it would, one more the system's timer may be
-late, and it has to get there. With a shorter step none waits at all."""
+"""So long before the simulation's next tick that is too long: the system's timer may be one millisecond late, and a
+command has to get there. With a shorter step it always is."""
+GATHER_NEAR_S: Final = 0.000_2
+"""Then they wait until no request is there to be answered, but no longer than this."""
 MANY: Final = 16
 """Rigs that are looked after at once; more than that in turns, so that no request waits for all of them."""
 MOST_TURNS: Final = 4
@@ -45,22 +47,21 @@ def run(service: Service) -> None:
         OperationError: a rig's address can't be had.
     """
 
-    async def serve() -> None:
-        await Edge(service, asyncio.get_running_loop()).run()
-
     with asyncio.Runner(loop_factory=DirectLoop) as runner:
-        runner.run(serve())
+        loop = runner.get_loop()
+        assert isinstance(loop, DirectLoop)
+        runner.run(Edge(service, loop).run())
 
 
 class Edge:
     """The rigs of one edge."""
 
-    def __init__(self, service: Service, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, service: Service, loop: DirectLoop) -> None:
         self._service = service
         self._loop = loop
         self._alarm = Alarm(loop, service.clock)
         self._states = service.latest_of_batches(topics.STATES)
-        self._commands = service.gatherer(topics.COMMANDS, self._soon, self._tick_is_near)
+        self._commands = service.gatherer(topics.COMMANDS, self._soon)
         self._seats: dict[str, Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
         now_ns = service.clock.monotonic_ns()
         for number, seat in enumerate(self._seats.values()):
@@ -226,11 +227,10 @@ class Edge:
             deadline_ns += (missed + 1) * TICK_NS
 
     def _soon(self, call: Callable[[], None]) -> None:
-        self._loop.call_later(GATHER_S, call)
-
-    def _tick_is_near(self) -> bool:
-        """Whether a command that waits now could miss the simulation's next tick."""
-        return self._monotonic_ns() - self._states.arrived_ns > self._far_ns
+        if self._monotonic_ns() - self._states.arrived_ns > self._far_ns:
+            self._loop.direct.call_when_quiet(call, GATHER_NEAR_S)
+        else:
+            self._loop.call_later(GATHER_S, call)
 
     def _close(self) -> None:
         self._closing.close()

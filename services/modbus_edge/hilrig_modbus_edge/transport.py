@@ -38,6 +38,9 @@ class DirectSelector(selectors.DefaultSelector):
         """Something was asked of asyncio since it began to wait: it must have its turn before it waits on."""
         self._calls: dict[int, Callable[[int], None]] = {}
         """By handle, what to call with the events."""
+        self._when_quiet: list[Callable[[], None]] = []
+        self._quiet_at_s = 0.0
+        """When those are called though it is not quiet, s, monotonic clock."""
         self._poll: Callable[[float], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
@@ -54,6 +57,12 @@ class DirectSelector(selectors.DefaultSelector):
         self._calls.pop(key.fd, None)
         return key
 
+    def call_when_quiet(self, callback: Callable[[], None], within_s: float) -> None:
+        """Call once as soon as no socket is ready, and after `within_s` even so."""
+        at_s = monotonic() + within_s
+        self._quiet_at_s = min(at_s, self._quiet_at_s) if self._when_quiet else at_s
+        self._when_quiet.append(callback)
+
     def select(self, timeout: float | None = None) -> _Events:
         """See `selectors.BaseSelector.select`; what is called meanwhile does not end the wait."""
         poll, call_of = self._poll, self._calls.get
@@ -61,7 +70,8 @@ class DirectSelector(selectors.DefaultSelector):
         others: _Events = []
         self.asyncio_has_work = False
         while True:
-            ready = poll(-1 if timeout is None else timeout if timeout > 0 else 0)
+            waiting = self._when_quiet
+            ready = poll(0 if waiting else -1 if timeout is None else timeout if timeout > 0 else 0)
             for handle, mask in ready:
                 call = call_of(handle)
                 # By far the most often there is something to read and nothing else.
@@ -70,10 +80,17 @@ class DirectSelector(selectors.DefaultSelector):
                     call(events)
                 elif (key := self.get_map().get(handle)) is not None and events & key.events:
                     others.append((key, events & key.events))
-            if others or self.asyncio_has_work or not ready:
+            now_s = monotonic()
+            if waiting and (not ready or now_s >= self._quiet_at_s):
+                self._when_quiet = []
+                for callback in waiting:
+                    callback()
+            elif not ready:
+                return others
+            if others or self.asyncio_has_work:
                 return others
             if deadline_s is not None:
-                timeout = deadline_s - monotonic()
+                timeout = deadline_s - now_s
                 if timeout <= 0:
                     return others
 
