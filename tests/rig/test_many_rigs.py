@@ -123,6 +123,8 @@ def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusT
         assert [(row["rig"], row["in_file"]) for row in listed][-1] == ("guest", False)
         held = json.loads(hilrig("lease", "guest", "--json", "--config", lab.config).stdout)
         assert held["holder"].startswith("127.0.0.1:")
+        leases = json.loads(hilrig("lease", "--json", "--config", lab.config).stdout)
+        assert [row["rig"] for row in leases] == ["rig1", "rig2", "rig3", "rig4", "guest"]
         assert hilrig("rig", "reset", "guest", "--config", lab.config).returncode == 0
         assert client.connected
         assert hilrig("rig", "remove", "guest", "--config", lab.config).returncode == 0

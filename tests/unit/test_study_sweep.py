@@ -53,6 +53,10 @@ def load(folder: Path, text: str = SMALL) -> StudyConfig:
         (SMALL + '[[controllers]]\nkind = "file"', "a file go together"),
         (SMALL + '[[traces]]\nx = 1\ny = 1\ncontroller = "X"', "no controller is called 'X'"),
         (SMALL + "[task]\npose = [0, 0, 0, 0]", "d3"),
+        (
+            SMALL + "[task]\npose = [132, 0, 80, 0]\noffset = [3, 0, 0, 0]",
+            r"task: theta1 would start at 135 \(pose 132, offset 3\): expected -133 to 133",
+        ),
         (SMALL.replace("duration_s = 3", "compute_ms = 30"), "its period must be longer"),
         (SMALL + '[impairment]\ncommand = "uniform:40,10"', "low_ms 40 is above high_ms 10"),
         (SMALL + "[task]\noffset = [200, 0, 0, 0]", "theta1"),

@@ -10,7 +10,7 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.presence import rosters
 from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas.topics import RigTopic
+from hilrig_schemas.topics import RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -19,7 +19,9 @@ ANSWER_WITHIN_S: Final = 3.0
 
 
 def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Message) -> list[MessageT]:
-    """Ask on a rig's topic, or on every rig's where `rig` is empty; the answers, at least one.
+    """Ask on a rig's topic, or on every rig's where `rig` is empty; the answers, at least one, in the lab's order.
+
+    Rigs that were added since the lab started come last.
 
     Raises:
         InputError: the lab has no such rig.
@@ -37,7 +39,9 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
             raise OperationError(f"rig {rig!r}: the edge refused: {answer.error}")
     if not answers:
         raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
-    return [topic.decode(answer.payload) for answer in answers]
+    places = {rig.name: place for place, rig in enumerate(lab.rigs)}
+    by_rig = {parse_rig_key(answer.key).rig: answer.payload for answer in answers}
+    return [topic.decode(by_rig[rig]) for rig in sorted(by_rig, key=lambda rig: (places.get(rig, len(places)), rig))]
 
 
 def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:

@@ -20,7 +20,7 @@ from hilrig_runtime.impairment_config import ImpairmentSetting, Ways
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import NotNegative, Number, Positive, Section, Vector4
 from hilrig_sim.configured import rig_parameters
-from hilrig_sim.model import RigParameters
+from hilrig_sim.model import JOINT_NAMES, RigParameters
 from hilrig_study.controllers import ComputedTorque, Controller, Pid
 from hilrig_study.linear import LinearPlant, linearise
 from hilrig_study.lqr import PredictiveLqr
@@ -227,8 +227,33 @@ class StudyConfig(Section):
             raise ValueError(f"{cells:,} runs are more than {MOST_CELLS:,}: take fewer values")
         return self
 
+    @model_validator(mode="after")
+    def _starts_between_its_stops(self) -> "StudyConfig":
+        joints = zip(
+            JOINT_NAMES,
+            self.task.pose,
+            self.task.offset,
+            self.arm.lower_limits,
+            self.arm.upper_limits,
+            strict=True,
+        )
+        for joint, pose, offset, lower, upper in joints:
+            if not lower <= pose + offset <= upper:
+                raise ValueError(
+                    f"task: {joint} would start at {pose + offset:g} (pose {pose:g}, offset {offset:g}): "
+                    f"expected {lower:g} to {upper:g}"
+                )
+        return self
+
     def with_files(self, paths: Sequence[Path]) -> "StudyConfig":
-        """The same with more controllers, each out of a Python file and called like it."""
+        """The same with more controllers, each out of a Python file and called like it.
+
+        Raises:
+            InputError: there is no such file.
+        """
+        for path in paths:
+            if not path.is_file():
+                raise InputError(f"--controller {path}: no such file")
         more = [ControllerConfig(name=path.stem[:40], kind="file", file=path.resolve()) for path in paths]
         return self.model_copy(update={"controllers": (*self.controllers, *more)})
 

@@ -44,11 +44,12 @@ def check(
         return
     table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is good", title_justify="left")
     kinds = list(lab.addresses(lab.rigs[0].name))
-    for column in ("rig", *kinds, "step", "integrator"):
+    allows = any(rig.allow for rig in lab.rigs)
+    for column in ("rig", *kinds, *(["may connect"] if allows else []), "step", "integrator"):
         table.add_column(column)
     for rig in lab.rigs:
         substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
-        table.add_row(
-            rig.name, *lab.addresses(rig.name).values(), f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps
-        )
+        allowed = [", ".join(map(str, rig.allow)) or "all"] if allows else []
+        step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
+        table.add_row(rig.name, *lab.addresses(rig.name).values(), *allowed, *step)
     Console().print(table)

@@ -65,8 +65,7 @@ def impair(
     request = ImpairmentRequest(as_lab=lab)
     if setting or off:
         request.set_json = _impairment(preset, state, command, loss, trace, seed).model_dump_json()
-    answers = ask_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
-    statuses = sorted(answers, key=lambda status: status.rig)
+    statuses = ask_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if rig else rows))

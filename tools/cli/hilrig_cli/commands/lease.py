@@ -28,8 +28,7 @@ def lease(
 
     if release and not rig:
         raise InputError("--release takes a rig: hilrig lease RIG --release")
-    answers = ask_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
-    statuses = sorted(answers, key=lambda status: status.rig)
+    statuses = ask_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if rig else rows))

@@ -50,7 +50,7 @@ def study(
     if from_run is not None:
         if live:
             raise InputError("--from takes what was recorded, and --live runs anew: choose one")
-        _from_recording(from_run, file, as_json)
+        _from_recording(from_run, file, as_json, console)
         return
     if file is None:
         raise InputError("name a study's file, or a recording with --from; examples/studies has one to start from")
@@ -67,20 +67,23 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_runtime.errors import InputError, OperationError
-    from hilrig_study.pictures import Dot, plane_figure, save_pictures, traces
-    from hilrig_study.rerun_pictures import save_study_rrd
-    from hilrig_study.results import save_results
     from hilrig_study.study_config import load_study
-    from hilrig_study.sweep import sweep
 
     chosen = load_study(file).with_files(controllers)
     if live and not chosen.live:
         raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
+    # Before these, which take a moment: what is wrong with a study is said at once.
+    from hilrig_study.pictures import Dot, plane_figure, save_pictures, traces
+    from hilrig_study.rerun_pictures import save_study_rrd
+    from hilrig_study.results import save_results
+    from hilrig_study.sweep import sweep
+
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OperationError(f"{out}: results can't be written there: {error.strerror}") from error
-    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress:
+    columns = (*Progress.get_default_columns(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("sweep", total=1.0)
         shown = traces(chosen, file.parent)
         swept = sweep(chosen, file.parent, lambda share: progress.update(task, completed=share))
@@ -146,12 +149,14 @@ def _ms(seconds: float | None) -> str:
     return "–" if seconds is None else f"{seconds * 1e3:.1f}"
 
 
-def _from_recording(path: Path, file: Path | None, as_json: bool) -> None:
+def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Console") -> None:
     from hilrig_replay.run import open_run
     from hilrig_study.from_recording import judge_gains
     from hilrig_study.study_config import load_study
 
-    judged = judge_gains(open_run(path), None if file is None else load_study(file)).as_dict()
+    study = None if file is None else load_study(file)
+    with console.status("judging gains"):
+        judged = judge_gains(open_run(path), study).as_dict()
     if as_json:
         print(json.dumps(judged))
     else:
