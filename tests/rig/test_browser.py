@@ -51,9 +51,13 @@ def test_a_report_is_whole_wide_and_narrow_and_asks_the_network_for_nothing(
     browser.open(report.as_uri(), width=width, height=2400)
     assert browser.errors == []
     assert all(address.startswith(("file:", "data:")) for address in browser.requests)
-    assert browser.run("[...document.images].every(image => image.complete && image.naturalWidth > 500)")
-    assert browser.run("document.images.length") == 2
-    # Nothing sticks out: wide tables scroll within their sections.
+    assert browser.run("[...document.images].every(image => image.complete && image.naturalWidth > 400)")
+    assert browser.run("document.images.length") == 4
+    assert browser.run("[...document.images].every(image => image.getBoundingClientRect().right <= innerWidth)")
+    # One below the other where the page is narrow.
+    rows = browser.run("new Set([...document.images].map(image => image.getBoundingClientRect().top)).size")
+    assert rows == (2 if width > 700 else 4)
+    # Nothing else sticks out: wide tables scroll within their sections.
     assert browser.run("document.documentElement.scrollWidth") <= width
     words = browser.run("document.body.innerText")
     for said in ("Task: There", "passed", "register wait", "controlled by 192.0.2.7:40001"):

@@ -72,7 +72,6 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples, "WINDOW", ROWS)
     monkeypatch.setattr(verify, "PIECE", ROWS)
     monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
-    monkeypatch.setattr(rerun_view, "ROWS", ROWS)
     monkeypatch.setattr(summary, "COURSE_POINTS", ROWS)
     monkeypatch.setattr(latency_plot, "_STRETCHES", ROWS)
     monkeypatch.setattr(diagnosis, "WINDOW_S", 1.0)

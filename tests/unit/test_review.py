@@ -150,7 +150,8 @@ def test_a_report_is_one_page_that_needs_no_other(tmp_path: Path) -> None:
     text = report([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0)).path]).html
     page = _Page(text)
     assert page.open == []
-    assert len(page.sources) == 2
+    # Two pictures, each in its two columns.
+    assert len(page.sources) == 4
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert not re.search(r"https?://|@import|url\(|<script|<link", text)
     for words in ("run-1", "register wait", "controlled by 192.0.2.7:40001", "0 of 4", "Not fit for latency claims"):

@@ -5,10 +5,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from numpy.typing import NDArray
 
 from hilrig_replay.assignment import task_of
 from hilrig_replay.distribution import Statistics
@@ -42,7 +46,11 @@ th, td { padding: .25rem .45rem; text-align: right; border-bottom: 1px solid #e8
 th:first-child, td:first-child, td.text { text-align: left; }
 td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600; }
 img { max-width: 100%; height: auto; display: block; }
-@media (max-width: 44rem) { .scroll img { max-width: none; width: 46rem; } th, td { padding: .25rem .3rem; }
+.picture { display: flex; align-items: flex-start; } .picture img { min-width: 0; }
+@media (max-width: 44rem) { .picture { display: block; } .picture img { width: 100%; }
+  .scroll img { max-width: none; width: 46rem; } table { font-size: .75rem; } th, td { padding: .25rem .15rem; }
+  section, details { padding: .8rem .6rem; }
+  td:first-child { white-space: normal; }
   td.text { min-width: 9rem; } }
  li { margin: .25rem 0; }
 .good { color: #1a7f37; } .bad { color: #b35900; }
@@ -237,7 +245,7 @@ def _overview(pages: Sequence[_Page]) -> str:
         )
     by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
     note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
-    distributions = _picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
+    distributions = _wide_picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
     return f"<section>{_table(header, rows)}{note}{distributions}</section>"
 
 
@@ -284,7 +292,40 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _picture(figure: Figure, what: str) -> str:
+    """A picture in its columns, beside each other where the page is wide enough, else one below the other."""
+    figure.suptitle("")
+    pixels = _pixels(figure)
+    edges = [0, *_between_columns(figure), pixels.shape[1]]
+    images = "".join(_image(pixels[:, left:right], what) for left, right in pairwise(edges))
+    return f'<div class="picture">{images}</div>'
+
+
+def _between_columns(figure: Figure) -> list[int]:
+    """Where no panel is, from the left, px."""
+    spans = sorted((box.x0, box.x1) for axes in figure.axes if (box := axes.get_tightbbox()) is not None)
+    found, end = [], spans[0][1]
+    for begin, until in spans:
+        if begin > end:
+            found.append(int((begin + end) / 2))
+        end = max(end, until)
+    return found
+
+
+def _wide_picture(figure: Figure, what: str) -> str:
+    """A picture whose panels share their rows: on a narrow page it is moved sideways."""
+    return f'<div class="scroll">{_image(_pixels(figure), what)}</div>'
+
+
+def _pixels(figure: Figure) -> NDArray[np.uint8]:
+    """A figure drawn: red, green, blue and opacity, shape (height, width, 4)."""
     with BytesIO() as file:
-        figure.savefig(file, format="png")
+        figure.savefig(file, format="rgba")
+        return np.frombuffer(file.getvalue(), np.uint8).reshape(-1, int(figure.bbox.width), 4)
+
+
+def _image(pixels: NDArray[np.uint8], what: str) -> str:
+    with BytesIO() as file:
+        imsave(file, np.ascontiguousarray(pixels), format="png")
         data = b64encode(file.getvalue()).decode()
-    return f'<div class="scroll"><img alt="{escape(what, quote=True)}" src="data:image/png;base64,{data}"></div>'
+    width = pixels.shape[1]
+    return f'<img alt="{escape(what, quote=True)}" style="flex: {width}" src="data:image/png;base64,{data}">'

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -14,9 +13,6 @@ from hilrig_replay.rig_view import Drawn, RigView
 from hilrig_replay.run import Run
 from hilrig_replay.streams import to_file, to_viewer
 from hilrig_runtime.errors import InputError
-
-ROWS: Final = 40_000
-"""Messages that are written at once, count: the fewer the pieces, the smaller the index that rerun makes of a file."""
 
 
 def drawn(run: Run) -> Drawn:
@@ -75,7 +71,7 @@ def _write(stream: rr.RecordingStream, runs: Sequence[Run], over: Callable[[], b
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
             view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
-            for block in run.blocks(rows=ROWS):
+            for block in run.blocks():
                 if over():
                     return
                 view.add(block)
