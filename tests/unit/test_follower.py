@@ -70,7 +70,7 @@ def test_what_is_on_the_bus_is_drawn_batch_by_batch(watched: Watched) -> None:
 
 
 def test_where_nothing_runs_it_says_what_to_do(watched: Watched) -> None:
-    with pytest.raises(OperationError, match=r"no simulation of rig 'rig1' in lab 'lab' answers.*hilrig up"):
+    with pytest.raises(OperationError, match=r"no simulation of rig 'rig1' answers for lab 'lab'.*hilrig up"):
         watched.follower.find(threading.Event(), timeout_s=0.0)
 
 
