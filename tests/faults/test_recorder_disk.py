@@ -130,7 +130,10 @@ def test_a_disk_that_is_full_before_the_first_chunk_is_written_holds_what_came_u
         with RecorderProcess(config) as recorder:
             wait_ready(lab, recorder)
             senders.begin("rig1")
-            eventually(lambda: files_of(lab, "rig1", "*.part"), every_s=0.002)
+            # The file has its beginning, and some messages of the session are on their way into its first chunk.
+            eventually(lambda: any(part.stat().st_size for part in files_of(lab, "rig1", "*.part")), every_s=0.002)
+            before = senders.count("rig1")
+            eventually(lambda: senders.count("rig1") > before + 10, every_s=0.002)
             fill(folder / "ballast")
             [path] = eventually(lambda: files_of(lab, "rig1"))
         found = metadata(path)
