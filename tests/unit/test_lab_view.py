@@ -111,6 +111,22 @@ def test_in_a_low_terminal_the_slowest_loops_stay() -> None:
     assert re.search(r"and \d+ rigs more", text)
 
 
+@pytest.mark.parametrize("width", [120, 70, 50])
+def test_in_a_narrow_terminal_columns_are_left_out_and_none_is_cut(width: int) -> None:
+    from rich.console import Console
+
+    console = Console(width=width)
+    with console.capture() as capture:
+        console.print(picture(view(), 11.0, None, width))
+    text = capture.get()
+    assert "…" not in text
+    assert all(len(line.rstrip()) <= width for line in text.splitlines())
+    for always in ("service", "cpu %", "lost", "rig", "p99 ms", "state", "40.0"):
+        assert always in text
+    assert ("clock ms" in text) == (width == 120)
+    assert ("controller" in text) == (width >= 70)
+
+
 def test_json_says_the_same() -> None:
     plain = view().as_dict(11.0)
     assert [service["service"] for service in plain["services"]] == ["edge", "recorder", "sim"]
