@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from hilrig_schemas import Event, JointState, TorqueCommand
 from labs import HILRIG, RunningLab, hilrig, write_lab
 from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, eventually
+from waiting import PATIENT_S, Stalls, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
 LATE_MS = 15
@@ -52,8 +52,9 @@ def messages(path: Path, topic: str, kind: type) -> list:  # type: ignore[type-a
         return [kind.FromString(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
 
 
-def judge(recording: Path, why: str) -> None:
-    """The torque of the last write was gone in time, and the event says why."""
+def judge(recording: Path, why: str, stalls: Stalls) -> None:
+    """The torque of the last write was gone in time, and the event says why; the machine may be late twice."""
+    late_ms = LATE_MS + 2e3 * stalls.worst_s
     commands = messages(recording, "/command", TorqueCommand)
     states = messages(recording, "/state", JointState)
     events = messages(recording, "/event", Event)
@@ -63,11 +64,11 @@ def judge(recording: Path, why: str) -> None:
     first_zero = next(state for state in states if state.step > acting[-1].step)
     assert first_zero.sampled_ns > last_write.write_arrived_ns
     took_ms = (first_zero.sampled_ns - last_write.write_arrived_ns) / 1e6
-    assert TIMEOUT_MS <= took_ms <= TIMEOUT_MS + STEP_MS + LATE_MS
+    assert TIMEOUT_MS <= took_ms <= TIMEOUT_MS + STEP_MS + late_ms
     [trip] = [event for event in events if event.kind == Event.WATCHDOG_TRIP]
     assert why in trip.text
     assert trip.watchdog_data.timeout_ns == TIMEOUT_MS * 1_000_000
-    assert TIMEOUT_MS <= trip.watchdog_data.silent_ns / 1e6 < TIMEOUT_MS + LATE_MS
+    assert TIMEOUT_MS <= trip.watchdog_data.silent_ns / 1e6 < TIMEOUT_MS + late_ms
 
 
 FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
@@ -81,7 +82,7 @@ FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
 @pytest.mark.rig
 def test_torque_is_gone_when_the_controller_is(tmp_path: Path) -> None:
     config = write_lab(tmp_path, rigs=3, extra=f"edge.watchdog_ms = {TIMEOUT_MS}")
-    with RunningLab(config) as lab:
+    with Stalls() as stalls, RunningLab(config) as lab:
         processes = {
             rig: subprocess.Popen(controller(lab.lab.ports[rig], mode), stdout=subprocess.PIPE, text=True)
             for rig, (mode, _, _) in FAULTS.items()
@@ -101,7 +102,7 @@ def test_torque_is_gone_when_the_controller_is(tmp_path: Path) -> None:
         assert lab.stop() == 0
         for rig, (_, _, why) in FAULTS.items():
             [recording] = [path for path in lab.recordings if path.parent.name == rig]
-            judge(recording, why)
+            judge(recording, why, stalls)
 
 
 def tripped(status: dict[str, object]) -> bool:
@@ -113,7 +114,7 @@ def test_torque_is_gone_when_the_edge_is(tmp_path: Path) -> None:
     """With the edge killed nobody repeats the command: the simulation's own time-out does it."""
     extra = "sim.command_timeout_ms = 300\nedge.repeat_ms = 100"
     config = write_lab(tmp_path, extra=extra)
-    with RunningLab(config) as lab:
+    with Stalls() as stalls, RunningLab(config) as lab:
         process = subprocess.Popen(controller(lab.port), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         try:
             assert process.stdout is not None
@@ -131,14 +132,16 @@ def test_torque_is_gone_when_the_edge_is(tmp_path: Path) -> None:
         acting = [state for state in states if any(state.effort)]
         zero = next(state for state in states if state.step > acting[-1].step)
         # The last word may be a repetition, which is not recorded.
-        assert 0 < (zero.sampled_ns - commands[-1].sent_ns) / 1e6 <= 300 + 100 + STEP_MS + LATE_MS
+        assert (
+            0 < (zero.sampled_ns - commands[-1].sent_ns) / 1e6 <= 300 + 100 + STEP_MS + LATE_MS + 2e3 * stalls.worst_s
+        )
 
 
 @pytest.mark.hosts
 def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
     require_namespaces()
     lab = write_lab(tmp_path, extra=f"edge.watchdog_ms = {TIMEOUT_MS}\nedge.host = '0.0.0.0'")
-    with Network(["rig", "pc"]) as network:
+    with Stalls() as stalls, Network(["rig", "pc"]) as network:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
         eventually(lambda: "running" in (tmp_path / "up.log").read_text())
@@ -160,4 +163,4 @@ def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
         assert up.wait(PATIENT_S) == 0
         log.close()
     [recording] = (tmp_path / "recordings").rglob("*.mcap")
-    judge(recording, "is silent")
+    judge(recording, "is silent", stalls)

@@ -7,7 +7,7 @@ import signal
 import socket
 import urllib.request
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
@@ -104,16 +104,16 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
 
 def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusTcpClient) -> None:
     with socket.socket() as stranger:
-        try:
-            stranger.bind(("127.0.0.1", lab.port + 4))
+        behind = lab.port + 4
+        # Where another one has the port behind the lab's already it may be gone a moment later.
+        with suppress(OSError):
+            stranger.bind(("127.0.0.1", behind))
             stranger.listen()
-        except OSError:
-            # Another one has the port behind the lab's already.
-            pass
+            behind += 1
         done = hilrig("rig", "add", "guest", "--config", lab.config)
     assert done.returncode == 0, done.stderr
     port = int(done.stdout.strip().rpartition(":")[2])
-    assert port > lab.port + 4
+    assert port >= behind
     with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
         assert client.connect()
         for _ in range(20):
@@ -138,7 +138,7 @@ def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: Running
     for arguments, code, text in [
         (("add", "rig1"), 2, "the lab has a rig called 'rig1' already"),
         (("add", "no name"), 2, "name: expected"),
-        (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/1 .* can't listen on"),
+        (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/[12] .* can't listen on"),
         (("remove", "nobody"), 2, "no running service has a rig called 'nobody'"),
         (("reset", "nobody"), 2, "no edge serves a rig called 'nobody'"),
     ]:
