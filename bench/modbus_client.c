@@ -12,7 +12,6 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
-#include <sched.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -120,10 +119,6 @@ int main(int argc, char **argv)
     if (connections > MOST) return 2;
     reads = malloc(SAMPLES * sizeof *reads);
     cycles = malloc(SAMPLES * sizeof *cycles);
-
-    /* Controllers stand on machines of their own: where the right is there, ours do not wait for the server's processes. */
-    struct sched_param first = {.sched_priority = 10};
-    sched_setscheduler(0, SCHED_FIFO, &first);
 
     for (int i = 0; i < connections; i++) {
         struct epoll_event event = {.events = EPOLLIN, .data.ptr = &all[i]};
