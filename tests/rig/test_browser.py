@@ -94,7 +94,7 @@ def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path
         told = re.match(r"open (http://127\.0\.0\.1:\S+) ", process.stderr.readline())
         assert told is not None
         with Browser(tmp_path / "browser", graphics=True) as browser:
-            browser.open(told[1], width=800, height=480)
+            browser.open(told[1], width=560, height=336)
 
             def arm_on_its_table(picture: np.ndarray) -> bool:
                 scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
