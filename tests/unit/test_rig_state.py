@@ -80,3 +80,29 @@ def test_states_do_not_depend_on_when_before_the_tick_a_command_came(at_ms: floa
     assert [event.kind for event in early[1]] == [event.kind for event in late[1]]
     assert {Event.RESET, Event.COMMAND_LOST} <= {event.kind for event in early[1]}
     assert any(state.loop_latency_ns for state in early[0])
+
+
+def test_parts_are_stated_on_time_though_a_command_came_after_the_state_was_encoded() -> None:
+    lab = parse_lab(f"[rigs]\ncount = {MANY}\n[[scene.parts]]\nname = 'red'\nposition_mm = [300, 0]\n")
+    with VirtualRig(lab) as rig:
+        for _ in range(120):
+            rig.simulation.look_ahead(rig._rate.next_ns)
+            rig.command((0.1, 0.0, 0.0, 0.0))
+            rig.simulation.tick(rig._rate.wait())
+        stated = [state.step for state in rig.states if state.rig == "rig1" and state.parts]
+        others = [state.step for state in rig.states if state.rig == "rig2" and state.parts]
+    assert stated == others
+    assert len(stated) >= 3
+
+
+def test_a_command_that_became_too_old_while_its_tick_was_held_up_does_not_act() -> None:
+    with VirtualRig(LAB) as rig:
+        rig.command((3.0, 0.0, 0.0, 0.0))
+        rig.tick(2)
+        assert rig.states[-MANY].effort[0] == 3.0
+        rig.simulation.look_ahead(rig._rate.next_ns)
+        rig.clock.advance(LAB.sim.command_timeout_ns)
+        rig.simulation.tick(rig._rate.wait())
+        (state,) = [state for state in rig.states[-MANY:] if state.rig == "rig1"]
+        assert (list(state.effort), state.safe) == ([0.0] * 4, True)
+        assert state.missed_steps or state.lateness_ns > LAB.sim.step_ns

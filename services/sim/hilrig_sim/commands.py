@@ -107,6 +107,10 @@ class CommandFollower:
             self.is_new = self.changed = self.lost = self.back = self.reset = False
             self.basis_step = self.arrived_ns = 0
             self._is_plain = True
+        self.overtake(arrival, now_ns)
+
+    def overtake(self, arrival: Arrival | None, now_ns: int) -> None:
+        """Take what came after `latch`, but before the tick that it was for: what it overtakes has never acted."""
         if arrival is not self._arrival and arrival is not None:
             self._is_plain = False
             self._arrival = arrival
@@ -116,13 +120,9 @@ class CommandFollower:
             self.safe = self.lost = self.changed = True
             self.silent_ns = now_ns - self._heard_ns
             self.effort = ZERO_EFFORT
-
-    def overtake(self, arrival: Arrival | None, now_ns: int) -> None:
-        """Take what came after `latch`, but before the tick that it was for: what it overtakes has never acted."""
-        if arrival is not self._arrival and arrival is not None:
-            self._is_plain = False
-            self._arrival = arrival
-            self._take(arrival, now_ns)
+            # Where it came for this very tick, and that was held up for so long, it does not act.
+            self.is_new = False
+            self.basis_step = self.arrived_ns = 0
 
     def _take(self, arrival: Arrival, now_ns: int) -> None:
         command = _decode(arrival.payload)

@@ -117,8 +117,10 @@ class Simulation:
         # Stamped after they were taken: no command arrives later than the tick that applies it.
         sampled_ns, wall_ns = self._clock.monotonic_ns(), self._clock.wall_ns()
         times.add(step, sampled_ns)
+        # What was prepared for a tick that was held up is looked at again: a command may have become too old.
+        overrun = tick.missed_steps > 0 or tick.lateness_ns > self._step_ns
         for rig, arrival in zip(rigs, arrivals, strict=True):
-            if arrival is not rig.arrival or not rig.encoded:
+            if arrival is not rig.arrival or not rig.encoded or overrun:
                 rig.follow(arrival, sampled_ns)
                 if rig.follower.reset:
                     plant.reset(rig.index)
@@ -144,7 +146,7 @@ class Simulation:
             self._catch(step + 1)
         self._see()
         self._counters.count_tick(tick, self._step_ns)
-        if tick.missed_steps or tick.lateness_ns > self._step_ns:
+        if overrun:
             self._reporter.tell_of_overrun(tick, step, sampled_ns)
 
     def _after_sending(self, latencies_ns: Mapping[int, int]) -> None:

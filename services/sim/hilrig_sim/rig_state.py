@@ -87,6 +87,8 @@ class RigState:
         self._of_command = JointState()
         self._loops_us: list[int] = []
         self._parts_due_ns = 0
+        self._parts_stated_ns = 0
+        """When the tick is whose state, as it is encoded, has the parts; 0: it has not."""
         self.move_to(index, plant)
 
     def move_to(self, index: int, plant: Plant) -> None:
@@ -113,10 +115,9 @@ class RigState:
     def encode(self, times: StepTimes, now_ns: int) -> None:
         """Encode what is known, for a tick at `now_ns`, monotonic clock."""
         follower, world, index = self.follower, self._world, self.index
-        parts = b""
+        parts, self._parts_stated_ns = b"", 0
         if self._part_names and (world.moving[index] or now_ns >= self._parts_due_ns):
-            self._parts_due_ns = now_ns + ALL_PARTS_PERIOD_NS
-            parts = self._encoded_parts()
+            parts, self._parts_stated_ns = self._encoded_parts(), now_ns
         said = (follower.session, follower.magnet, follower.safe, self._held_part, self._limit_flags)
         if said != self._said:
             self._said = said
@@ -140,6 +141,9 @@ class RigState:
     def sent(self, latency_ns: int) -> None:
         """The state has left; `latency_ns` is that of the loop that it closed, 0: none."""
         self._follows = False
+        if self._parts_stated_ns:
+            # Only now: what was encoded before may have been encoded anew, for a command that came later.
+            self._parts_due_ns = self._parts_stated_ns + ALL_PARTS_PERIOD_NS
         if latency_ns:
             self._loops_us.append(latency_ns // 1000)
 
