@@ -1,6 +1,7 @@
-"""Asking the edges of a running lab about its rigs."""
+"""Asking a running lab who is there, and its edges about their rigs."""
 
 import time
+from collections.abc import Set
 from typing import Final, TypeVar
 
 from google.protobuf.message import Message
@@ -10,12 +11,13 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.presence import rosters
 from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_schemas import Roster
 from hilrig_schemas.topics import RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
 ANSWER_WITHIN_S: Final = 3.0
-"""How long an edge has to answer; a link to it may have to be made first."""
+"""How long a service has to answer; a link to it may have to be made first."""
 
 
 def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Message) -> list[MessageT]:
@@ -28,10 +30,13 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
         OperationError: nobody answers, or the edge refuses.
     """
     payload = question.SerializeToString()
+    deadline_s = time.monotonic() + ANSWER_WITHIN_S
     with ZenohBus(lab.bus, "tool") as bus:
         if rig:
             check_rig(bus, lab, rig)
-        deadline_s = time.monotonic() + ANSWER_WITHIN_S
+        else:
+            # Else the first edge that answers would be taken for all.
+            all_rosters(bus, lab, {"edge"})
         while not (answers := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
             time.sleep(0.05)
     for answer in answers:
@@ -42,6 +47,19 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
     places = {rig.name: place for place, rig in enumerate(lab.rigs)}
     by_rig = {parse_rig_key(answer.key).rig: answer.payload for answer in answers}
     return [topic.decode(by_rig[rig]) for rig in sorted(by_rig, key=lambda rig: (places.get(rig, len(places)), rig))]
+
+
+def all_rosters(bus: Bus, lab: LabConfig, services: Set[str]) -> list[Roster]:
+    """What the services of a lab say of themselves; waits `ANSWER_WITHIN_S` for those kinds of them, if it must."""
+    deadline_s = time.monotonic() + ANSWER_WITHIN_S
+    found: list[Roster] = []
+    # A link to each has to be made first: what one look finds and the next one too is all that there is.
+    while time.monotonic() < deadline_s:
+        before, found = found, rosters(bus, lab.name)
+        if services <= {roster.service for roster in found} and len(found) == len(before):
+            break
+        time.sleep(0.05)
+    return found
 
 
 def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:

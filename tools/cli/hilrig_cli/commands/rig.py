@@ -1,7 +1,6 @@
 """`hilrig rig`: which rigs a running lab has, and having more or fewer of them."""
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from hilrig_schemas import Event, Roster
 
 app = typer.Typer(help="See which rigs a running lab has; add, take away or reset one.", no_args_is_help=True)
-ANSWER_WITHIN_S = 3.0
 
 Name = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
 
@@ -120,17 +118,10 @@ def reset(rig: Name, config: Config = None) -> None:
 
 
 def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
+    from hilrig_cli.asking import all_rosters
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.presence import rosters
 
-    deadline_s = time.monotonic() + ANSWER_WITHIN_S
-    found: list[Roster] = []
-    # A link to each has to be made first: what one look finds and the next one too is all that there is.
-    while time.monotonic() < deadline_s:
-        before, found = found, rosters(bus, lab.name)
-        if {"sim", "edge"} <= {roster.service for roster in found} and len(found) == len(before):
-            return found
-        time.sleep(0.05)
+    found = all_rosters(bus, lab, {"sim", "edge"})
     if not found:
         raise OperationError(f"nothing is heard of lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
     return found
@@ -177,6 +168,7 @@ def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "R
 
 
 def _ask(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
+    from hilrig_cli.asking import ANSWER_WITHIN_S
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import Event, topics
 
