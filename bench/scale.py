@@ -33,7 +33,7 @@ from stolen import StolenTime
 
 from hilrig_cli.lab import running_lab
 from hilrig_cli.supervisor import shared
-from hilrig_modbus_edge.bridge import NEAR_NS
+from hilrig_modbus_edge.departures import NEAR_NS
 from hilrig_replay.latency import measure as latency_of
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.samples import join_commands
@@ -208,7 +208,7 @@ def ways_of(run: Run, begin_ns: int) -> dict[str, NDArray[np.float64]]:
     known = (command["basis_step"] > 0) & (ticks < len(states))
     applied, command, basis = applied[known], command[known], states[ticks[known]]
     # What has time until the tick waits for others at the edge: that is no part of the way.
-    is_near = applied["sampled_ns"] - applied["command_arrived_ns"] < NEAR_NS
+    is_near = applied["sampled_ns"] - command["sent_ns"] < NEAR_NS
     return {
         "state way": (command["state_arrived_ns"] - basis["sampled_ns"]) / 1e6,
         "read to write": (command["sent_ns"] - command["state_served_ns"]) / 1e6,

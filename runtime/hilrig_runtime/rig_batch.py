@@ -7,7 +7,6 @@ on its rig's own key, which costs little while nobody listens there. Recorded is
 
 from collections.abc import Callable, Sequence
 from itertools import repeat
-from typing import Final
 
 from hilrig_runtime.bus import Publisher
 from hilrig_runtime.clock import Clock
@@ -59,50 +58,3 @@ class BatchSender:
         self._sequences = [sequence + 1 for sequence in self._sequences]
         self._log.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
         self._counters.published += len(payloads)
-
-
-class Gatherer:
-    """Sends messages of single rigs as they come; where there are many, those of a short while together.
-
-    `later` is asked to call a function in that while.
-    """
-
-    MANY: Final = 32
-    """Messages since the last `look`."""
-
-    def __init__(
-        self,
-        source: str,
-        together: Publisher,
-        later: Callable[[Callable[[], None]], object],
-    ) -> None:
-        self._put = together.put
-        self._later = later
-        self._source = source
-        self._rigs: list[str] = []
-        self._messages: list[bytes] = []
-        self._count = 0
-        self._waits = False
-
-    def add(self, rig: str, payload: bytes) -> None:
-        """Send an encoded message of a rig."""
-        self._rigs.append(rig)
-        self._messages.append(payload)
-        self._count += 1
-        if not self._waits:
-            self.flush()
-        elif len(self._rigs) == 1:
-            self._later(self.flush)
-
-    def look(self) -> None:
-        """Once a tick: decide from how many messages there were since then whether they wait for each other."""
-        self._waits = self._count >= self.MANY
-        self._count = 0
-        self.flush()
-
-    def flush(self) -> None:
-        """Send what waits."""
-        if self._rigs:
-            self._put(RigBatch(source=self._source, rigs=self._rigs, messages=self._messages).SerializeToString())
-            self._rigs.clear()
-            self._messages.clear()

@@ -3,7 +3,7 @@
 A service is a function `run(service)` that calls `service.ready()` once it does its work, and returns when
 `service.stopping` is set; everything that it declared is closed afterwards, in reverse order. Sending and receiving go
 through typed ends made here: `sender` encodes once and gives the same bytes to the bus and to the log stream,
-`batch_sender` and `gatherer` do so for many rigs together; `latest_of_batches` keeps the newest value of each rig.
+`batch_sender` does so for many rigs together; `latest_of_batches` keeps the newest value of each rig.
 """
 
 import threading
@@ -23,7 +23,7 @@ from hilrig_runtime.errors import OperationError
 from hilrig_runtime.health import Counters, HealthReporter
 from hilrig_runtime.logstream import LogStream, batches_kept
 from hilrig_runtime.presence import Presence
-from hilrig_runtime.rig_batch import BatchSender, Gatherer
+from hilrig_runtime.rig_batch import BatchSender
 from hilrig_schemas import Event, RigBatch, Roster
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
 
@@ -226,21 +226,14 @@ class Service:
         self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, waiting))
         return values
 
-    def gatherer(
-        self,
-        topic: ServiceTopic[RigBatch],
-        later: Callable[[Callable[[], None]], object],
-    ) -> Gatherer:
-        """An end that sends single messages, together where they are many; see `Gatherer`."""
+    def publisher(self, topic: ServiceTopic[MessageT]) -> Publisher:
+        """An end that sends encoded messages on a topic of this service; nothing of them is recorded."""
         key = topic.key(self.lab.name, self.name, self.instance)
-        together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return Gatherer(self.source, together, later)
+        return self._closing.enter_context(self.bus.publisher(key, topic.traffic))
 
     def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
         """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""
-        key = topic.key(self.lab.name, self.name, self.instance)
-        together = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return BatchSender(self.source, together, self.log, self.clock, self.counters)
+        return BatchSender(self.source, self.publisher(topic), self.log, self.clock, self.counters)
 
     def add_to_batch(self, batch: BatchSender, topic: RigTopic[MessageT], rig: str) -> None:
         """Let a batch sender send for one more rig, whose own messages go on `topic` too."""

@@ -1,13 +1,9 @@
 """Messages of many rigs together: recorded each under its own key, the newest kept, nobody speaks for another's rig."""
 
-from collections.abc import Callable
-from functools import partial
-
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import parse_lab
 from hilrig_runtime.health import resident_bytes
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.rig_batch import Gatherer
 from hilrig_runtime.service import Service
 from hilrig_schemas import LogBatch, RigBatch
 from hilrig_schemas.topics import COMMANDS, LOG, STATE, STATES
@@ -76,63 +72,6 @@ def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
             )
         assert latest.get("rig1").payload == b"e"  # type: ignore[union-attr]
         assert latest.get("rig2") is None
-
-
-class Gathering:
-    """A gatherer, what it sends, and what it asks to be called later."""
-
-    def __init__(self) -> None:
-        hub = MemoryHub()
-        self.heard = Heard(hub, COMMANDS.key("lab", "*", "*"))
-        self.waiting: list[Callable[[], None]] = []
-        publisher = MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", "1"), COMMANDS.traffic)
-        self.gatherer = Gatherer("edge/1", publisher, self.waiting.append)
-        self.rigs = {f"rig{number}": partial(self.gatherer.add, f"rig{number}") for number in range(Gatherer.MANY)}
-
-    def speak_often(self) -> None:
-        for send in self.rigs.values():
-            send(b"x")
-        self.gatherer.look()
-        self.heard.payloads.clear()
-
-
-def test_where_there_are_few_each_message_leaves_at_once() -> None:
-    one = Gathering()
-    for _ in range(3):
-        for _ in range(Gatherer.MANY - 1):
-            one.rigs["rig1"](b"x")
-        one.gatherer.look()
-    assert len(one.heard.payloads) == 3 * (Gatherer.MANY - 1)
-    assert one.waiting == []
-
-
-def test_where_there_are_many_those_of_a_short_while_leave_together() -> None:
-    many = Gathering()
-    many.speak_often()
-    many.rigs["rig1"](b"a")
-    many.rigs["rig2"](b"b")
-    assert many.heard.payloads == []
-    assert len(many.waiting) == 1
-    many.waiting.pop()()
-    assert many.heard.batches() == [{"rig1": b"a", "rig2": b"b"}]
-    # There are fewer again: what waits is sent, and nothing waits any more.
-    many.rigs["rig1"](b"c")
-    many.gatherer.look()
-    many.rigs["rig1"](b"d")
-    assert [batch["rig1"] for batch in many.heard.batches()[1:]] == [b"c", b"d"]
-
-
-def test_of_one_controller_that_writes_very_often_every_command_leaves_in_its_order() -> None:
-    fast = Gathering()
-    for _ in range(Gatherer.MANY):
-        fast.rigs["rig1"](b"x")
-    fast.gatherer.look()
-    fast.heard.payloads.clear()
-    for payload in (b"a", b"b", b"c"):
-        fast.rigs["rig1"](payload)
-    fast.waiting.pop()()
-    (batch,) = map(RigBatch.FromString, fast.heard.payloads)
-    assert (list(batch.rigs), list(batch.messages)) == (["rig1"] * 3, [b"a", b"b", b"c"])
 
 
 def test_sending_for_long_takes_no_memory() -> None:

@@ -1,17 +1,16 @@
 """Between the devices and the bus: the edge service, on one asyncio loop that alone touches devices.
 
-States come on the bus's thread, which only keeps the newest of each rig; a device takes it when it is read. Commands
-and events leave at once. A tick every 20 ms does what can wait that long.
+States come on the bus's thread, which only keeps the newest of each rig; a device takes it when it is read. Events
+leave at once, commands in time for their tick. A tick every 20 ms does what can wait that long.
 """
 
 import asyncio
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Final
 
-from hilrig_modbus_edge.alarm import Alarm
 from hilrig_modbus_edge.answers import answer_control, answer_impairment, answer_lease, serve_on_loop
+from hilrig_modbus_edge.departures import Departures
 from hilrig_modbus_edge.seat import Seat
 from hilrig_modbus_edge.transport import DirectLoop
 from hilrig_runtime.config import RigSettings
@@ -25,13 +24,6 @@ TICK_NS: Final = 20_000_000
 FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 """How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
 
-GATHER_S: Final = 0.002
-"""For so long commands wait for each other where there are many, if the next tick is far enough."""
-NEAR_NS: Final = 6_000_000
-"""So long before the simulation's next tick that is too long: the system's timer may be one millisecond late, and a
-command has to get there. With a shorter step it always is."""
-GATHER_NEAR_S: Final = 0.000_2
-"""Then they wait until no request is there to be answered, but no longer than this."""
 MANY: Final = 16
 """Rigs that are looked after at once; more than that in turns, so that no request waits for all of them."""
 MOST_TURNS: Final = 4
@@ -59,9 +51,15 @@ class Edge:
     def __init__(self, service: Service, loop: DirectLoop) -> None:
         self._service = service
         self._loop = loop
-        self._alarm = Alarm(loop, service.clock)
         self._states = service.latest_of_batches(topics.STATES)
-        self._commands = service.gatherer(topics.COMMANDS, self._soon)
+        self._commands = Departures(
+            service.source,
+            service.publisher(topics.COMMANDS).put,
+            self._states,
+            service.lab.sim.step_ns,
+            service.clock,
+            loop.call_at,
+        )
         self._seats: dict[str, Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
         now_ns = service.clock.monotonic_ns()
         for number, seat in enumerate(self._seats.values()):
@@ -71,11 +69,9 @@ class Edge:
         service.health.rig_reports = lambda: [seat.report() for seat in self._seats.values()]
         service.addresses = self._address_of
         self._closing = ExitStack()
-        self._monotonic_ns = service.clock.monotonic_ns
-        self._far_ns = service.lab.sim.step_ns - NEAR_NS
 
     def _seat(self, rig: RigSettings) -> Seat:
-        return Seat(rig, self._service, self._states, self._commands, self._alarm, self._state_sessions)
+        return Seat(rig, self._service, self._states, self._commands, self._state_sessions)
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
@@ -226,15 +222,8 @@ class Edge:
             service.beat(monotonic_ns())
             deadline_ns += (missed + 1) * TICK_NS
 
-    def _soon(self, call: Callable[[], None]) -> None:
-        if self._monotonic_ns() - self._states.arrived_ns > self._far_ns:
-            self._loop.direct.call_when_quiet(call, GATHER_NEAR_S)
-        else:
-            self._loop.call_later(GATHER_S, call)
-
     def _close(self) -> None:
         self._closing.close()
-        self._alarm.close()
         for seat in self._seats.values():
             seat.shut("the edge stops")
         self._commands.flush()

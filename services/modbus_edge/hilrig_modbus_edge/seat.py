@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from hilrig_modbus_edge.alarm import Alarm
+from hilrig_modbus_edge.departures import Departures
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Limits, RigServer, bind
 from hilrig_modbus_edge.settings import DeviceSettings
@@ -15,7 +15,6 @@ from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.config import RigSettings
-from hilrig_runtime.rig_batch import Gatherer
 from hilrig_runtime.service import Arrival, LatestOfBatches, Service
 from hilrig_schemas import Event, RigReport, topics
 
@@ -25,10 +24,8 @@ TRAFFIC_PERIOD_NS: Final = 200_000_000
 class Wire:
     """A device's outlet: to the bus, to the log stream, and to the loop's timers."""
 
-    def __init__(
-        self, rig: str, service: Service, commands: Gatherer, alarm: Alarm, sessions_changed: Callable[[], None]
-    ) -> None:
-        sender = service.sender(topics.COMMAND, rig, first=partial(commands.add, rig))
+    def __init__(self, rig: str, service: Service, commands: Departures, sessions_changed: Callable[[], None]) -> None:
+        sender = service.sender(topics.COMMAND, rig, first=partial(commands.send, rig))
         self.send_command = sender.send
         self.repeat_command = sender.repeat
         self.emit: Callable[[Event], None] = service.emit
@@ -37,7 +34,6 @@ class Wire:
         """Whose outlet it is; set once, by whoever makes both."""
         self._bus = service.bus
         self._monotonic_ns = service.clock.monotonic_ns
-        self._alarm = alarm
         self._state_key = topics.STATE.key(service.lab.name, rig)
         self._timer: asyncio.TimerHandle | None = None
         self._send_ns: int | None = None
@@ -55,7 +51,7 @@ class Wire:
         """See `Outlet.send_at`."""
         if self._send_ns is None or deadline_ns < self._send_ns:
             self._send_ns = deadline_ns
-            self._alarm.call_at(deadline_ns, self._on_send)
+            asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
 
     def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
         """See `Outlet.follow_states`."""
@@ -89,14 +85,13 @@ class Seat:
         rig: RigSettings,
         service: Service,
         states: LatestOfBatches,
-        commands: Gatherer,
-        alarm: Alarm,
+        commands: Departures,
         sessions_changed: Callable[[], None],
     ) -> None:
         lab = service.lab
         self._clock = service.clock
         self._edge = lab.edge
-        self._wire = Wire(rig.name, service, commands, alarm, sessions_changed)
+        self._wire = Wire(rig.name, service, commands, sessions_changed)
         settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
         self.device = self._wire.device = Device(
             rig.name, settings, service.clock, self._wire, partial(states.get, rig.name)

@@ -21,6 +21,7 @@ HIGH_WATER: Final = 65_536
 LOW_WATER: Final = 16_384
 """Bytes that wait to be sent: above the one the protocol is told to pause, below the other to go on."""
 
+_MS: Final = 0.001
 _Args = TypeVarTuple("_Args")
 _Events = list[tuple[selectors.SelectorKey, int]]
 _Ready = list[tuple[int, int]]
@@ -30,7 +31,10 @@ logger = logging.getLogger(__name__)
 
 
 class DirectSelector(selectors.DefaultSelector):
-    """A selector for an asyncio loop that calls what was registered with a function, and tells asyncio of the rest."""
+    """A selector for an asyncio loop that calls what was registered with a function, and tells asyncio of the rest.
+
+    It waits to the moment that asyncio names, where the standard library's waits for whole milliseconds.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,10 +42,7 @@ class DirectSelector(selectors.DefaultSelector):
         """Something was asked of asyncio since it began to wait: it must have its turn before it waits on."""
         self._calls: dict[int, Callable[[int], None]] = {}
         """By handle, what to call with the events."""
-        self._when_quiet: list[Callable[[], None]] = []
-        self._quiet_at_s = 0.0
-        """When those are called though it is not quiet, s, monotonic clock."""
-        self._poll: Callable[[float], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
+        self._poll: Callable[[float | None], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
         """See `selectors.BaseSelector.register`; `data` that can be called is called with the events."""
@@ -57,12 +58,6 @@ class DirectSelector(selectors.DefaultSelector):
         self._calls.pop(key.fd, None)
         return key
 
-    def call_when_quiet(self, callback: Callable[[], None], within_s: float) -> None:
-        """Call once as soon as no socket is ready, and after `within_s` even so."""
-        at_s = monotonic() + within_s
-        self._quiet_at_s = min(at_s, self._quiet_at_s) if self._when_quiet else at_s
-        self._when_quiet.append(callback)
-
     def select(self, timeout: float | None = None) -> _Events:
         """See `selectors.BaseSelector.select`; what is called meanwhile does not end the wait."""
         poll, call_of = self._poll, self._calls.get
@@ -70,9 +65,7 @@ class DirectSelector(selectors.DefaultSelector):
         others: _Events = []
         self.asyncio_has_work = False
         while True:
-            waiting = self._when_quiet
-            ready = poll(0 if waiting else -1 if timeout is None else timeout if timeout > 0 else 0)
-            for handle, mask in ready:
+            for handle, mask in poll(timeout):
                 call = call_of(handle)
                 # By far the most often there is something to read and nothing else.
                 events = EVENT_READ if mask == EVENT_READ else _events_of(mask)
@@ -80,29 +73,39 @@ class DirectSelector(selectors.DefaultSelector):
                     call(events)
                 elif (key := self.get_map().get(handle)) is not None and events & key.events:
                     others.append((key, events & key.events))
-            now_s = monotonic()
-            if waiting and (not ready or now_s >= self._quiet_at_s):
-                self._when_quiet = []
-                for callback in waiting:
-                    callback()
-            elif not ready:
-                return others
             if others or self.asyncio_has_work:
                 return others
             if deadline_s is not None:
-                timeout = deadline_s - now_s
+                timeout = deadline_s - monotonic()
                 if timeout <= 0:
                     return others
 
-    def _super_poll(self, timeout: float) -> _Ready:
-        return [(key.fd, events) for key, events in super().select(None if timeout < 0 else timeout)]
+    def _super_poll(self, timeout: float | None) -> _Ready:
+        return [(key.fd, events) for key, events in super().select(timeout)]
 
 
 if hasattr(select, "epoll"):
-    # To let the standard library make a key of each event takes longer than to ask the system.
-    def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float], _Ready]:
+
+    def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float | None], _Ready]:
+        """A wait for what is ready, which may end before its time and with nothing.
+
+        To let the standard library make a key of each event takes longer than to ask the system.
+        """
         # A handle of its own to the same set, for it is closed with this object.
-        return select.epoll.fromfd(os.dup(selector.fileno())).poll
+        epoll = select.epoll.fromfd(os.dup(selector.fileno()))
+        poll, itself, wait = epoll.poll, (epoll,), select.select
+
+        def poll_for(timeout: float | None) -> _Ready:
+            if timeout is None:
+                return poll()
+            if timeout >= _MS:
+                # The system counts in whole milliseconds here: not one more than is left.
+                return poll(int(timeout / _MS) * _MS - _MS / 2)
+            if timeout > 0:
+                wait(itself, (), (), timeout)
+            return poll(0)
+
+        return poll_for
 
     def _events_of(mask: int) -> int:
         return (EVENT_READ if mask & ~select.EPOLLOUT else 0) | (EVENT_WRITE if mask & ~select.EPOLLIN else 0)

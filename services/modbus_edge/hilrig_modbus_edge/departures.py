@@ -1,0 +1,115 @@
+"""When commands leave for the simulation, which takes the newest of each rig at its tick and no other.
+
+A message costs its sender, threads of the bus on both sides and the simulation a wake-up each: on a small machine these
+are taken from the very requests that are to be answered. So where commands are many they leave together, and each early
+enough for the tick that it is meant for. A rig's first word on a new state is what a loop is measured by; more of them
+before the next state come from a controller that asks again and again, and replace each other: the newest leaves.
+"""
+
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from hilrig_runtime.clock import Clock
+from hilrig_runtime.service import LatestOfBatches
+from hilrig_schemas import RigBatch
+
+MANY: Final = 32
+"""Commands from one `look` to the next, 20 ms later, from which on they wait for each other."""
+GATHER_NS: Final = 2_000_000
+"""For so long a first word waits for others, if the tick is far enough."""
+NEAR_NS: Final = 3_000_000
+"""So long before the tick it waits no more."""
+LAST_NS: Final = 1_000_000
+"""So long before the tick all that waits leaves."""
+PARTS: Final = 50
+"""Of a step, one of which lies between two departures after that."""
+
+
+class Timer(Protocol):
+    """What was asked for, to be taken back."""
+
+    def cancel(self) -> None:
+        """Do not call."""
+
+
+class Departures:
+    """Sends the commands of an edge's rigs, on its loop.
+
+    `states` tells when the last tick was, `call_at` has the loop call something at a time of its clock, s.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        put: Callable[[bytes], None],
+        states: LatestOfBatches,
+        step_ns: int,
+        clock: Clock,
+        call_at: Callable[[float, Callable[[], None]], Timer],
+    ) -> None:
+        self._source = source
+        self._put = put
+        self._states = states
+        self._step_ns = step_ns
+        self._monotonic_ns = clock.monotonic_ns
+        self._call_at = call_at
+        self._waiting: dict[str, bytes] = {}
+        """By rig, its newest command, encoded."""
+        self._count = 0
+        self._many = False
+        self._said: set[str] = set()
+        """Rigs of which a command was sent, or waits, that may know the newest states."""
+        self._said_ns = 0
+        """When those states came."""
+        self._timer: Timer | None = None
+        self._due_ns = 0
+        """When it comes."""
+
+    def send(self, rig: str, command: bytes) -> None:
+        """Send an encoded command of a rig, now or in time for the next tick."""
+        self._waiting[rig] = command
+        self._count += 1
+        if not self._many:
+            self.flush()
+            return
+        states_ns = self._states.arrived_ns
+        if states_ns != self._said_ns:
+            self._said_ns = states_ns
+            self._said.clear()
+        if rig not in self._said:
+            self._said.add(rig)
+            now_ns = self._monotonic_ns()
+            self._leave_at(now_ns if self._to_tick_ns(now_ns) < NEAR_NS else now_ns + GATHER_NS)
+        elif self._timer is None:
+            now_ns = self._monotonic_ns()
+            left_ns = self._to_tick_ns(now_ns) - LAST_NS
+            self._leave_at(now_ns + (left_ns if left_ns > 0 else self._step_ns // PARTS))
+
+    def look(self) -> None:
+        """Once a tick of the edge: decide from how many there were since then whether they wait for each other."""
+        self._many = self._count >= MANY
+        self._count = 0
+        if not self._many:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send what waits."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        waiting = self._waiting
+        if waiting:
+            self._put(RigBatch(source=self._source, rigs=waiting, messages=waiting.values()).SerializeToString())
+            waiting.clear()
+
+    def _to_tick_ns(self, now_ns: int) -> int:
+        """Until the next tick; less than 0 where it is late."""
+        return self._states.arrived_ns + self._step_ns - now_ns
+
+    def _leave_at(self, when_ns: int) -> None:
+        if self._timer is not None:
+            if self._due_ns <= when_ns:
+                return
+            self._timer.cancel()
+        self._due_ns = when_ns
+        self._timer = self._call_at(when_ns * 1e-9, self.flush)
