@@ -53,8 +53,6 @@ class LatestOfBatches:
     """
 
     def __init__(self, clock: Clock, counters: Counters, permitted: Mapping[str, Collection[str]]) -> None:
-        self.arrived_ns = 0
-        """When the newest batch came, ns, monotonic clock; 0: none has."""
         self._permitted = permitted
         self._by_rig: dict[str, Arrival] = {}
         self._monotonic_ns = clock.monotonic_ns
@@ -83,7 +81,6 @@ class LatestOfBatches:
             self._by_rig.update((rig, arrival) for rig, arrival in arrivals if rig in permitted)
         else:
             self._by_rig.update(arrivals)
-        self.arrived_ns = arrived_ns
         self._counters.received += len(messages)
 
 

@@ -13,6 +13,7 @@ from hilrig_schemas import RigBatch
 
 STEP_NS = 20_000_000
 US = 1_000
+RIGS = ("other", *(f"rig{number}" for number in range(7)))
 
 
 class Call:
@@ -33,8 +34,9 @@ class Edge:
         self.states = LatestOfBatches(self.clock, Counters(), {})
         self.timers: list[Call] = []
         self.left: list[tuple[int, dict[str, bytes]]] = []
-        self.departures = Departures("edge/1", self._put, self.states, step_ns, self.clock, self._call_at)
+        self.departures = Departures("edge/1", self._put, self.states.get, step_ns, self.clock, self._call_at)
         self.send = self.departures.send
+        self.ticked_ns = 0
         self.tick()
 
     def _put(self, payload: bytes) -> None:
@@ -48,19 +50,21 @@ class Edge:
 
     @property
     def since_tick_ns(self) -> int:
-        return self.clock.monotonic_ns() - self.states.arrived_ns
+        return self.clock.monotonic_ns() - self.ticked_ns
 
     @property
     def pending(self) -> list[Call]:
         return [timer for timer in self.timers if not timer.cancelled]
 
-    def tick(self) -> None:
-        """States come."""
-        self.states.on_message("", RigBatch().SerializeToString())
+    def tick(self, *rigs: str) -> None:
+        """States come, of all rigs if none is named."""
+        self.ticked_ns = self.clock.monotonic_ns()
+        batch = RigBatch(rigs=rigs or RIGS, messages=[b""] * len(rigs or RIGS))
+        self.states.on_message("", batch.SerializeToString())
 
     def go_to(self, since_tick_ns: int) -> None:
         """Let time pass, and what is due be called."""
-        until_ns = self.states.arrived_ns + since_tick_ns
+        until_ns = self.ticked_ns + since_tick_ns
         while (due := min(self.pending, key=lambda timer: timer.at_ns, default=None)) and due.at_ns <= until_ns:
             self.timers.remove(due)
             self.clock.advance(max(0, due.at_ns - self.clock.monotonic_ns()))
@@ -168,6 +172,23 @@ def test_at_a_short_step_a_first_word_leaves_at_once_and_the_newest_a_little_lat
     edge.send("rig1", b"second")
     edge.go_to(max(late_ns + step_ns // PARTS, step_ns - LAST_NS))
     assert edge.left[1][1] == {"rig1": b"second"}
+
+
+def test_each_rig_has_the_tick_of_its_own_simulation() -> None:
+    edge = Edge()
+    edge.be_many()
+    edge.go_to(9_000 * US)
+    edge.tick("rig2")
+    # 2 ms before the next tick of rig1's simulation, 11 ms before that of rig2's.
+    edge.go_to(9_000 * US)
+    edge.send("rig2", b"far")
+    edge.send("rig1", b"near")
+    edge.go_to(9_000 * US)
+    assert edge.left == [(9_000 * US, {"rig1": b"near", "rig2": b"far"})]
+    edge.send("rig2", b"far again")
+    edge.send("rig1", b"near again")
+    edge.go_to(STEP_NS)
+    assert edge.left[1:] == [(11_000 * US - LAST_NS, {"rig1": b"near again", "rig2": b"far again"})]
 
 
 def test_timers_do_not_become_more() -> None:

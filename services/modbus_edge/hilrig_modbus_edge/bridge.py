@@ -55,7 +55,7 @@ class Edge:
         self._commands = Departures(
             service.source,
             service.publisher(topics.COMMANDS).put,
-            self._states,
+            self._states.get,
             service.lab.sim.step_ns,
             service.clock,
             loop.call_at,

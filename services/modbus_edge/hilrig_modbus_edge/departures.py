@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from hilrig_runtime.clock import Clock
-from hilrig_runtime.service import LatestOfBatches
+from hilrig_runtime.service import Arrival
 from hilrig_schemas import RigBatch
 
 MANY: Final = 32
@@ -19,8 +19,9 @@ GATHER_NS: Final = 2_000_000
 """For so long a first word waits for others, if the tick is far enough."""
 NEAR_NS: Final = 3_000_000
 """So long before the tick it waits no more."""
-LAST_NS: Final = 1_000_000
-"""So long before the tick all that waits leaves."""
+LAST_NS: Final = 1_500_000
+"""So long before the tick all that waits leaves: a tick is a state's way earlier than seen from here, and a command has
+its way to go."""
 PARTS: Final = 50
 """Of a step, one of which lies between two departures after that."""
 
@@ -35,32 +36,32 @@ class Timer(Protocol):
 class Departures:
     """Sends the commands of an edge's rigs, on its loop.
 
-    `states` tells when the last tick was, `call_at` has the loop call something at a time of its clock, s.
+    `newest_state` gives a rig's, which tells when its last tick was; rigs of several simulations have several.
+    `call_at` has the loop call something at a time of its clock, s.
     """
 
     def __init__(
         self,
         source: str,
         put: Callable[[bytes], None],
-        states: LatestOfBatches,
+        newest_state: Callable[[str], Arrival | None],
         step_ns: int,
         clock: Clock,
         call_at: Callable[[float, Callable[[], None]], Timer],
     ) -> None:
         self._source = source
         self._put = put
-        self._states = states
+        self._newest_state = newest_state
         self._step_ns = step_ns
+        self._apart_ns = step_ns // PARTS
         self._monotonic_ns = clock.monotonic_ns
         self._call_at = call_at
         self._waiting: dict[str, bytes] = {}
         """By rig, its newest command, encoded."""
         self._count = 0
         self._many = False
-        self._said: set[str] = set()
-        """Rigs of which a command was sent, or waits, that may know the newest states."""
-        self._said_ns = 0
-        """When those states came."""
+        self._said: dict[str, int] = {}
+        """By rig, when the state came that was its newest at its last command, ns, monotonic clock."""
         self._timer: Timer | None = None
         self._due_ns = 0
         """When it comes."""
@@ -72,18 +73,17 @@ class Departures:
         if not self._many:
             self.flush()
             return
-        states_ns = self._states.arrived_ns
-        if states_ns != self._said_ns:
-            self._said_ns = states_ns
-            self._said.clear()
-        if rig not in self._said:
-            self._said.add(rig)
-            now_ns = self._monotonic_ns()
-            self._leave_at(now_ns if self._to_tick_ns(now_ns) < NEAR_NS else now_ns + GATHER_NS)
-        elif self._timer is None:
-            now_ns = self._monotonic_ns()
-            left_ns = self._to_tick_ns(now_ns) - LAST_NS
-            self._leave_at(now_ns + (left_ns if left_ns > 0 else self._step_ns // PARTS))
+        state = self._newest_state(rig)
+        state_ns = 0 if state is None else state.arrived_ns
+        now_ns = self._monotonic_ns()
+        to_tick_ns = state_ns + self._step_ns - now_ns
+        if self._said.get(rig) != state_ns:
+            self._said[rig] = state_ns
+            self._leave_at(now_ns + (0 if to_tick_ns < NEAR_NS else GATHER_NS))
+        elif to_tick_ns > LAST_NS:
+            self._leave_at(now_ns + to_tick_ns - LAST_NS)
+        else:
+            self._leave_at(now_ns + self._apart_ns)
 
     def look(self) -> None:
         """Once a tick of the edge: decide from how many there were since then whether they wait for each other."""
@@ -101,10 +101,6 @@ class Departures:
         if waiting:
             self._put(RigBatch(source=self._source, rigs=waiting, messages=waiting.values()).SerializeToString())
             waiting.clear()
-
-    def _to_tick_ns(self, now_ns: int) -> int:
-        """Until the next tick; less than 0 where it is late."""
-        return self._states.arrived_ns + self._step_ns - now_ns
 
     def _leave_at(self, when_ns: int) -> None:
         if self._timer is not None:
