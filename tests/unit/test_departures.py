@@ -191,6 +191,24 @@ def test_each_rig_has_the_tick_of_its_own_simulation() -> None:
     assert edge.left[1:] == [(11_000 * US - LAST_NS, {"rig1": b"near again", "rig2": b"far again"})]
 
 
+def test_while_the_simulation_is_silent_commands_leave_as_seldom_as_they_can() -> None:
+    edge = Edge()
+    edge.be_many()
+    edge.send("rig1", b"first")
+    edge.go_to(2 * STEP_NS)
+    edge.left.clear()
+    for number in range(1, 1001):
+        edge.go_to(2 * STEP_NS + number * 100 * US)
+        edge.send("rig1", b"%d" % number)
+    # 100 ms of them.
+    assert 4 <= len(edge.left) <= 6
+    # It comes back.
+    edge.tick()
+    edge.send("rig1", b"now")
+    edge.go_to(GATHER_NS)
+    assert edge.left[-1][1] == {"rig1": b"now"}
+
+
 def test_timers_do_not_become_more() -> None:
     edge = Edge()
     edge.be_many()

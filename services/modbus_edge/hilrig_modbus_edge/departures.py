@@ -77,6 +77,9 @@ class Departures:
         state_ns = 0 if state is None else state.arrived_ns
         now_ns = self._monotonic_ns()
         to_tick_ns = state_ns + self._step_ns - now_ns
+        if to_tick_ns < -self._step_ns:
+            # The simulation is silent: there is no tick to be in time for.
+            to_tick_ns = self._step_ns
         if self._said.get(rig) != state_ns:
             self._said[rig] = state_ns
             self._leave_at(now_ns + (0 if to_tick_ns < NEAR_NS else GATHER_NS))
