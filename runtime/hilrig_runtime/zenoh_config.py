@@ -21,6 +21,7 @@ MESH_ORDER: Final = ("sim", "edge", "recorder")
 ROUTER: Final = "router"
 FIRST_INSTANCE: Final = "1"
 """The instance that has a port of its own in the mesh."""
+_WHERE_MADE: Final = "hilrig certs makes certificates, on the host that has ca.key"
 
 
 def mesh_endpoint(bus: BusConfig, service: str) -> str:
@@ -96,7 +97,7 @@ def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE
         if (tls.folder / f"{name}.key").exists():
             return name
     wanted = " or ".join(f"{name}.key" for name in names)
-    raise InputError(f"bus.tls.folder: {tls.folder} holds no {wanted}; hilrig certs makes certificates")
+    raise InputError(f"bus.tls.folder: {tls.folder} holds no {wanted}; {_WHERE_MADE}")
 
 
 def _protocol(bus: BusConfig) -> str:
@@ -136,9 +137,7 @@ def _file(tls: BusTlsConfig, name: str) -> str:
     try:
         path.read_bytes()
     except OSError as error:
-        raise InputError(
-            f"bus.tls.folder: {path} can't be read: {error.strerror}; hilrig certs makes certificates"
-        ) from error
+        raise InputError(f"bus.tls.folder: {path} can't be read: {error.strerror}; {_WHERE_MADE}") from error
     return str(path)
 
 

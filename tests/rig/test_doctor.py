@@ -82,6 +82,7 @@ def test_without_its_router_a_lab_is_not_well_and_with_it_nothing_runs(routed: P
     alone = hilrig("doctor", "--config", routed, "--json", cwd=routed.parent)
     assert alone.returncode == 1
     assert "no zenoh router answers" in findings(alone)["bus"][0]["text"]
+    assert "services" not in findings(alone), "nobody can know whether they run"
     command = [*HILRIG, "router", "--stop-with-parent", "--config", str(routed)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as router:
         assert router.stdout is not None
@@ -96,6 +97,11 @@ def test_without_its_router_a_lab_is_not_well_and_with_it_nothing_runs(routed: P
         router.terminate()
         assert router.wait(PATIENT_S) == 0
     assert hilrig("doctor", "--service", "router", "--config", routed).returncode == 1
+
+
+def test_what_is_to_be_written_into_the_file_stands_in_the_table_as_it_is_written(tmp_path: Path) -> None:
+    done = hilrig("doctor", "--config", write_lab(tmp_path, extra="edge.host = '0.0.0.0'"), cwd=tmp_path)
+    assert "[edge.tls]" in done.stdout
 
 
 def test_the_configuration_for_zenohs_own_router_is_one(routed: Path) -> None:

@@ -14,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from edge_rig import EdgeRig, free_ports, running_edge
 from hilrig_modbus_edge.certificates import (
@@ -21,6 +22,7 @@ from hilrig_modbus_edge.certificates import (
     issue_client,
     issue_server,
     make_authority,
+    names_in,
     role_of,
 )
 from hilrig_runtime.config import LabConfig
@@ -292,6 +294,41 @@ def test_what_ends_soon_is_made_anew(tmp_path: Path) -> None:
     (folder / "observer.pem").write_bytes(soon.certificate_pem)
     (folder / "observer.key").write_bytes(soon.key_pem)
     assert written(folder) == {"observer"}
+
+
+def test_hosts_that_a_certificate_names_outlast_its_renewal(tmp_path: Path) -> None:
+    folder = tmp_path / "certs"
+    written(folder, "--host", "rig.example")
+    before = {name: names_of(folder / f"{name}.pem") for name in ("edge", "bus/router")}
+    assert all("rig.example" in names for names in before.values())
+    written(folder, "--renew")
+    assert {name: names_of(folder / f"{name}.pem") for name in before} == before
+
+
+def names_of(path: Path) -> set[str]:
+    return names_in(x509.load_pem_x509_certificate(path.read_bytes()))
+
+
+@pytest.mark.parametrize("missing", ["ca.key", "bus/ca.key", "bus/ca.pem"])
+def test_where_half_of_an_authority_is_missing_nothing_is_written(tmp_path: Path, missing: str) -> None:
+    """A host has `ca.pem` and not its key: a new authority there would be the end of all trust in the others."""
+    folder = tmp_path / "certs"
+    written(folder)
+    (folder / missing).unlink()
+    before = {path: path.read_bytes() for path in folder.rglob("*.*")}
+    done = hilrig("certs", folder, "--renew")
+    assert done.returncode == 2
+    assert f"has no {Path(missing).name} beside it" in done.stderr
+    assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
+
+
+def test_a_host_of_the_bus_gets_no_authority_for_controllers_either(tmp_path: Path) -> None:
+    written(tmp_path / "made")
+    (tmp_path / "host/bus").mkdir(parents=True)
+    for name in ("ca.pem", "sim.pem", "sim.key"):
+        (tmp_path / "host/bus" / name).write_bytes((tmp_path / "made/bus" / name).read_bytes())
+    assert hilrig("certs", tmp_path / "host").returncode == 2
+    assert not list((tmp_path / "host").glob("*.*"))
 
 
 def test_files_that_are_no_certificates_are_named(tmp_path: Path) -> None:

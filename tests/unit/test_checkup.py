@@ -280,4 +280,14 @@ def test_without_a_router_the_bus_is_what_is_wrong() -> None:
         lab = parse_lab(f'[bus]\ntopology = "router"\nrouter = "tcp/127.0.0.1:{port}"\n')
         findings, found = services.check_bus(lab)
     assert "no zenoh router answers" in only_wrong(findings)
-    assert found.alive == set()
+    assert "certificates" not in findings[0].mend
+    assert found is None
+
+
+def test_a_host_without_a_certificate_of_a_command_is_told_which_one(folder: Path) -> None:
+    for name in ("operator", "viewer"):
+        (folder / f"{name}.key").unlink()
+    findings, found = services.check_bus(secured(folder))
+    assert "holds no operator.key or viewer.key" in only_wrong(findings)
+    assert "viewer" in findings[0].mend
+    assert found is None

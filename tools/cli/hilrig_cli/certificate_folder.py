@@ -18,6 +18,7 @@ class CertificateFolder:
     """`<name>.pem` and `<name>.key` for each name, and `ca.pem` and `ca.key`; made where it is not there.
 
     Raises:
+        InputError: half of its authority is missing, so what it signed can't be added to.
         OperationError: it can't be written.
     """
 
@@ -27,6 +28,7 @@ class CertificateFolder:
         self._days = days
         self._renew = renew
         self.written: list[Path] = []
+        self._refuse_half_an_authority()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -44,6 +46,17 @@ class CertificateFolder:
             self.write(AUTHORITY, authority)
         return authority
 
+    def _refuse_half_an_authority(self) -> None:
+        """A host that was given `ca.pem` alone would lose all trust in the others by a new one."""
+        certificate, key = (self._folder / f"{AUTHORITY}{suffix}" for suffix in (".pem", ".key"))
+        if certificate.exists() == key.exists():
+            return
+        there, missing = (certificate, key) if certificate.exists() else (key, certificate)
+        raise InputError(
+            f"{there} has no {missing.name} beside it, so nothing can be signed here: run hilrig certs where the "
+            f"authority was made (or take {there} away, and a new authority is made, which nobody trusts yet)"
+        )
+
     def is_due(self, name: str, hosts: Sequence[str] = ()) -> bool:
         """Whether a certificate is missing, about to end, or does not name all of `hosts`."""
         identity = None if self._renew else self._read(name)
@@ -52,6 +65,12 @@ class CertificateFolder:
         certificate = identity.certificate
         left = certificate.not_valid_after_utc - self._now
         return left < min(RENEWED_BEFORE, timedelta(days=self._days) / 3) or not set(hosts) <= names_in(certificate)
+
+    def names_for(self, name: str, hosts: Sequence[str]) -> list[str]:
+        """Host names and addresses for a certificate: `hosts`, and those that the one that is there names."""
+        identity = self._read(name)
+        before = names_in(identity.certificate) if identity is not None else set()
+        return [*hosts, *sorted(before - set(hosts))]
 
     def write(self, name: str, identity: Identity) -> None:
         """Write a certificate, and its key for its owner's eyes alone."""

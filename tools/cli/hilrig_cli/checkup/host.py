@@ -54,7 +54,7 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[Finding]:
     if lab.edge.host not in ("127.0.0.1", "::1", "localhost") and lab.edge.plain and not _all_restricted(lab):
         yield notice(
             "ports",
-            f"anyone who reaches {lab.edge.host} may take a rig without a certificate",
+            f"edge.host is {lab.edge.host}: whoever reaches the edge's host may take a rig without a certificate",
             "name the networks of each rig (allow), or take [edge.tls] with plain = false",
         )
 

@@ -8,7 +8,7 @@ from threading import Lock, Thread
 from hilrig_cli.checkup import Finding, good, notice, wrong
 from hilrig_runtime.clock import SYSTEM_CLOCK
 from hilrig_runtime.config import LabConfig
-from hilrig_runtime.errors import HilrigError
+from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Health
@@ -78,15 +78,21 @@ def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S
     return heard
 
 
-def check_bus(lab: LabConfig) -> tuple[list[Finding], Heard]:
-    """Whether the bus can be joined, and what is heard there."""
+def check_bus(lab: LabConfig) -> tuple[list[Finding], Heard | None]:
+    """Whether the bus can be joined, and what is heard there; nothing can be, where it can't."""
     where = f"router {lab.bus.router}" if lab.bus.topology == "router" else f"mesh on {lab.bus.host}"
     try:
         heard = listen(lab)
     except HilrigError as error:
-        mend = "start the router (hilrig router), and look at the certificates below"
-        return [wrong("bus", str(error), mend)], Heard()
+        return [wrong("bus", str(error), _mend_of_bus(lab, error))], None
     return [good("bus", f"{where}: joined")], heard
+
+
+def _mend_of_bus(lab: LabConfig, error: HilrigError) -> str:
+    if lab.bus.tls is not None and isinstance(error, InputError):
+        return "give this host a command's certificate and its key (viewer, operator) beside ca.pem"
+    mend = "start the router (hilrig router), and compare bus.router" if lab.bus.topology == "router" else "see its log"
+    return mend if lab.bus.tls is None else f"{mend}; look at the certificates below"
 
 
 def check_services(lab: LabConfig, heard: Heard) -> Iterator[Finding]:

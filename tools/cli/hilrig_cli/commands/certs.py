@@ -53,22 +53,22 @@ def certs(
     here = ["localhost", "127.0.0.1"]
 
     controllers = CertificateFolder(folder, now, days, renew=renew)
+    bus = CertificateFolder(folder / "bus", now, days, renew=renew)
     authority = controllers.authority(f"hilrig {lab.name}: controllers")
     edge_names = _distinct([*(host or []), *_reachable(lab.edge.host), *here])
     if controllers.is_due("edge", edge_names):
-        controllers.write("edge", issue_server(authority, edge_names, now, days))
+        controllers.write("edge", issue_server(authority, controllers.names_for("edge", edge_names), now, days))
     for name, role in clients.items():
         if client or controllers.is_due(name):
             controllers.write(name, issue_client(authority, name, role, now, days))
 
-    bus = CertificateFolder(folder / "bus", now, days, renew=renew)
     authority = bus.authority(f"hilrig {lab.name}: bus")
     router_names = _distinct([*_router_host(lab), *(host or []), *here])
     service_names = _distinct([*_reachable(lab.bus.host), *here])
     wanted = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
     for name, names in ({"router": router_names} | wanted).items():
         if bus.is_due(name, names):
-            bus.write(name, issue_peer(authority, name, names, now, days))
+            bus.write(name, issue_peer(authority, name, bus.names_for(name, names), now, days))
 
     tables = {
         "edge.tls": {

@@ -62,7 +62,10 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
     findings += host.check_software()
     of_bus, heard = on_bus.check_bus(lab)
     findings += of_bus
-    findings += on_bus.check_services(lab, heard)
+    if heard is not None:
+        findings += on_bus.check_services(lab, heard)
+    # Of a lab that can't be heard nobody knows what runs; this host can be looked at all the same.
+    heard = heard or on_bus.Heard()
     findings += on_bus.check_realtime(lab, heard)
     findings += on_bus.check_versions((health for health, _ in heard.healths.values()), version("hilrig"))
     findings += on_bus.check_clocks(list(heard.healths.values()))
@@ -106,6 +109,7 @@ def _one_service(lab: "LabConfig", service: str, instance: str) -> "list[Finding
 
 def _print(findings: "list[Finding]") -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     colours = {"good": "green", "notice": "yellow", "wrong": "bold red"}
@@ -113,9 +117,9 @@ def _print(findings: "list[Finding]") -> None:
     for column in ("", "check", "found"):
         table.add_column(column, no_wrap=column != "found", overflow="fold")
     for found in findings:
-        mend = f"\n[dim]→ {found.mend}[/dim]" if found.mend else ""
+        mend = f"\n[dim]→ {escape(found.mend)}[/dim]" if found.mend else ""
         level = found.level.value
-        table.add_row(f"[{colours[level]}]{level}[/]", found.check, found.text.replace("[", r"\[") + mend)
+        table.add_row(f"[{colours[level]}]{level}[/]", found.check, escape(found.text) + mend)
     Console().print(table)
     wrong = sum(found.level.value == "wrong" for found in findings)
     notices = sum(found.level.value == "notice" for found in findings)
