@@ -91,7 +91,8 @@ if hasattr(select, "epoll"):
 
         To let the standard library make a key of each event takes longer than to ask the system.
         """
-        # A handle of its own to the same set, for it is closed with this object.
+        # A handle of its own to the same set, for it is closed with this object. It is older than all connections: its
+        # number is one of those that `select` can wait for.
         epoll = select.epoll.fromfd(os.dup(selector.fileno()))
         poll, itself, wait = epoll.poll, (epoll,), select.select
 
