@@ -84,15 +84,15 @@ def listen_for_ticks(clock_rig: RigClient, step_ns: int) -> int:
     begin_ns = time.monotonic_ns()
     before, phases = clock_rig.step(), []
     while time.monotonic_ns() - begin_ns < LISTEN_S * 1e9:
-        asked_ns = time.monotonic_ns()
         step = clock_rig.step()
         if step != before:
-            phases.append(asked_ns)
+            # Not when it was asked: a request that is held up would show a change before it was.
+            phases.append(time.monotonic_ns())
             before = step
         time.sleep(2e-4)
     if len(phases) < 3:
         raise OperationError("the simulation does not step: its counter stood still")
-    # A change is seen late by up to the time between two requests, never early: the earliest is the nearest.
+    # A change is seen late by a request and the time between two, or more, and never early: the earliest is the nearest.
     later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2
     return int(phases[0] + later.min())
 
