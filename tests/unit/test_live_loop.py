@@ -11,7 +11,7 @@ STEP_NS = 20_000_000
 
 
 class Counter:
-    """A step counter that is asked over a network, which holds some requests up."""
+    """A step counter that is asked over a network, which holds a request up before each tick."""
 
     def __init__(self, *, stands: bool = False) -> None:
         self.begin_ns = time.monotonic_ns() - STEP_NS // 2
@@ -21,7 +21,7 @@ class Counter:
     def step(self) -> int:
         now_ns = time.monotonic_ns()
         to_tick_ns = STEP_NS - (now_ns - self.begin_ns) % STEP_NS
-        if 6_000_000 < to_tick_ns < 9_000_000 and self._held_up < 3:
+        if 6_000_000 < to_tick_ns < 9_000_000:
             # It is asked long before a tick, and answered after it.
             self._held_up += 1
             time.sleep((to_tick_ns + 100_000) * 1e-9)
@@ -31,7 +31,7 @@ class Counter:
 def test_a_request_that_is_held_up_does_not_move_the_ticks() -> None:
     counter = Counter()
     tick_ns = listen_for_ticks(counter, STEP_NS)  # type: ignore[arg-type]
-    assert counter._held_up == 3
+    assert counter._held_up > 3
     after_ns = (tick_ns - counter.begin_ns) % STEP_NS
     # Never early; of 25 ticks one is seen soon.
     assert after_ns < STEP_NS // 4

@@ -92,7 +92,7 @@ def listen_for_ticks(clock_rig: RigClient, step_ns: int) -> int:
         time.sleep(2e-4)
     if len(phases) < 3:
         raise OperationError("the simulation does not step: its counter stood still")
-    # A change is seen late by a request and the time between two, or more, and never early: the earliest is the nearest.
+    # A change is seen late by a request and the time between two, or more, never early: the earliest is the nearest.
     later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2
     return int(phases[0] + later.min())
 
