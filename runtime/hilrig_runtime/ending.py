@@ -20,6 +20,8 @@ from hilrig_runtime.errors import HilrigError, OperationError
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
+CLOSED_PIPE: Final = 141
+"""Exit code where whoever read the output has seen enough: what a shell says of a program that SIGPIPE ended."""
 TURN_S: Final = 0.5
 """Of waiting for a signal."""
 _NO_ROOM: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -80,6 +82,19 @@ def run_main(main: Callable[[], int | None]) -> int:
     """Run a command; turn what a person should read into one line on standard error, and an exit code."""
     _open_output()
     try:
+        return _run_and_tell(main)
+    except BrokenPipeError:
+        pass
+    except SystemExit as end:
+        # What parses and what prints tables both make 1 of a closed pipe, which is an answer here.
+        if not isinstance(end.__context__, BrokenPipeError):
+            raise
+    _drop_output()
+    return CLOSED_PIPE
+
+
+def _run_and_tell(main: Callable[[], int | None]) -> int:
+    try:
         try:
             return main() or 0
         finally:
@@ -91,10 +106,6 @@ def run_main(main: Callable[[], int | None]) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        # Whoever read our output has seen enough.
-        _drop_output()
-        return 0
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise

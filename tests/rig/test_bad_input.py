@@ -7,7 +7,7 @@ import pytest
 from mcap.writer import Writer
 
 from labs import hilrig, write_lab
-from recordings import Script, record
+from recordings import record
 
 READERS = (
     ("latency", "{file}"),
@@ -54,13 +54,6 @@ def test_a_recording_of_nothing(tmp_path: Path, command: tuple[str, ...]) -> Non
     done = hilrig(*(word.format(file=file, folder=tmp_path) for word in command))
     assert done.returncode == 2
     assert f"{file}: an empty recording" in one_line(done.stderr)
-
-
-def test_a_recording_without_commands_has_no_latency(tmp_path: Path) -> None:
-    file = record(tmp_path / "run.mcap", Script(controllers=False))
-    done = hilrig("latency", file)
-    assert done.returncode == 2
-    assert f"{file}: a recording without commands" in one_line(done.stderr)
 
 
 def test_a_plot_that_can_not_be_written(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,17 @@ def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, brows
     browser.run("document.querySelector('summary').click()")
     assert browser.run("document.querySelector('details').open")
     assert browser.run("document.body.scrollHeight") > before + 500
+    # On a narrow page no picture sticks out of its section, nor has to be moved: its panels stand below each other.
+    browser.open(page.as_uri(), width=420)
+    assert browser.run("document.documentElement.scrollWidth") <= 420
+    assert browser.run("document.querySelectorAll('.scroll img').length") == 0
+    panels = browser.run(
+        "[...document.querySelector('section').querySelectorAll('img')].map(image => image.getBoundingClientRect())"
+        ".map(box => [box.left, box.right, box.top, box.bottom])"
+    )
+    assert len(panels) == 4
+    assert all(left >= 0 and right <= 420 for left, right, _, _ in panels)
+    assert all(below[2] >= above[3] for above, below in pairwise(panels))
 
 
 @pytest.mark.timeout(300)

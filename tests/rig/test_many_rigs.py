@@ -139,14 +139,25 @@ def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: Running
         (("add", "rig1"), 2, "the lab has a rig called 'rig1' already"),
         (("add", "no name"), 2, "name: expected"),
         (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/[12] .* can't listen on"),
-        (("remove", "nobody"), 2, "no running service has a rig called 'nobody'"),
-        (("reset", "nobody"), 2, "no edge serves a rig called 'nobody'"),
+        (("remove", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
+        (("reset", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
     ]:
         done = hilrig("rig", *arguments, "--config", lab.config)
         assert done.returncode == code, done.stderr
         assert re.search(text, done.stderr)
     listed = json.loads(hilrig("rig", "list", "--json", "--config", lab.config).stdout)
     assert [row["rig"] for row in listed] == ["rig1", "rig2", "rig3", "rig4"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("lease",), ("impair",), ("rig", "reset"), ("rig", "remove"), ("record", "start"), ("live",)],
+    ids=" ".join,
+)
+def test_a_name_that_is_no_rig_s_is_refused_with_those_that_are(lab: RunningLab, words: tuple[str, ...]) -> None:
+    done = hilrig(*words, "rg1", "--config", lab.config)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.endswith("hilrig: error: no rig is called 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,41 @@ def test_output_that_is_closed_is_no_reason_to_fail() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+PRINTERS = [
+    ("check", "--json"),
+    ("registers",),
+    ("compare", "{run}", "{run}"),
+    ("latency", "{run}", "--json"),
+    ("runs", "{folder}"),
+    ("--help",),
+    # Its mistake is written to the closed pipe too.
+    ("report", "{folder}/nowhere.mcap"),
+]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes elsewhere end otherwise")
+@pytest.mark.parametrize("words", PRINTERS, ids=lambda words: words[0])
+def test_a_pipe_that_nobody_reads_ends_a_command_quietly_as_it_ends_others(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    run = record(tmp_path / "run.mcap")
+    reader, writer = os.pipe()
+    os.close(reader)
+    mistaken = words[0] == "report"
+    try:
+        done = subprocess.run(
+            [*HILRIG, *(word.format(run=run, folder=tmp_path) for word in words)],
+            check=False,
+            stdout=writer,
+            stderr=writer if mistaken else subprocess.PIPE,
+            timeout=60,
+        )
+    finally:
+        os.close(writer)
+    assert done.returncode == 141
+    assert not done.stderr
+
+
 def test_help_says_every_command_s_first_sentence_in_full() -> None:
     from typer.main import get_command
 

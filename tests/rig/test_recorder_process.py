@@ -72,8 +72,9 @@ def test_a_session_by_hand_and_its_refusals(tmp_path: Path) -> None:
         assert again.returncode == 3
         assert f"is being recorded by hand already: {session}" in again.stderr
         unknown = hilrig("record", "start", "rig9", "--config", config)
-        assert unknown.returncode == 3
-        assert "there is no rig 'rig9' in this lab" in unknown.stderr
+        assert unknown.returncode == 2
+        assert unknown.stderr == "hilrig: error: no rig is called 'rig9'; this lab has rig1\n"
+        assert hilrig("record", "stop", "rig9", "--config", config).returncode == 2
         # By hand too, a session outlives the recorder.
         recorder.kill()
         with RecorderProcess(config) as second:
@@ -149,7 +150,7 @@ def test_recorders_share_the_rigs_of_a_lab_and_no_rig_has_two(tmp_path: Path) ->
             assert "serves rig2 already; a rig has one recorder" in third.log.read_text()
             # Not in the lab's file, as one that was added while the lab runs: the first rig's recorder has it.
             added = hilrig("record", "start", "rig9", "--config", config)
-            assert "there is no rig 'rig9'" in added.stderr
+            assert "no rig is called 'rig9'; this lab has rig1, rig2, rig3" in added.stderr
             by_hand = hilrig("record", "start", "rig3", "--config", config, "--json")
             assert by_hand.returncode == 0, by_hand.stderr
             for rig in rigs:

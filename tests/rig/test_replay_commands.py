@@ -67,13 +67,37 @@ def test_a_bad_file_is_one_clear_line(command: list[str], content: bytes | None,
     assert words in result.stderr
 
 
-def test_a_run_without_a_controller_has_a_picture_but_no_latency(tmp_path: Path) -> None:
+def test_a_run_without_a_controller_is_shown_and_has_no_latency(tmp_path: Path, run: Path) -> None:
     script = Script(seconds=1.0, controllers=False)
-    path = write(tmp_path / "run.mcap", make(script), script=script)
+    path = write(tmp_path / "alone.mcap", make(script), script=script)
     result = hilrig("latency", path)
-    assert result.returncode == 2
-    assert "a recording without commands" in result.stderr
+    assert (result.returncode, result.stderr) == (1, "")
+    assert "nothing closed a loop, for no controller wrote in this session" in " ".join(result.stdout.split())
+    assert "jitter" not in result.stdout
+    assert json.loads(hilrig("latency", path, "--json").stdout)["loop_ms"] is None
+    assert hilrig("latency", path, "--plot", tmp_path / "plot.png").returncode == 2
     assert hilrig("replay", path, "--save", tmp_path / "run.rrd").returncode == 0
+    page = tmp_path / "page.html"
+    assert hilrig("report", path, "--out", page).returncode == 0
+    assert "recorded by hand" in page.read_text()
+    compared = hilrig("compare", run, path, "--plot", tmp_path / "both.svg")
+    assert compared.returncode == 0, compared.stderr
+    assert "no command acted, so it is aligned by its start" in " ".join(compared.stdout.split())
+
+
+def test_among_several_runs_a_bad_one_does_not_hide_the_comparison(tmp_path: Path, run: Path) -> None:
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(run.read_bytes()[:5000])
+    done = hilrig("compare", run, run, torn, "--json")
+    assert done.returncode == 1, done.stderr
+    found = json.loads(done.stdout)
+    assert (len(found["runs"]), len(found["differences"])) == (2, 1)
+    assert [f"{torn}: torn" in reason for reason in found["left_out"]] == [True]
+    assert f"left out: {torn}: torn" in hilrig("compare", run, run, torn).stderr
+    for others in ([run, torn], [torn, run, run], [run, torn, torn]):
+        refused = hilrig("compare", *others)
+        assert (refused.returncode, refused.stdout) == (2, "")
+        assert f"{torn}: torn" in refused.stderr
 
 
 def test_replay_writes_a_file_that_rerun_reads(run: Path, tmp_path: Path) -> None:

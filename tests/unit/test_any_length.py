@@ -43,7 +43,7 @@ COMMANDS: dict[str, Callable[[Path], object]] = {
     # Without its pictures, which take what their lines are made of: both runs are thinned to the same points.
     "report": lambda path: summary.summarise(open_run(path)),
     "compare": lambda path: compare.compare([open_run(path), open_run(path)]),
-    "compare --align": lambda path: compare.origin_ns(open_run(path), "SESSION_END"),
+    "compare --align": lambda path: compare.origin_of(open_run(path), "SESSION_END"),
     "replay --save": lambda path: rerun_view.save_rrd(open_run(path), path.with_suffix(".rrd")),
     "verify": verify.verify,
     "export --csv": lambda path: export.export_tables(open_run(path), path.parent / path.stem, "csv"),

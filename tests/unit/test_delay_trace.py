@@ -54,5 +54,5 @@ def test_a_pause_of_the_controller_is_a_gap(tmp_path: Path) -> None:
 
 
 def test_a_recording_without_commands_is_no_trace(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a recording without commands"):
+    with pytest.raises(InputError, match="it has 0 samples of the loop"):
         trace_ms(tmp_path, Script(seconds=2.0, controllers=False))

@@ -282,11 +282,17 @@ def test_a_run_that_can_not_be_read_does_not_hide_the_others(tmp_path: Path) -> 
     torn.write_bytes(good.read_bytes()[:5000])
     alone = write(tmp_path / "alone.mcap", make(silent), script=silent)
     found = report([torn, good, alone])
-    assert len(found.runs) == 1
-    assert [("torn" in reason, "without commands" in reason) for reason in found.left_out] == [
-        (True, False),
-        (False, True),
-    ]
+    assert [run["latency"]["samples"] > 0 for run in found.runs].count(False) == 1
+    assert len(found.runs) == 2
+    assert ["torn" in reason for reason in found.left_out] == [True]
     assert "Left out" in found.html
     with pytest.raises(InputError, match="no run can be reported"):
-        report([torn, alone])
+        report([torn, torn])
+
+
+def test_where_nobody_wrote_no_goal_is_reached(tmp_path: Path) -> None:
+    silent = Script(seconds=1.0, controllers=False)
+    path = write(tmp_path / "alone.mcap", make(silent), script=silent)
+    task = parse_lab("[[task.poses]]\nname = 'a'\nposition_mm = [300, 0, 0]\n").task
+    (found,) = report([path], task=task).runs
+    assert found["grade"]["score"] == 0

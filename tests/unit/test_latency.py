@@ -167,10 +167,21 @@ def test_a_recorder_that_fell_behind_is_said(tmp_path: Path) -> None:
     assert any("the recorder was behind by up to 2.5 s" in reason for reason in measure(run).reasons)
 
 
-def test_a_recording_without_commands_is_no_measurement(tmp_path: Path) -> None:
-    run = open_run(record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False)))
-    with pytest.raises(InputError, match="a recording without commands: no controller wrote"):
-        measure(run)
+def test_where_no_controller_wrote_the_ticks_are_measured_and_no_loop(tmp_path: Path) -> None:
+    report = measure(open_run(record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))))
+    assert (report.samples, report.loop_ms, report.stages_ms, report.fit) == (0, None, {}, False)
+    assert report.reasons == ("nothing closed a loop, for no controller wrote in this session",)
+    assert report.jitter_ms.tick_lateness.max > 0
+
+
+def test_torques_that_answer_no_state_close_no_loop(tmp_path: Path) -> None:
+    made = make(Script(seconds=1.0))
+    for one in made:
+        # A controller that writes without ever having read.
+        if isinstance(one.message, JointState | TorqueCommand):
+            one.message.basis_step = 0
+    report = measure(open_run(write(tmp_path / "run.mcap", made, script=Script(seconds=1.0))))
+    assert report.reasons == ("nothing closed a loop, for no torque that acted answered a state",)
 
 
 @pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])

@@ -60,14 +60,9 @@ def test_what_can_not_be_read_is_said_with_what_to_do(
     assert "\n" not in str(said.value)
 
 
-@pytest.mark.parametrize("command", ["latency", "compare", "report"])
-def test_a_run_without_a_controller_has_no_loop(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [command for command in ALL if command != "verify"])
+def test_a_run_without_a_controller_is_a_run(command: str, tmp_path: Path) -> None:
     path = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
-    with pytest.raises(InputError, match=r"without commands: no controller wrote|never moves"):
-        ALL[command](path)
-
-
-def test_a_run_without_a_controller_can_be_looked_at(tmp_path: Path) -> None:
-    path = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
-    save_rrd(open_run(path), tmp_path / "run.rrd")
-    assert (tmp_path / "run.rrd").stat().st_size > 10_000
+    ALL[command](path)
+    if command == "replay":
+        assert (tmp_path / "run.rrd").stat().st_size > 10_000

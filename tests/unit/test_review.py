@@ -14,7 +14,7 @@ from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import tips
 from hilrig_replay.summary import COURSE_POINTS, summarise
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import JointState
+from hilrig_schemas import Event, JointState
 from recordings import PARAMETERS, Made, Script, make, position, record, write
 
 
@@ -82,7 +82,7 @@ def test_runs_are_aligned_by_an_event(tmp_path: Path) -> None:
     runs = [named(tmp_path, "one", script), named(tmp_path, "late", script, late)]
     by_event = compare(runs, "session-end")
     # A second is missing at the beginning of the late run: seen from the end, they are the same.
-    assert by_event.origins_s[0] - by_event.origins_s[1] == pytest.approx(1.0, abs=0.03)
+    assert (by_event.origins[0].ns - by_event.origins[1].ns) / 1e9 == pytest.approx(1.0, abs=0.03)
     assert by_event.differences[0].tool_max_mm < 2.0
     assert runs[1].time_s(runs[1].states)[-1] == pytest.approx(0.0, abs=0.03)
 
@@ -94,19 +94,53 @@ def test_a_slower_controller_shows_in_the_comparison(tmp_path: Path) -> None:
     assert json.loads(json.dumps(comparison.as_dict()))["differences"][0]["session"] == "slow"
 
 
-@pytest.mark.parametrize(
-    ("align", "words"),
-    [("part_picked", "has no event PART_PICKED; it has SESSION_END, SESSION_START"), ("motion", "the arm never moves")],
-)
-def test_what_can_not_be_aligned_is_said(tmp_path: Path, align: str, words: str) -> None:
-    script = Script(seconds=2.0)
+def test_what_can_not_be_aligned_is_said(tmp_path: Path) -> None:
+    run = named(tmp_path, "run", Script(seconds=2.0))
+    with pytest.raises(InputError, match="has no event PART_PICKED; it has SESSION_END, SESSION_START"):
+        compare([run, run], "part_picked")
+
+
+def test_what_never_moves_is_aligned_by_its_first_command_and_without_one_by_its_start(tmp_path: Path) -> None:
+    script, silent = Script(seconds=2.0), Script(seconds=2.0, controllers=False)
     made = make(script)
     for one in made:
         if isinstance(one.message, JointState):
             one.message.velocity[:] = [0.0] * 4
-    run = named(tmp_path, "run", script, made)
-    with pytest.raises(InputError, match=words):
-        compare([run, run], align)
+    still, alone = named(tmp_path, "still", script, made), named(tmp_path, "alone", silent)
+    comparison = compare([named(tmp_path, "moving", script), still, alone])
+    assert [origin.by for origin in comparison.origins] == ["motion", "command", "start"]
+    first = still.states[still.states["command_seq"] > 0][:1]
+    assert still.time_s(first)[0] == 0.0
+    assert alone.time_s(alone.states)[0] == 0.0
+    assert comparison.differences[0].loop_p50_ms == 0
+    assert comparison.differences[1].loop_p50_ms is None
+    assert comparison.left_out == ()
+
+
+def test_a_run_that_can_not_be_aligned_does_not_hide_the_others(tmp_path: Path) -> None:
+    script = Script(seconds=2.0)
+    cut = [
+        one for one in make(script) if not (isinstance(one.message, Event) and one.message.kind == Event.SESSION_END)
+    ]
+    runs = [named(tmp_path, "one", script), named(tmp_path, "cut", script, cut), named(tmp_path, "two", script)]
+    comparison = compare(runs, "session-end")
+    assert [one.session for one in comparison.differences] == ["two"]
+    assert [run.session for run in comparison.runs] == ["one", "two"]
+    assert ["has no event SESSION_END" in reason for reason in comparison.left_out] == [True]
+
+
+def test_a_report_of_a_run_without_a_controller_says_that_nothing_closed_a_loop(tmp_path: Path) -> None:
+    silent = named(tmp_path, "silent", Script(seconds=2.0, controllers=False))
+    alone = report([silent.path])
+    page = _Page(alone.html)
+    assert page.text.count("nothing closed a loop, for no controller wrote in this session") == 2
+    assert alone.html.count("<img") == 2
+    assert "tick lateness" in page.text
+    among = report([silent.path, named(tmp_path, "quick", Script(seconds=2.0)).path])
+    assert among.left_out == ()
+    # Among equals it comes last.
+    assert [run["session"] for run in among.runs] == ["quick", "silent"]
+    assert among.runs[1]["latency"]["loop_ms"] is None
 
 
 def test_one_run_is_no_comparison(tmp_path: Path) -> None:

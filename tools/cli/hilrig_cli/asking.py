@@ -1,14 +1,15 @@
 """Asking a running lab who is there, and its edges about their rigs."""
 
+import sys
 import time
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
 from hilrig_runtime.bus import Bus
 from hilrig_runtime.config import LabConfig
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.presence import rosters
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Roster
@@ -18,6 +19,12 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 ANSWER_WITHIN_S: Final = 3.0
 """How long a service has to answer; a link to it may have to be made first."""
+PATIENCE_S: Final = 0.5
+"""Who waits longer is told for what."""
+NAMED: Final = 16
+"""Rigs that a refusal names before it says "and … more"."""
+SERVING: Final = ("sim", "edge")
+"""Services that have each rig, also one that was added."""
 
 
 def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Message) -> list[MessageT]:
@@ -68,10 +75,41 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
     Raises:
         InputError: it has not.
     """
-    deadline_s = time.monotonic() + ANSWER_WITHIN_S
-    while all(rig != known.name for known in lab.rigs):
-        if any(rig in roster.rigs for roster in rosters(bus, lab.name)):
+    in_file = [known.name for known in lab.rigs]
+    if rig in in_file:
+        return
+    begun_s, told = time.monotonic(), False
+    while True:
+        found = rosters(bus, lab.name)
+        if any(rig in roster.rigs for roster in found):
             return
-        if time.monotonic() > deadline_s:
-            lab.rig(rig)
+        waited_s = time.monotonic() - begun_s
+        if _all_heard(found, in_file) or waited_s > ANSWER_WITHIN_S:
+            raise _no_such_rig(rig, lab, found)
+        if waited_s > PATIENCE_S and not told:
+            told = True
+            print(
+                f"hilrig: {rig!r} is not in lab.toml: looking for a service that it was added to, for up to "
+                f"{ANSWER_WITHIN_S:g} s",
+                file=sys.stderr,
+            )
         time.sleep(0.05)
+
+
+def _no_such_rig(rig: str, lab: LabConfig, found: Sequence[Roster]) -> InputError:
+    added = {name for roster in found if roster.service in SERVING for name in roster.rigs}
+    names = list(dict.fromkeys([*(known.name for known in lab.rigs), *sorted(added)]))
+    more = f" and {len(names) - NAMED} more (hilrig rig list)" if len(names) > NAMED else ""
+    return InputError(f"no rig is called {rig!r}; this lab has {', '.join(names[:NAMED])}{more}")
+
+
+def _all_heard(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
+    """Whether every service that can have a rig has answered.
+
+    Each simulation and each edge begins with rigs of the lab's file, and one has a rig that another does not: once all
+    of those are served, nobody is missing. (One that lost all of those rigs is known by the other kind of service.)
+    """
+    return all(
+        set(in_file) <= {rig for roster in found if roster.service == service for rig in roster.rigs}
+        for service in SERVING
+    )

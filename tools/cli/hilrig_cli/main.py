@@ -40,7 +40,8 @@ from hilrig_cli.commands import (
 app = typer.Typer(
     name="hilrig",
     help="A hardware-in-the-loop rig for robot control: a virtual SCARA arm over Modbus TCP, recorded and replayed.",
-    epilog="Exit codes: 0 done, 1 the answer is no, 2 wrong usage or input, 3 an operation failed.",
+    epilog="Exit codes: 0 done, 1 the answer is no, 2 wrong usage or input, 3 an operation failed, "
+    "130 Ctrl-C, 141 nobody read the output any more.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",

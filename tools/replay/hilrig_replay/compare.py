@@ -1,7 +1,8 @@
 """Runs beside each other: aligned in time, how far they differ in motion, torque and latency.
 
 The first run is the reference. Runs are aligned by their first state, by the first motion of the arm, or by the first
-event of a kind; then every other run is interpolated at the reference's times, where both were recorded.
+event of a kind; then every other run is interpolated at the reference's times, where both were recorded. A run that
+can't be aligned does not hide the others.
 """
 
 from collections.abc import Sequence
@@ -45,26 +46,40 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True)
+class Origin:
+    """Aligned zero of a run."""
+
+    ns: int
+    """In the run's own time."""
+    by: str
+    """What it is: `motion`, else where nothing moved under command the first `command`, else `start`; or an event."""
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
     """Aligned runs, and their differences from the first."""
 
     aligned_by: str
+    """What was asked for."""
+    runs: tuple[Run, ...]
     summaries: tuple[RunSummary, ...]
     """Courses are on the aligned time axis."""
-    origins_s: tuple[float, ...]
-    """Aligned zero in each run's own time, s."""
+    origins: tuple[Origin, ...]
     differences: tuple[Difference, ...]
     """One a run after the first."""
+    left_out: tuple[str, ...] = ()
+    """Why a run is not in it, one sentence each."""
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, for JSON."""
         return {
             "aligned_by": self.aligned_by,
             "runs": [
-                {**summary.as_dict(), "origin_s": origin}
-                for summary, origin in zip(self.summaries, self.origins_s, strict=True)
+                {**summary.as_dict(), "origin_s": origin.ns / 1e9, "aligned_by": origin.by}
+                for summary, origin in zip(self.summaries, self.origins, strict=True)
             ],
             "differences": [asdict(difference) for difference in self.differences],
+            "left_out": self.left_out,
         }
 
 
@@ -76,49 +91,68 @@ def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
         align: `motion`, `start`, or an event's kind such as `PART_PICKED`.
 
     Raises:
-        InputError: fewer than two runs, one that does not have what it is to be aligned by, or no common time.
+        InputError: fewer than two runs, or the first, or all others, do not have the event to be aligned by, have no
+            common time, or are damaged.
     """
     if len(runs) < 2:
         raise InputError("a comparison needs two runs or more")
-    for run in runs:
-        run.timebase.origin_ns = 0
-    origins_ns = [origin_ns(run, align) for run in runs]
-    for run, origin in zip(runs, origins_ns, strict=True):
-        run.timebase.origin_ns = origin
-    summaries = [summarise(run) for run in runs]
-    reference = summaries[0]
-    return Comparison(
-        aligned_by=align,
-        summaries=tuple(summaries),
-        origins_s=tuple(origin / 1e9 for origin in origins_ns),
-        differences=tuple(_difference(reference, other) for other in summaries[1:]),
-    )
+    reference, origin = _aligned(runs[0], align)
+    kept, summaries, origins = [runs[0]], [reference], [origin]
+    differences: list[Difference] = []
+    left_out: list[str] = []
+    for run in runs[1:]:
+        try:
+            summary, origin = _aligned(run, align)
+            differences.append(_difference(reference, summary))
+        except InputError as error:
+            left_out.append(str(error))
+            continue
+        kept.append(run)
+        summaries.append(summary)
+        origins.append(origin)
+    if not differences:
+        raise InputError("\n".join(left_out))
+    return Comparison(align, tuple(kept), tuple(summaries), tuple(origins), tuple(differences), tuple(left_out))
 
 
-def origin_ns(run: Run, align: str) -> int:
-    """Aligned zero in a run's own time, ns.
+def _aligned(run: Run, align: str) -> tuple[RunSummary, Origin]:
+    run.timebase.origin_ns = 0
+    origin = origin_of(run, align)
+    run.timebase.origin_ns = origin.ns
+    return summarise(run), origin
+
+
+def origin_of(run: Run, align: str) -> Origin:
+    """Aligned zero of a run whose time has not been moved.
 
     Raises:
-        InputError: it has no motion, or no such event.
+        InputError: it has no such event.
     """
     if align == "start":
-        return 0
+        return Origin(0, "start")
     if align == "motion":
-        # Before the session the arm may still settle: motion counts from the first command on.
-        for block in run.blocks(frozenset({"state"})):
-            moving = (np.abs(block.states["velocity"]) > MOVING).any(axis=1) & (block.states["command_seq"] > 0)
-            found = block.states[moving][:1]
-            if len(found):
-                return int(run.time_ns(found)[0])
-        raise InputError(f"{run.path}: the arm never moves, so it can't be aligned by motion; --align start can")
+        return _first_motion(run)
     wanted = align.upper().replace("-", "_").replace(" ", "_")
     kinds: set[str] = set()
     for block in run.blocks(frozenset({"event"})):
         found = block.events[block.events["kind"] == wanted][:1]
         if len(found):
-            return int(run.time_ns(found)[0])
+            return Origin(int(run.time_ns(found)[0]), align)
         kinds.update(block.events["kind"])
     raise InputError(f"{run.path}: has no event {wanted}; it has {', '.join(sorted(kinds)) or 'none'}")
+
+
+def _first_motion(run: Run) -> Origin:
+    first = Origin(0, "start")
+    for block in run.blocks(frozenset({"state"})):
+        # Before the session the arm may still settle: motion counts from the first command on.
+        states = block.states[block.states["command_seq"] > 0]
+        if len(states) and first.by == "start":
+            first = Origin(int(run.time_ns(states[:1])[0]), "command")
+        moving = states[(np.abs(states["velocity"]) > MOVING).any(axis=1)][:1]
+        if len(moving):
+            return Origin(int(run.time_ns(moving)[0]), "motion")
+    return first
 
 
 def _difference(reference: RunSummary, other: RunSummary) -> Difference:

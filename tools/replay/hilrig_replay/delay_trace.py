@@ -24,7 +24,7 @@ def delay_trace(run: Run) -> TraceDelay:
 
     Raises:
         InputError: the run has gaps (messages that are lost, a pause of 10 s or more), stamps that contradict each
-            other, or fewer than 100 samples; or nothing was commanded in it.
+            other, or fewer than 100 samples.
     """
     effective = 0
 

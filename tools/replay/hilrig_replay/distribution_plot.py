@@ -21,7 +21,7 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
     rows = np.arange(len(runs))
     height = 1.3 + max(0.09, min(0.28, 12 / len(runs))) * len(runs)
     figure = Figure(figsize=(11, height), layout="constrained", dpi=110)
-    goals, times, work, loop = figure.subplots(1, 4, sharey=True, width_ratios=(1, 1, 1, 1.6))
+    goals, times, work, loop = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.6))
     if any(run.grade is not None for run in runs):
         _bars(goals, rows, [None if run.grade is None else 100 * run.grade.score for run in runs])
         label(goals, "Goals reached, %", "", "")
@@ -37,9 +37,12 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
     label(work, "Work of the drives, J", "", "")
     _boxes(loop, runs)
     label(loop, "Loop latency, ms", "box: quartiles, whiskers: p1 and p99", "")
-    names = [run.session for run in runs] if len(runs) <= _NAMED else [str(row + 1) for row in rows]
-    goals.set_yticks(rows, names, fontsize=7, color=INK)
-    goals.set_ylim(len(runs) - 0.4, -0.6)
+    places = [str(row + 1) for row in rows]
+    names = [f"{place}. {run.session}" for place, run in zip(places, runs, strict=True)]
+    for axes in figure.axes:
+        # Each panel tells its rows: on a narrow page they stand one below the other.
+        axes.set_yticks(rows, names if axes is goals and len(runs) <= _NAMED else places, fontsize=7, color=INK)
+        axes.set_ylim(len(runs) - 0.4, -0.6)
     return figure
 
 
@@ -47,15 +50,21 @@ def _bars(axes: Axes, rows: np.ndarray, values: Sequence[float | None]) -> None:
     known = [value for value in values if value is not None]
     axes.barh(rows, [0.0 if value is None else value for value in values], height=0.6, color=RUN_COLORS[0], alpha=0.75)
     if not known:
-        axes.set_xticks([])
-        axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=INK, fontsize=8)
+        _nothing(axes)
     else:
+        axes.set_xlim(0, 1.05 * max(known) or 1.0)
         axes.axvline(float(np.median(known)), color=_MEDIAN, linewidth=0.8, linestyle=(0, (4, 2)))
+
+
+def _nothing(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", color=INK, fontsize=8)
 
 
 def _boxes(axes: Axes, runs: Sequence[RunSummary]) -> None:
     measured = [(row, run.box_ms) for row, run in enumerate(runs) if run.box_ms]
     if not measured:
+        _nothing(axes)
         return
     boxes = axes.bxp(
         [dict(zip(("whislo", "q1", "med", "q3", "whishi"), box_ms, strict=True)) for _, box_ms in measured],

@@ -15,6 +15,8 @@ from hilrig_replay.spool import Spool
 
 ENOUGH_SAMPLES: Final = 500
 """Below, p99 rests on fewer than five samples."""
+NO_CONTROLLER: Final = "nothing closed a loop, for no controller wrote in this session"
+NO_LOOP: Final = "nothing closed a loop, for no torque that acted answered a state"
 BACKLOG_NS: Final = 1_000_000_000
 """A recording whose messages waited longer than this to be taken in is not trusted."""
 CLOCK_STEP_NS: Final = 10_000_000
@@ -144,7 +146,9 @@ class FitnessWatch:
             yield f"the commands of {_count(unmatched, 'sample')} are not in the recording"
         if self._negative:
             yield f"{_count(self._negative, 'stage')} came out negative: the stamps contradict each other"
-        if self._samples < ENOUGH_SAMPLES:
+        if not self._samples and not unmatched:
+            yield NO_LOOP if run.file.counts["command"] else NO_CONTROLLER
+        elif self._samples < ENOUGH_SAMPLES:
             yield f"{_count(self._samples, 'sample')} only: {ENOUGH_SAMPLES} are needed for a 99th percentile"
 
 

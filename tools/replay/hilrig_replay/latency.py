@@ -15,7 +15,6 @@ from hilrig_replay.fitness import FitnessWatch, Lost
 from hilrig_replay.records import Records
 from hilrig_replay.run import Run
 from hilrig_replay.samples import STAGES, Matcher, SampleTable
-from hilrig_runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,7 @@ class LatencyReport:
     samples: int
     step_ms: float
     loop_ms: Statistics | None
-    """None: there are no samples."""
+    """None: nothing closed a loop; the reasons say so."""
     stages_ms: dict[str, Statistics]
     jitter_ms: Jitter
     lost: Lost
@@ -71,12 +70,8 @@ def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyR
         also: gets each block on the way, with states, commands, parts and events, so that one pass serves several.
 
     Raises:
-        InputError: nothing was commanded in it, or the file is damaged.
+        InputError: the file is damaged.
     """
-    if not run.file.counts["command"]:
-        raise InputError(
-            f"{run.path}: a recording without commands: no controller wrote in this session, so it has no loop latency"
-        )
     matcher, table, watch = Matcher(), SampleTable(), FitnessWatch(run)
     for block in run.blocks(frozenset({"state", "command", "event"})):
         if also is not None:

@@ -44,11 +44,12 @@ section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8
 .scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .45rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
 th:first-child, td:first-child, td.text { text-align: left; }
-td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600; }
+td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600;
+  white-space: normal; vertical-align: bottom; }
 img { max-width: 100%; height: auto; display: block; }
 .picture { display: flex; align-items: flex-start; } .picture img { min-width: 0; }
-@media (max-width: 44rem) { .picture { display: block; } .picture img { width: 100%; }
-  .scroll img { max-width: none; width: 46rem; } table { font-size: .75rem; } th, td { padding: .25rem .15rem; }
+@media (max-width: 44rem) { .picture { display: block; }
+  table { font-size: .75rem; } th, td { padding: .25rem .15rem; }
   section, details { padding: .8rem .6rem; }
   td:first-child { white-space: normal; }
   td.text { min-width: 9rem; } }
@@ -86,7 +87,7 @@ def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | 
         task: what the runs are graded by; None: each by what its own lab said.
 
     Raises:
-        InputError: there is one only, or none that can be read: it has no commands, is damaged, or is not understood.
+        InputError: there is one only, or none that can be read: it is damaged, or not understood.
     """
     pages: list[_Page] = []
     left_out: list[str] = []
@@ -149,8 +150,9 @@ def _run(page: _Page) -> str:
 
 
 def _who(summary: RunSummary) -> str:
-    who = summary.controller or "nobody"
-    return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · controlled by {who} · {summary.start}"
+    # A session that a controller began has its address.
+    who = f"controlled by {summary.controller}" if summary.controller else "recorded by hand"
+    return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {who} · {summary.start}"
 
 
 def _facts(page: _Page) -> str:
@@ -163,7 +165,9 @@ def _facts(page: _Page) -> str:
         within = "none placed" if error is None else f"within {error:.1f} mm"
         facts.append((f"{summary.task.placed} of {len(summary.task.parts)}", f"parts in their places, {within}"))
     loop = summary.latency.loop_ms
-    if loop is not None:
+    if loop is None:
+        facts.append(("–", f"loop latency: {summary.latency.reasons[-1]}"))
+    else:
         facts.append((f"{loop.p50:.1f} ms", f"loop latency p50; p99 {loop.p99:.1f} ms"))
     facts.append(
         (f"{summary.motion.tool_path_m:.2f} m", f"way of the tool, at most {summary.motion.top_speed:.2f} m/s")
@@ -245,7 +249,7 @@ def _overview(pages: Sequence[_Page]) -> str:
         )
     by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
     note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
-    distributions = _wide_picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
+    distributions = _picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
     return f"<section>{_table(header, rows)}{note}{distributions}</section>"
 
 
@@ -271,7 +275,9 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 
 def _rank(page: _Page) -> tuple[float, ...]:
-    task, grade, way = page.summary.task, page.summary.grade, page.summary.motion.tool_path_m
+    task, grade = page.summary.task, page.summary.grade
+    # A tool that nobody moved went the shortest way: among equals such a run comes last.
+    way = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:
         return (0.0, *grade.rank, way)
     # Beside graded runs, those without a task come last.
@@ -309,11 +315,6 @@ def _between_columns(figure: Figure) -> list[int]:
             found.append(int((begin + end) / 2))
         end = max(end, until)
     return found
-
-
-def _wide_picture(figure: Figure, what: str) -> str:
-    """A picture whose panels share their rows: on a narrow page it is moved sideways."""
-    return f'<div class="scroll">{_image(_pixels(figure), what)}</div>'
 
 
 def _pixels(figure: Figure) -> NDArray[np.uint8]:

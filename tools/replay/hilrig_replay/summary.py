@@ -110,7 +110,7 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
         task: what it is graded by; None: what its own lab said.
 
     Raises:
-        InputError: nothing was commanded in it, it is damaged, or its parameters or its task are not understood.
+        InputError: it is damaged, or its parameters or its task are not understood.
     """
     collector = _Collector(run, parameters_of(run.parameters_json), task or task_of(run))
     latency = measure(run, collector.add)

@@ -1,6 +1,8 @@
 """`hilrig compare`: how one run differs from another."""
 
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +12,13 @@ from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
     from hilrig_replay.compare import Comparison
+
+
+OTHERWISE = {
+    "command": "nothing moved under command, so it is aligned by the first command that acted",
+    "start": "no command acted, so it is aligned by its start",
+}
+"""What a run without motion is aligned by, for people."""
 
 
 def compare(
@@ -25,22 +34,41 @@ def compare(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Align runs in time and show how they differ from the first: positions, the tool, torques, loop latency."""
+    """Align runs in time and show how they differ from the first: positions, the tool, torques, loop latency.
+
+    Exit code 1: one of several could not be compared; it is said which, and why.
+    """
     from hilrig_replay.compare import compare as compare_runs
     from hilrig_replay.compare import save_comparison_plot
     from hilrig_replay.rerun_view import save_rrd
     from hilrig_replay.run import open_run
+    from hilrig_runtime.errors import InputError
 
-    opened = [open_run(path) for path in runs]
+    opened, unreadable = [], []
+    for path in runs:
+        try:
+            opened.append(open_run(path))
+        except InputError as error:
+            # Among several a bad one does not hide the others; without the reference there is nothing to compare with.
+            if not opened or len(runs) == 2:
+                raise
+            unreadable.append(str(error))
+    if unreadable and len(opened) == 1:
+        raise InputError("\n".join(unreadable))
     comparison = compare_runs(opened, align)
+    comparison = replace(comparison, left_out=(*unreadable, *comparison.left_out))
     if plot is not None:
         save_comparison_plot(comparison, plot)
     if save is not None:
-        save_rrd(opened, save)
+        save_rrd(comparison.runs, save)
     if as_json:
         print(json.dumps(comparison.as_dict()))
     else:
         _print(comparison)
+        for reason in comparison.left_out:
+            print(f"left out: {reason}", file=sys.stderr)
+    if comparison.left_out:
+        raise typer.Exit(1)
 
 
 def _print(comparison: "Comparison") -> None:
@@ -73,4 +101,8 @@ def _print(comparison: "Comparison") -> None:
         ("loop latency p99, ms more", [one.loop_p99_ms for one in each]),
     ):
         table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    for summary, origin in zip(comparison.summaries, comparison.origins, strict=True):
+        if (why := OTHERWISE.get(origin.by)) and origin.by != comparison.aligned_by:
+            console.print(f"{summary.session}: {why}", highlight=False, markup=False)

@@ -95,10 +95,9 @@ def print_report(report: "LatencyReport") -> None:
         table.add_section()
     table.add_row("tick lateness", *_figures(report.jitter_ms.tick_lateness))
     console.print(table)
-    console.print(
-        f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
-        f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
-    )
+    jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
+    lost = f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
+    console.print(lost if report.loop_ms is None else jitter + lost)
     for finding in report.findings:
         console.print(Text(f"• {finding.text}"))
     if report.fit:

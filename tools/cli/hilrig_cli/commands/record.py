@@ -1,6 +1,5 @@
 """`hilrig record start RIG`, `hilrig record stop RIG`: a session by hand, beside those that controllers begin."""
 
-import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,7 +12,7 @@ if TYPE_CHECKING:
     from hilrig_schemas import Event
 
 ANSWER_TIMEOUT_S = 5.0
-"""How long a recorder is looked for: a tool needs a moment to be linked to it."""
+"""How long a recorder has to answer."""
 
 app = typer.Typer(help="Record a rig by hand, whether a controller is there or not.", no_args_is_help=True)
 
@@ -39,26 +38,27 @@ def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
 
 
 def _ask(config: "Path | None", request: "Event") -> "Event":
+    from hilrig_cli.asking import all_rosters, check_rig
     from hilrig_runtime.config import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.presence import rosters
     from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas.topics import CONTROL
 
     lab = load_lab(config)
-    deadline_s = time.monotonic() + ANSWER_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
-        while not (recorders := rosters(bus, lab.name, "recorder")):
-            if time.monotonic() > deadline_s:
-                raise OperationError(
-                    f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
-                )
+        recorders = [one for one in all_rosters(bus, lab, {"recorder"}) if one.service == "recorder"]
+        if not recorders:
+            raise OperationError(
+                f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
+            )
         # Rigs that were added since are the one's that has the first of the lab's file.
         has = next((one for one in recorders if request.rig in one.rigs), None)
         has = has or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
         key = CONTROL.key(lab.name, has.service, has.instance)
         for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
             if answer.error:
+                # A recorder knows of rigs that were taken away: it is asked first, and a name that is none told after.
+                check_rig(bus, lab, request.rig)
                 raise OperationError(answer.error)
             return CONTROL.decode(answer.payload)
     raise OperationError(f"{has.service}/{has.instance} does not answer: see its log")

@@ -85,16 +85,18 @@ def add(
 @app.command()
 def remove(rig: Name, config: Config = None) -> None:
     """Take a rig away from a running lab: no torque, its session ends, its port closes; the others do not feel it."""
+    from hilrig_cli.asking import SERVING, check_rig
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.errors import OperationError
     from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas import Event
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        owners = [roster for roster in _rosters(bus, lab) if rig in roster.rigs and roster.service in ("edge", "sim")]
+        owners = [roster for roster in _rosters(bus, lab) if rig in roster.rigs and roster.service in SERVING]
         if not owners:
-            raise InputError(f"no running service has a rig called {rig!r}: hilrig rig list shows those that there are")
+            check_rig(bus, lab, rig)
+            raise OperationError(f"no running service has {rig}: hilrig rig list shows those that there are")
         # The edge first: its last word is that there is no torque.
         for roster in sorted(owners, key=lambda roster: roster.service):
             print(_ask(bus, lab, roster, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
@@ -103,8 +105,9 @@ def remove(rig: Name, config: Config = None) -> None:
 @app.command()
 def reset(rig: Name, config: Config = None) -> None:
     """Put a rig's arm and parts back to the start; a controller that holds it goes on from there."""
+    from hilrig_cli.asking import check_rig
     from hilrig_runtime.config import load_lab
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.errors import OperationError
     from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas import Event
 
@@ -114,7 +117,8 @@ def reset(rig: Name, config: Config = None) -> None:
             if roster.service == "edge" and rig in roster.rigs:
                 print(_ask(bus, lab, roster, Event(kind=Event.RESET, rig=rig)).text)
                 return
-    raise InputError(f"no edge serves a rig called {rig!r}: hilrig rig list shows those that there are")
+        check_rig(bus, lab, rig)
+    raise OperationError(f"no edge serves {rig}: hilrig rig list shows those that there are")
 
 
 def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
