@@ -82,7 +82,7 @@ def test_a_run_without_a_controller_is_shown_and_has_no_latency(tmp_path: Path, 
     assert "recorded by hand" in page.read_text()
     compared = hilrig("compare", run, path, "--plot", tmp_path / "both.svg")
     assert compared.returncode == 0, compared.stderr
-    assert "no command acted, so it is aligned by its start" in " ".join(compared.stdout.split())
+    assert "no controller commanded, so it is aligned by its start" in " ".join(compared.stdout.split())
 
 
 def test_among_several_runs_a_bad_one_does_not_hide_the_comparison(tmp_path: Path, run: Path) -> None:

@@ -181,7 +181,7 @@ def test_torques_that_answer_no_state_close_no_loop(tmp_path: Path) -> None:
         if isinstance(one.message, JointState | TorqueCommand):
             one.message.basis_step = 0
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=Script(seconds=1.0))))
-    assert report.reasons == ("nothing closed a loop, for no torque that acted answered a state",)
+    assert report.reasons == ("nothing closed a loop, for no torque acted that a controller wrote after it had read",)
 
 
 @pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])

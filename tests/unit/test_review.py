@@ -8,18 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.compare import compare, save_comparison_plot
+from hilrig_replay.compare import Origin, compare, origin_of, save_comparison_plot
 from hilrig_replay.report import report
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import tips
 from hilrig_replay.summary import COURSE_POINTS, summarise
+from hilrig_runtime.config import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import Event, JointState
+from hilrig_schemas import Event, JointState, TorqueCommand
 from recordings import PARAMETERS, Made, Script, make, position, record, write
 
 
 def named(folder: Path, name: str, script: Script, made: list[Made] | None = None) -> Run:
-    return open_run(write(folder / f"{name}.mcap", made or make(script), script=script, session=name))
+    made = made or make(script)
+    for one in made:
+        if getattr(one.message, "session", ""):
+            one.message.session = name  # type: ignore[attr-defined]
+    return open_run(write(folder / f"{name}.mcap", made, script=script, session=name))
 
 
 def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
@@ -115,6 +120,26 @@ def test_what_never_moves_is_aligned_by_its_first_command_and_without_one_by_its
     assert comparison.differences[0].loop_p50_ms == 0
     assert comparison.differences[1].loop_p50_ms is None
     assert comparison.left_out == ()
+
+
+def test_the_torque_zero_that_an_edge_begins_with_is_nobody_s_command(tmp_path: Path) -> None:
+    silent = Script(seconds=2.0, controllers=False)
+    made = make(silent)
+    for one in made:
+        if isinstance(one.message, JointState):
+            one.message.session, one.message.command_seq = "", 1
+    first = made[0]
+    made.insert(
+        0, Made("command", first.publish_wall_ns, TorqueCommand(rig="rig1", seq=1, effort=[0.0] * 4, safe=True))
+    )
+    run = named(tmp_path, "alone", silent, made)
+    assert origin_of(run, "motion") == Origin(0, "start")
+    summary = summarise(
+        run, parse_lab("[[task.poses]]\nname = 'here'\nposition_mm = [300, 0, 0]\ntolerance_mm = 900\n").task
+    )
+    assert summary.latency.reasons == ("nothing closed a loop, for no controller wrote in this session",)
+    assert summary.grade is not None
+    assert summary.grade.score == 0
 
 
 def test_a_run_that_can_not_be_aligned_does_not_hide_the_others(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.run import Run
-from hilrig_replay.summary import Course, RunSummary, summarise
+from hilrig_replay.summary import Course, RunSummary, summarise, under_command
 from hilrig_runtime.errors import InputError
 
 ALIGNMENTS: Final = ("motion", "start")
@@ -145,9 +145,13 @@ def origin_of(run: Run, align: str) -> Origin:
 def _first_motion(run: Run) -> Origin:
     first = Origin(0, "start")
     for block in run.blocks(frozenset({"state"})):
-        # Before the session the arm may still settle: motion counts from the first command on.
-        states = block.states[block.states["command_seq"] > 0]
-        if len(states) and first.by == "start":
+        states = block.states
+        # Before the session the arm may still settle: motion counts from a controller's first command on.
+        if first.by == "start":
+            commanded = under_command(run, states)
+            if not commanded.any():
+                continue
+            states = states[int(np.argmax(commanded)) :]
             first = Origin(int(run.time_ns(states[:1])[0]), "command")
         moving = states[(np.abs(states["velocity"]) > MOVING).any(axis=1)][:1]
         if len(moving):

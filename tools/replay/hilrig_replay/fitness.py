@@ -16,7 +16,7 @@ from hilrig_replay.spool import Spool
 ENOUGH_SAMPLES: Final = 500
 """Below, p99 rests on fewer than five samples."""
 NO_CONTROLLER: Final = "nothing closed a loop, for no controller wrote in this session"
-NO_LOOP: Final = "nothing closed a loop, for no torque that acted answered a state"
+NO_LOOP: Final = "nothing closed a loop, for no torque acted that a controller wrote after it had read"
 BACKLOG_NS: Final = 1_000_000_000
 """A recording whose messages waited longer than this to be taken in is not trusted."""
 CLOCK_STEP_NS: Final = 10_000_000
@@ -59,7 +59,7 @@ class FitnessWatch:
         self._run = run
         self._ticks, self._writes = Spool(_TICK), Spool(_WRITE)
         self.stalls = Stalls()
-        self._samples = self._negative = 0
+        self._samples = self._negative = self._written = 0
         self._gaps = 0
         self._missed = 0
         self._delay_ns: tuple[int, int] | None = None
@@ -80,7 +80,10 @@ class FitnessWatch:
     def _add_commands(self, commands: Rows) -> None:
         self._gaps += _gaps(commands, self._last_command)
         self._last_command = commands[-1:].copy()
-        write_ns = np.concatenate((self._last_write_ns, commands["write_arrived_ns"][~commands["safe"]]))
+        # What the edge says of itself was written by nobody.
+        written = commands["write_arrived_ns"][~commands["safe"]]
+        self._written += len(written)
+        write_ns = np.concatenate((self._last_write_ns, written))
         self._writes.add(np.diff(write_ns).view(_WRITE))
         self._last_write_ns = write_ns[-1:].copy()
 
@@ -147,7 +150,7 @@ class FitnessWatch:
         if self._negative:
             yield f"{_count(self._negative, 'stage')} came out negative: the stamps contradict each other"
         if not self._samples and not unmatched:
-            yield NO_LOOP if run.file.counts["command"] else NO_CONTROLLER
+            yield NO_LOOP if self._written else NO_CONTROLLER
         elif self._samples < ENOUGH_SAMPLES:
             yield f"{_count(self._samples, 'sample')} only: {ENOUGH_SAMPLES} are needed for a 99th percentile"
 

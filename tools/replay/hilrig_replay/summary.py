@@ -132,6 +132,14 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
     )
 
 
+def under_command(run: Run, states: Rows) -> NDArray[np.bool_]:
+    """Where a controller's command acts, shape (n,): what is from before its session may belong to the one before."""
+    if run.controller:
+        return np.asarray((states["command_seq"] > 0) & (states["session"] == run.names.code(run.session)))
+    # Recorded by hand, controllers come and go; where there is none, the edge's own command of no torque acts.
+    return np.asarray((states["basis_step"] != 0) | (states["effort"] != 0).any(axis=1))
+
+
 def _box_ms(latency: LatencyReport) -> tuple[float, ...]:
     if not latency.samples:
         return ()
@@ -172,7 +180,7 @@ class _Collector:
         pose = np.ascontiguousarray(forward(self._parameters.arm, states["position"].T).T)
         tip = pose[:, :3]
         if self._grader is not None:
-            self._grader.add_states(time_s, pose, self._commanded(states))
+            self._grader.add_states(time_s, pose, under_command(self._run, states))
         way = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
         lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
         step_s = self._run.step_ns / 1e9
@@ -193,13 +201,6 @@ class _Collector:
         )
         self._seen += len(states)
         self._last_tip = tip[-1:]
-
-    def _commanded(self, states: Rows) -> NDArray[np.bool_]:
-        """Where a command of the session acts: what is from before it may belong to the one before."""
-        commanded = states["command_seq"] > 0
-        if self._run.controller:
-            commanded &= states["session"] == self._run.names.code(self._run.session)
-        return np.asarray(commanded)
 
     def grade(self) -> Grade | None:
         return None if self._grader is None else self._grader.grade(self.task())

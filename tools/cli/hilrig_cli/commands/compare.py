@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 OTHERWISE = {
-    "command": "nothing moved under command, so it is aligned by the first command that acted",
-    "start": "no command acted, so it is aligned by its start",
+    "command": "nothing moved under command, so it is aligned by its first command",
+    "start": "no controller commanded, so it is aligned by its start",
 }
 """What a run without motion is aligned by, for people."""
 
