@@ -1,6 +1,8 @@
 """Bad input to the command line: one clear line that says what and where, the documented exit code, no traceback."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -94,6 +96,29 @@ def test_a_demo_that_can_not_write_its_results(tmp_path: Path) -> None:
     done = hilrig("demo", "--duration", "1", "--out", tmp_path / "out")
     assert done.returncode == 3
     assert str(tmp_path / "out") in one_line(done.stderr)
+
+
+def without(package: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """A command where a package is not installed, as on a host with some of the parts."""
+    code = f"import sys; sys.modules['{package}'] = None; from hilrig_cli.__main__ import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(("package", "command"), [("cryptography", "certs"), ("mcap", "runs")])
+def test_a_part_that_is_not_installed_is_named(tmp_path: Path, package: str, command: str) -> None:
+    done = without(package, command, tmp_path)
+    assert done.returncode == 3
+    assert f"needs {package!r}, which is not installed" in one_line(done.stderr)
+
+
+def test_a_host_that_can_not_read_certificates_is_looked_at_all_the_same(tmp_path: Path) -> None:
+    config = write_lab(tmp_path, extra=f"bus.tls = {{folder = '{tmp_path}'}}")
+    done = without("cryptography", "doctor", "--config", config)
+    assert done.returncode == 1, "the bus can't be joined without certificates"
+    assert "'cryptography' is not installed" in " ".join(done.stdout.replace("│", "").split())
+    assert "open files" in done.stdout
+    assert "Traceback" not in done.stderr
 
 
 def test_wrong_usage_is_exit_code_2() -> None:

@@ -186,6 +186,7 @@ def test_a_disk_is_judged_by_what_is_free(
     lab = parse_lab(f'[recorder]\nfolder = "{tmp_path / "later"}"\n')
     [finding] = host.check_disk(lab)
     assert finding.level is level
+    assert ("976.6 GiB free" if level is Level.GOOD else f"{free_mib} MiB free") in finding.text
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

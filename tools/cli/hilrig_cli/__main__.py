@@ -1,8 +1,13 @@
 """`hilrig` and `python -m hilrig_cli`: a command, and how its process ends."""
 
 import sys
+from typing import Final
 
 from hilrig_runtime.ending import run_main
+from hilrig_runtime.errors import OperationError
+
+_OUR_OWN: Final = "hilrig"
+"""What begins so is in every installation."""
 
 
 def main() -> int:
@@ -14,7 +19,16 @@ def _command() -> None:
     # Here, because it takes a moment in which Ctrl-C may come.
     from hilrig_cli.main import app
 
-    app()
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith(_OUR_OWN):
+            raise
+        package = error.name.partition(".")[0]
+        raise OperationError(
+            f"this command needs {package!r}, which is not installed here, for only some of hilrig's parts are: "
+            "pip install 'hilrig[all]'"
+        ) from error
 
 
 if __name__ == "__main__":

@@ -110,13 +110,17 @@ def check_disk(lab: LabConfig) -> Iterator[Finding]:
     free = shutil.disk_usage(there).free
     least = lab.recorder.min_free_mib * 2**20
     hours = max(0.0, free - least) / (BYTES_A_RIG_AND_HOUR * len(lab.rigs))
-    text = f"{free / 2**30:.1f} GiB free for recordings in {folder}"
+    text = f"{_size(free)} free for recordings in {folder}"
     if free <= least:
         yield wrong("disk", f"{text}: recordings end below {lab.recorder.min_free_mib} MiB", "delete old recordings")
     elif hours < 8:
         yield notice("disk", f"{text}, about {hours:.1f} h of this lab", "delete old ones, or set recorder.keep_gib")
     else:
         yield good("disk", text)
+
+
+def _size(bytes_: int) -> str:
+    return f"{bytes_ / 2**30:.1f} GiB" if bytes_ >= 2**30 else f"{bytes_ >> 20} MiB"
 
 
 def _all_restricted(lab: LabConfig) -> bool:
