@@ -55,7 +55,7 @@ def as_markdown() -> str:
 
 
 def as_csv() -> str:
-    """One line a value: table, number, address, classic number, name, type, words, unit, scale, access, text."""
+    """One line a value: table, number, address, classic number, name, type, words, unit, scale, writable, text."""
     text = io.StringIO()
     rows = as_rows()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
