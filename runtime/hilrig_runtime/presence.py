@@ -3,32 +3,38 @@
 Two simulations of one rig, or two edges, would each tell the controller something else. So a service asks the others
 of its kind before it begins, and again whenever one appears and every few seconds: a network that was in two halves
 may have let both in. Of two that have a rig in common, or a name, the one that started later ends and says why. The
-same answers tell how far the hosts' wall clocks are apart; nothing depends on that, people want to know.
+same answers tell how far the hosts' wall clocks are apart; nothing depends on that, people want to know. Nor does
+anything depend on who is gone: it stands in the log, so that an operator finds the moment at which a link broke.
 """
 
+import logging
 import platform
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from queue import Empty, SimpleQueue
 from typing import Final
 
 from google.protobuf.message import DecodeError
 
+from hilrig_runtime.absence import Absences
 from hilrig_runtime.bus import Bus, Handle
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Roster
 from hilrig_schemas.topics import ROSTER, alive_key
 
-ASK_PERIOD_S: Final = 10.0
+ASK_PERIOD_NS: Final = 10_000_000_000
 ASK_AGAIN_S: Final = 0.1
 ASK_TIMEOUT_S: Final = 0.5
 CLAIM_TIMEOUT_S: Final = 3.0
 """For one that is there and slow to answer; who has answered is not waited for."""
 NAMED: Final = 3
 """Rigs that a refusal names before it says "and … more"."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +116,8 @@ class Presence:
         self._on_conflict = on_conflict
         self._claimed = False
         self._closing = False
-        self._wake = threading.Event()
+        self._seen: SimpleQueue[tuple[str, bool]] = SimpleQueue()
+        """Who came (True) or went, "<service>/<instance>"; what ends the watch has no name."""
         self._declared: list[Handle] = [bus.serve(ROSTER.key(lab, own.service, own.instance), self._answer)]
 
     def claim(self) -> None:
@@ -123,8 +130,8 @@ class Presence:
             return
         self.look_again()
         self._claimed = True
-        watched = alive_key(self._lab, self._own.service, "*")
-        self._declared.append(self._bus.watch(watched, lambda _, alive: self._wake.set() if alive else None))
+        watched = alive_key(self._lab, "*", "*")
+        self._declared.append(self._bus.watch(watched, lambda key, alive: self._seen.put((_who(key), alive))))
         threading.Thread(target=self._watch, name="presence", daemon=True).start()
 
     def look_again(self) -> None:
@@ -145,7 +152,7 @@ class Presence:
     def close(self) -> None:
         """Stop answering and watching."""
         self._closing = True
-        self._wake.set()
+        self._seen.put(("", False))
         while self._declared:
             self._declared.pop().close()
 
@@ -169,11 +176,30 @@ class Presence:
         return conflict(self._roster(), others)
 
     def _watch(self) -> None:
+        absences, monotonic_ns = Absences(), self._clock.monotonic_ns
+        look_ns = monotonic_ns() + ASK_PERIOD_NS
         while not self._closing:
-            self._wake.wait(ASK_PERIOD_S)
-            self._wake.clear()
+            due_ns = absences.due_ns
+            next_ns = look_ns if due_ns is None else min(look_ns, due_ns)
+            try:
+                who, is_there = self._seen.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
+            except Empty:
+                pass
+            else:
+                if is_there and who.startswith(f"{self._own.service}/"):
+                    look_ns = monotonic_ns()
+                if not is_there:
+                    absences.went(who, monotonic_ns())
+                elif absences.came(who):
+                    logger.info("%s is on the bus again", who)
             if self._closing:
                 return
+            gone = absences.lasting(monotonic_ns())
+            if gone:
+                logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))
+            if monotonic_ns() < look_ns:
+                continue
+            look_ns = monotonic_ns() + ASK_PERIOD_NS
             try:
                 reason = self._look()
             except OperationError:
@@ -182,3 +208,8 @@ class Presence:
             if reason:
                 self._on_conflict(reason)
                 return
+
+
+def _who(alive: str) -> str:
+    """The service of a liveliness token, "<service>/<instance>"."""
+    return "/".join(alive.split("/")[-2:])

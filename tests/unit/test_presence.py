@@ -114,6 +114,20 @@ def test_health_says_how_far_clocks_are_apart() -> None:
     assert (heard[0].clock_peer, heard[0].clock_offset_ns) == ("edge/1", -700_000_000_000)
 
 
+def test_who_goes_and_comes_back_stands_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "hilrig_runtime.presence")
+    hub = MemoryHub()
+    with Service("recorder", LAB, MemoryBus(hub)) as recorder:
+        recorder.ready()
+        with Service("sim", LAB, MemoryBus(hub)) as sim:
+            sim.ready()
+        eventually(lambda: "not on the bus any more: sim/1;" in caplog.text)
+        with Service("sim", LAB, MemoryBus(hub)) as sim:
+            sim.ready()
+            eventually(lambda: "sim/1 is on the bus again" in caplog.text)
+    assert "recorder/1" not in caplog.text
+
+
 def test_a_rig_that_the_lab_does_not_have_is_refused() -> None:
     with pytest.raises(InputError, match="no rig is called 'rig9'"):
         service(MemoryHub(), "1", ("rig9",), 1_000)
