@@ -12,6 +12,7 @@ import platform
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from queue import Empty, SimpleQueue
@@ -116,6 +117,7 @@ class Presence:
         self._on_conflict = on_conflict
         self._claimed = False
         self._closing = False
+        self._absences = Absences()
         self._seen: SimpleQueue[tuple[str, bool]] = SimpleQueue()
         """Who came (True) or went, "<service>/<instance>"; what ends the watch has no name."""
         self._declared: list[Handle] = [bus.serve(ROSTER.key(lab, own.service, own.instance), self._answer)]
@@ -176,27 +178,18 @@ class Presence:
         return conflict(self._roster(), others)
 
     def _watch(self) -> None:
-        absences, monotonic_ns = Absences(), self._clock.monotonic_ns
+        monotonic_ns, due_ns = self._clock.monotonic_ns, self._absences.due_ns
         look_ns = monotonic_ns() + ASK_PERIOD_NS
         while not self._closing:
-            due_ns = absences.due_ns
             next_ns = look_ns if due_ns is None else min(look_ns, due_ns)
-            try:
+            with suppress(Empty):
                 who, is_there = self._seen.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
-            except Empty:
-                pass
-            else:
+                if self._closing:
+                    return
                 if is_there and who.startswith(f"{self._own.service}/"):
                     look_ns = monotonic_ns()
-                if not is_there:
-                    absences.went(who, monotonic_ns())
-                elif absences.came(who):
-                    logger.info("%s is on the bus again", who)
-            if self._closing:
-                return
-            gone = absences.lasting(monotonic_ns())
-            if gone:
-                logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))
+                self._note(who, is_there, monotonic_ns())
+            due_ns = self._tell_of_absences(monotonic_ns())
             if monotonic_ns() < look_ns:
                 continue
             look_ns = monotonic_ns() + ASK_PERIOD_NS
@@ -208,6 +201,21 @@ class Presence:
             if reason:
                 self._on_conflict(reason)
                 return
+
+    def _note(self, who: str, is_there: bool, now_ns: int) -> None:
+        # Without a router a service does not see itself either.
+        if who == f"{self._own.service}/{self._own.instance}":
+            return
+        if not is_there:
+            self._absences.went(who, now_ns)
+        elif self._absences.came(who):
+            logger.info("%s is on the bus again", who)
+
+    def _tell_of_absences(self, now_ns: int) -> int | None:
+        gone = self._absences.lasting(now_ns)
+        if gone:
+            logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))
+        return self._absences.due_ns
 
 
 def _who(alive: str) -> str:
