@@ -7,12 +7,14 @@ this way, so that this module imports nothing that takes time.
 
 import errno
 import io
+import itertools
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
 from types import FrameType
 from typing import Final
 
@@ -30,12 +32,22 @@ _NO_ROOM: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT"
 
 def stop_on_signals(stopping: threading.Event) -> None:
     """Set `stopping` on the first SIGINT or SIGTERM; end the process on the second."""
+    count = itertools.count()
+    heard: SimpleQueue[int] = SimpleQueue()
 
     def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        if stopping.is_set():
+        # Counted too, for a second one may come while the first is being handled.
+        if next(count) or stopping.is_set():
             os._exit(128 + number)
+        # A signal may come while this very thread holds the event's lock: to set it here could wait without end. This
+        # kind of queue has no such lock.
+        heard.put(number)
+
+    def tell() -> None:
+        heard.get()
         stopping.set()
 
+    threading.Thread(target=tell, name="signals", daemon=True).start()
     for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", None)):
         if number is not None:
             signal.signal(number, on_signal)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from labs import free_ports
-from waiting import eventually
+from waiting import PATIENT_S, eventually
 
 SERVICE = """
 import sys, threading, time
@@ -71,6 +71,27 @@ def test_the_second_signal_forces(tmp_path: Path) -> None:
     eventually(lambda: process.poll() is not None or process.terminate())
     assert process.wait() == 128 + signal.SIGTERM
     process.communicate()
+
+
+LOCKED = """
+import os, signal, threading
+from hilrig_runtime.ending import stop_on_signals
+
+stopping = threading.Event()
+stop_on_signals(stopping)
+with stopping._cond:
+    # As in the middle of `wait`.
+    os.kill(os.getpid(), signal.SIGTERM)
+    for _ in range(1000):
+        pass
+stopping.wait()
+print("ended", flush=True)
+"""
+
+
+def test_a_signal_that_comes_while_the_event_is_locked_is_heard_all_the_same() -> None:
+    done = subprocess.run([sys.executable, "-c", LOCKED], check=True, capture_output=True, text=True, timeout=PATIENT_S)
+    assert done.stdout == "ended\n"
 
 
 def test_a_process_whose_closing_hangs_ends_all_the_same(tmp_path: Path) -> None:
