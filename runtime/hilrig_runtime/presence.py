@@ -25,7 +25,7 @@ from hilrig_runtime.bus import Bus, Handle
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Roster
-from hilrig_schemas.topics import ROSTER, alive_key
+from hilrig_schemas.topics import ROSTER, alive_key, source_of_alive_key
 
 ASK_PERIOD_NS: Final = 10_000_000_000
 ASK_AGAIN_S: Final = 0.1
@@ -133,7 +133,9 @@ class Presence:
         self.look_again()
         self._claimed = True
         watched = alive_key(self._lab, "*", "*")
-        self._declared.append(self._bus.watch(watched, lambda key, alive: self._seen.put((_who(key), alive))))
+        self._declared.append(
+            self._bus.watch(watched, lambda key, alive: self._seen.put((source_of_alive_key(key), alive)))
+        )
         threading.Thread(target=self._watch, name="presence", daemon=True).start()
 
     def look_again(self) -> None:
@@ -178,9 +180,10 @@ class Presence:
         return conflict(self._roster(), others)
 
     def _watch(self) -> None:
-        monotonic_ns, due_ns = self._clock.monotonic_ns, self._absences.due_ns
+        monotonic_ns = self._clock.monotonic_ns
         look_ns = monotonic_ns() + ASK_PERIOD_NS
         while not self._closing:
+            due_ns = self._absences.due_ns
             next_ns = look_ns if due_ns is None else min(look_ns, due_ns)
             with suppress(Empty):
                 who, is_there = self._seen.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
@@ -189,7 +192,7 @@ class Presence:
                 if is_there and who.startswith(f"{self._own.service}/"):
                     look_ns = monotonic_ns()
                 self._note(who, is_there, monotonic_ns())
-            due_ns = self._tell_of_absences(monotonic_ns())
+            self._tell_of_absences(monotonic_ns())
             if monotonic_ns() < look_ns:
                 continue
             look_ns = monotonic_ns() + ASK_PERIOD_NS
@@ -211,13 +214,7 @@ class Presence:
         elif self._absences.came(who):
             logger.info("%s is on the bus again", who)
 
-    def _tell_of_absences(self, now_ns: int) -> int | None:
+    def _tell_of_absences(self, now_ns: int) -> None:
         gone = self._absences.lasting(now_ns)
         if gone:
             logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))
-        return self._absences.due_ns
-
-
-def _who(alive: str) -> str:
-    """The service of a liveliness token, "<service>/<instance>"."""
-    return "/".join(alive.split("/")[-2:])

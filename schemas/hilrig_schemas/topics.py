@@ -115,6 +115,11 @@ def alive_key(lab: str, service: str, instance: str) -> str:
     return f"{ROOT}/{lab}/{ALIVE}/{service}/{instance}"
 
 
+def source_of_alive_key(key: str) -> str:
+    """Whose liveliness token it is, "<service>/<instance>"."""
+    return "/".join(key.split("/")[-2:])
+
+
 def all_topics() -> Iterator[Topic[Message]]:
     """Every topic of the registry."""
     yield from RIG_TOPICS

@@ -12,7 +12,7 @@ from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Health
-from hilrig_schemas.topics import HEALTH, alive_key
+from hilrig_schemas.topics import HEALTH, alive_key, source_of_alive_key
 
 SERVICES = ("sim", "edge", "recorder")
 LISTENING_S = 2.5
@@ -60,7 +60,7 @@ def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S
             heard.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
 
     def on_alive(key: str, alive: bool) -> None:
-        name = "/".join(key.split("/")[-2:])
+        name = source_of_alive_key(key)
         with lock:
             (heard.alive.add if alive else heard.alive.discard)(name)
 
