@@ -136,6 +136,22 @@ def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_ar
         new.unlink()
 
 
+def test_a_finished_file_with_zeros_in_its_middle_is_not_taken_for_whole(tmp_path: Path) -> None:
+    path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
+    made = good_file(path)
+    starts = [offset for offset, item in scan(path.read_bytes()) if isinstance(item, Chunk)]
+    data = bytearray(path.read_bytes())
+    within = starts[1] + 60
+    data[within : within + 40] = bytes(40)
+    path.write_bytes(data)
+    assert is_whole(data)
+    recovery = recover(path, new)
+    assert recovery.damaged_chunks == 1
+    assert read(new) == [message for number, content in enumerate(made) if number != 1 for message in content]
+    # What was made of it is whole.
+    assert recover(new, tmp_path / "again.mcap").path is None
+
+
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("chunked", [True, False])
 def test_a_foreign_file_is_recovered_too(tmp_path: Path, compression: CompressionType, chunked: bool) -> None:

@@ -128,7 +128,7 @@ def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: Tru
 def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
     recovery = Recovery(source)
     view = map_file(source)
-    if is_whole(view):
+    if is_whole(view) and _is_intact(view, source, go_on):
         return recovery
     if path.exists():
         raise OperationError(f"{path}: exists; choose another name for what is recovered from {source.name}")
@@ -140,6 +140,25 @@ def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
         raise OperationError(f"{path}: can't be written: {error.strerror}") from error
     recovery.path = path
     return recovery
+
+
+def _is_intact(view: memoryview, source: Path, go_on: Callable[[], bool]) -> bool:
+    """Whether everything before a good end holds too: what was damaged on a disk or a stick still ends as it did."""
+    for _, item in scan(view):
+        if isinstance(item, Damage):
+            return False
+        if isinstance(item, Chunk):
+            _ask(go_on, source)
+            try:
+                open_chunk(item)
+            except DamagedError:
+                return False
+    return True
+
+
+def _ask(go_on: Callable[[], bool], source: Path) -> None:
+    if not go_on():
+        raise OperationError(f"{source}: recovering was interrupted; the file is as it was")
 
 
 @contextlib.contextmanager
@@ -200,8 +219,7 @@ class _Copy:
         recovery = self._recovery
         for _, item in scan(self._view):
             if isinstance(item, Chunk):
-                if not go_on():
-                    raise OperationError(f"{recovery.source}: recovering was interrupted; the file is as it was")
+                _ask(go_on, recovery.source)
                 self._copy_chunk(writer, item)
             elif isinstance(item, Message):
                 # A file of chunks has no messages beside them: that is a damaged record which looks like one.
