@@ -86,6 +86,12 @@ def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, brows
     browser.open(page.as_uri(), width=420)
     assert browser.run("document.documentElement.scrollWidth") <= 420
     assert browser.run("document.querySelectorAll('.scroll img').length") == 0
+    # Nor does a table: the ranking stands in cards whose figures say what they are.
+    browser.run("document.querySelectorAll('details').forEach(each => { each.open = true })")
+    assert browser.run("[...document.querySelectorAll('.scroll')].every(each => each.scrollWidth <= each.clientWidth)")
+    told = browser.run("getComputedStyle(document.querySelector('.ranking td + td'), '::before').content")
+    assert told.strip('"') in {"goals", "parts placed"}
+    browser.run("document.querySelectorAll('details').forEach(each => { each.open = false })")
     panels = browser.run(
         "[...document.querySelector('section').querySelectorAll('img')].map(image => image.getBoundingClientRect())"
         ".map(box => [box.left, box.right, box.top, box.bottom])"

@@ -24,7 +24,9 @@ def test_the_csv_has_every_value_of_the_map() -> None:
         "4",
         "40005",
     )
-    assert (theta1["type"], theta1["unit"], theta1["scale"], theta1["writable"]) == ("int16", "°", "100", "False")
+    assert (theta1["type"], theta1["unit"], theta1["scale"], theta1["access"]) == ("int16", "°", "100", "R")
+    access = {row["name"]: row["access"] for row in rows}
+    assert access == {register.name: "R/W" if register.writable else "R" for register in MAP}
 
 
 def test_the_command_prints_the_map_in_each_form() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -232,6 +233,28 @@ def test_a_class_is_ranked_with_each_run_below(tmp_path: Path) -> None:
     assert page.text.index("one-part") < page.text.index("nothing")
     assert "1 of 4" in page.text
     assert "1.00" in page.text
+
+
+def test_a_run_that_was_replayed_and_a_copied_file_are_named_and_honest_ones_are_not(tmp_path: Path) -> None:
+    script = Script(seconds=8.0, law="feedback")
+    anna = named(tmp_path, "anna", script).path
+    ben = named(tmp_path, "ben", replace(script, seed=2, delay_ms=3.0)).path
+    # The same torques, in a session of its own; and the same file under another name.
+    replayed = named(tmp_path, "carl", script).path
+    copied = tmp_path / "dora.mcap"
+    copied.write_bytes(ben.read_bytes())
+    found = report([anna, ben, replayed, copied])
+    assert sorted(found.alike) == [
+        "anna and carl: 100 % of the torques that the controllers wrote are the same to the last count",
+        "ben and dora: the same recording",
+    ]
+    page = _Page(found.html)
+    assert "The same torques" in page.text
+    assert all(pair in page.text for pair in found.alike)
+    # Each goes by the name of its file.
+    assert {run["name"] for run in found.runs} == {"anna", "ben", "carl", "dora"}
+    assert "dora" in page.text.split("Ranked")[0]
+    assert report([anna, ben]).alike == ()
 
 
 def test_what_a_recording_says_is_text_and_never_markup(tmp_path: Path) -> None:

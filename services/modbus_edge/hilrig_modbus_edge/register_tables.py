@@ -55,9 +55,9 @@ def as_markdown() -> str:
 
 
 def as_csv() -> str:
-    """One line a value: table, number, address, classic number, name, type, words, unit, scale, writable, text."""
+    """One line a value, as `as_rows`; but `access` is R or R/W, as manuals and import formats of PLC tools have it."""
     text = io.StringIO()
-    rows = as_rows()
+    rows = [_with_access(row) for row in as_rows()]
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -83,6 +83,13 @@ def as_rows() -> list[dict[str, str | int | bool]]:
         for table in _TITLES
         for row in _rows(table)
     ]
+
+
+def _with_access(row: dict[str, str | int | bool]) -> dict[str, str | int | bool]:
+    return {
+        "access" if key == "writable" else key: value if key != "writable" else ("R/W" if value else "R")
+        for key, value in row.items()
+    }
 
 
 def _rows(table: Table) -> list[Register]:

@@ -38,7 +38,7 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
     _boxes(loop, runs)
     label(loop, "Loop latency, ms", "box: quartiles, whiskers: p1 and p99", "")
     places = [str(row + 1) for row in rows]
-    names = [f"{place}. {run.session}" for place, run in zip(places, runs, strict=True)]
+    names = [f"{place}. {run.name}" for place, run in zip(places, runs, strict=True)]
     for axes in figure.axes:
         # Each panel tells its rows: on a narrow page they stand one below the other.
         axes.set_yticks(rows, names if axes is goals and len(runs) <= _NAMED else places, fontsize=7, color=INK)

@@ -18,6 +18,7 @@ from hilrig_replay.assignment import task_of
 from hilrig_replay.distribution import Statistics
 from hilrig_replay.distribution_plot import distribution_figure
 from hilrig_replay.latency_plot import latency_figure
+from hilrig_replay.likeness import alike
 from hilrig_replay.motion_plot import motion_figure
 from hilrig_replay.palette import EFFORT_SYMBOLS, STAGE_NAMES
 from hilrig_replay.run import Run, open_run
@@ -53,7 +54,14 @@ img { max-width: 100%; height: auto; display: block; }
   section, details { padding: .8rem .6rem; }
   td:first-child { white-space: normal; }
   td.text { min-width: 9rem; } }
- li { margin: .25rem 0; }
+@media (max-width: 44rem) { .ranking thead { display: none; } .ranking table, .ranking tbody { display: block; }
+  .ranking tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(6.5rem, 1fr)); padding: .4rem 0;
+    border-bottom: 1px solid #dfe3e8; }
+  .ranking td { text-align: left; border: 0; white-space: normal; font-size: .85rem; }
+  .ranking td:first-child { grid-column: 1 / -1; font-weight: 600; overflow-wrap: anywhere; }
+  .ranking td + td::before { content: attr(data-what); display: block; color: #5d6771; font-size: .7rem; } }
+@media (max-width: 30rem) { table { font-size: .68rem; } th, td { padding: .25rem .1rem; } }
+li { margin: .25rem 0; overflow-wrap: anywhere; }
 .good { color: #1a7f37; } .bad { color: #b35900; }
 summary { cursor: pointer; font-weight: 600; } summary span { font-weight: 400; }
 @media print { body { max-width: none; } section, details { break-inside: avoid; } }
@@ -76,6 +84,8 @@ class Report:
     """Each run as plain values for JSON, the best first."""
     left_out: tuple[str, ...]
     """Why a recording is not in it, one sentence each."""
+    alike: tuple[str, ...]
+    """Which runs were driven by the same torques, one sentence a pair."""
 
 
 def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | None = None) -> Report:
@@ -103,10 +113,24 @@ def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | 
     pages.sort(key=_rank)
     verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
     plain = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
-    return Report(_html(pages, left_out), plain, tuple(left_out))
+    pairs = _alike(pages)
+    return Report(_html(pages, left_out, pairs), plain, tuple(left_out), pairs)
 
 
-def _html(pages: Sequence[_Page], left_out: Sequence[str]) -> str:
+def _alike(pages: Sequence[_Page]) -> tuple[str, ...]:
+    runs = [page.summary for page in pages]
+    return tuple(
+        f"{runs[one].name} and {runs[other].name}: "
+        + (
+            "the same recording"
+            if runs[one].session == runs[other].session
+            else f"{int(100 * share)} % of the torques that the controllers wrote are the same to the last count"
+        )
+        for one, other, share in alike([run.torques for run in runs])
+    )
+
+
+def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str]) -> str:
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
@@ -114,11 +138,12 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str]) -> str:
     else:
         title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
-            f"<details><summary>{number}. {escape(page.summary.session)} "
-            f'<span class="quiet">· {escape(_who(page.summary))}</span></summary>{_run(page)}</details>'
+            f"<details><summary>{number}. {escape(page.summary.name)} "
+            f'<span class="quiet">· {escape(_whose(page.summary))}</span></summary>{_run(page)}</details>'
             for number, page in enumerate(pages, start=1)
         )
-        body = f"<h1>{title}</h1>{_overview(pages)}{_left_out(left_out)}{details}"
+        told = _named("Left out", left_out) + _named("The same torques", pairs)
+        body = f"<h1>{title}</h1>{_overview(pages)}{told}{details}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -153,6 +178,12 @@ def _who(summary: RunSummary) -> str:
     # A session that a controller began has its address.
     who = f"controlled by {summary.controller}" if summary.controller else "recorded by hand"
     return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {who} · {summary.start}"
+
+
+def _whose(summary: RunSummary) -> str:
+    # A file that was renamed says in its text what it was recorded as.
+    renamed = "" if summary.name == summary.session else f"{summary.session} · "
+    return renamed + _who(summary)
 
 
 def _facts(page: _Page) -> str:
@@ -237,7 +268,7 @@ def _overview(pages: Sequence[_Page]) -> str:
         summary, loop = page.summary, page.summary.latency.loop_ms
         rows.append(
             [
-                f"{number}. {summary.session}",
+                f"{number}. {summary.name}",
                 *(_graded(summary) if graded else _placed(summary)),
                 "–" if loop is None else f"{loop.p50:.1f} / {loop.p99:.1f}",
                 f"{summary.motion.tool_path_m:.2f}",
@@ -250,12 +281,12 @@ def _overview(pages: Sequence[_Page]) -> str:
     by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
     note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
     distributions = _picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
-    return f"<section>{_table(header, rows)}{note}{distributions}</section>"
+    return f"<section>{_ranking(header, rows)}{note}{distributions}</section>"
 
 
-def _left_out(reasons: Iterable[str]) -> str:
-    items = "".join(f"<li>{escape(reason)}</li>" for reason in reasons)
-    return f'<section><h2>Left out</h2><ul class="bad">{items}</ul></section>' if items else ""
+def _named(title: str, sentences: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
+    return f'<section><h2>{title}</h2><ul class="bad">{items}</ul></section>' if items else ""
 
 
 def _graded(summary: RunSummary) -> list[str]:
@@ -295,6 +326,21 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _ranking(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose rows are cards on a narrow page: each cell knows what it is."""
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<td data-what="{escape(what, quote=True)}">{escape(cell)}</td>'
+            for what, cell in zip(header, row, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll ranking"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _picture(figure: Figure, what: str) -> str:

@@ -13,6 +13,7 @@ from hilrig_replay.columns import Rows
 from hilrig_replay.distribution import percentiles
 from hilrig_replay.grade import Grade, Grader
 from hilrig_replay.latency import LatencyReport, measure
+from hilrig_replay.likeness import Torques
 from hilrig_replay.records import Records
 from hilrig_replay.run import Run
 from hilrig_replay.scene import parameters_of
@@ -63,6 +64,8 @@ class Course:
 class RunSummary:
     """One run, ready to be shown or compared."""
 
+    name: str
+    """What people call it: the file's name without its suffix, which is the session unless somebody renamed it."""
     session: str
     rig: str
     lab: str
@@ -82,10 +85,13 @@ class RunSummary:
     box_ms: tuple[float, ...]
     """Loop latency: its percentiles 1, 25, 50, 75 and 99; empty: there are no samples."""
     course: Course = field(repr=False, compare=False)
+    torques: Torques = field(repr=False, compare=False)
+    """What its controllers wrote, to be held against other runs."""
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, for JSON: without what is there to be drawn."""
         return {
+            "name": self.name,
             "session": self.session,
             "rig": self.rig,
             "lab": self.lab,
@@ -115,6 +121,7 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
     collector = _Collector(run, parameters_of(run.parameters_json), task or task_of(run))
     latency = measure(run, collector.add)
     return RunSummary(
+        name=run.path.stem,
         session=run.session,
         rig=run.rig,
         lab=run.lab,
@@ -129,6 +136,7 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
         grade=collector.grade(),
         box_ms=_box_ms(latency),
         course=collector.course(),
+        torques=collector.torques,
     )
 
 
@@ -160,10 +168,13 @@ class _Collector:
         self._poses: dict[str, Any] = {}
         self._held = ""
         self.events: Counter[str] = Counter()
+        self.torques = Torques()
 
     def add(self, block: Records) -> None:
         self.events.update(block.events["kind"].tolist())
         names = self._run.names
+        written = block.commands[(block.commands["controller"] != names.code("")) & ~block.commands["safe"]]
+        self.torques.add(written["effort"])
         if self._grader is not None:
             dropped = block.events[block.events["kind"] == "PART_DROPPED"]
             for event, time_s in zip(dropped, self._run.time_s(dropped), strict=True):

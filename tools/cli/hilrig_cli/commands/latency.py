@@ -10,6 +10,8 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from hilrig_replay.distribution import Statistics
     from hilrig_replay.latency import LatencyReport
 
@@ -55,17 +57,17 @@ def latency(
         if plot is not None:
             save_plot(report, run, plot)
         # Of many runs only the figures are kept.
-        reports.append(report.without_table())
+        reports.append((path, report.without_table()))
     if as_json:
-        many = {"runs": [each.as_dict() for each in reports], "unreadable": unreadable}
-        print(json.dumps(reports[0].as_dict() if len(paths) == 1 else many))
+        plain = [{"path": str(path), **each.as_dict()} for path, each in reports]
+        print(json.dumps(plain[0] if len(paths) == 1 else {"runs": plain, "unreadable": unreadable}))
     elif len(paths) == 1:
-        print_report(reports[0])
+        print_report(reports[0][1])
     else:
-        print_overview(reports)
+        print_overview({path.stem: each for path, each in reports})
         for bad in unreadable:
             print(bad["reason"], file=sys.stderr)
-    if unreadable or not all(each.fit for each in reports):
+    if unreadable or not all(each.fit for _, each in reports):
         raise typer.Exit(1)
 
 
@@ -106,23 +108,29 @@ def print_report(report: "LatencyReport") -> None:
         console.print(Text("not fit for latency claims: " + "; ".join(report.reasons), style="yellow"))
 
 
-def print_overview(reports: "list[LatencyReport]") -> None:
-    """Print many runs, one line each."""
+def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
+    """Print many runs by their names: the figures one line each, and below them what there is to say."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=f"Loop latency of {len(reports)} runs, ms", title_justify="left", title_style="bold")
-    table.add_column("session", overflow="fold")
+    console = Console()
+    title = f"Loop latency of {len(reports)} runs, ms"
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("run", overflow="fold")
     for column in ("samples", "p50", "p99", "p99.9", "max"):
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", no_wrap=True)
     table.add_column("fit")
-    table.add_column("why", overflow="fold")
-    for report in reports:
+    for name, report in reports.items():
         loop = report.loop_ms
         figures = [f"{value:.2f}" for value in (loop.p50, loop.p99, loop.p999, loop.max)] if loop else ["–"] * 4
+        table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
+    console.print(table)
+    for name, report in reports.items():
         why = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
-        table.add_row(report.session, str(report.samples), *figures, "yes" if report.fit else "no", why)
-    Console().print(table)
+        if why:
+            console.print(Text(f"{name}: {'' if report.fit else 'not fit: '}{why}"))
 
 
 def _figures(statistics: "Statistics") -> list[str]:

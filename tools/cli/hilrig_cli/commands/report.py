@@ -31,7 +31,8 @@ def report(
 ) -> None:
     """Write one HTML page of a run, or of a class of runs, ranked: motion, task, latency, events; no network needed.
 
-    Exit code 1: a recording of several could not be read; the page says which, and why.
+    Runs of a class that were driven by the same torques, as when one was replayed, are named. Exit code 1: a recording
+    of several could not be read; the page says which, and why.
     """
     from hilrig_replay.assignment import read_task
     from hilrig_replay.report import report as make_report
@@ -47,10 +48,12 @@ def report(
     except OSError as error:
         raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
     if as_json:
-        print(json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out}))
+        print(json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out, "alike": found.alike}))
     else:
         print(out)
         for reason in found.left_out:
             print(f"left out: {reason}", file=sys.stderr)
+        for pair in found.alike:
+            print(f"alike: {pair}", file=sys.stderr)
     if found.left_out:
         raise typer.Exit(1)
