@@ -6,7 +6,7 @@ This is the edge where people type, so it is pydantic, and units are those that 
 
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +22,8 @@ from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
 MOST_RIGS = 10_000
 """More than any machine steps in real time; a mistyped count is found here."""
+NAMED = 16
+"""Rigs that a refusal names before it says "and … more"."""
 
 
 class ArmConfig(Section):
@@ -245,7 +247,7 @@ class LabConfig(Section):
         for edge, rigs in edges.items():
             for rig in rigs:
                 if rig not in names:
-                    raise ValueError(f"bus.tls.edges.{edge}: no rig is called {rig!r}")
+                    raise ValueError(f"bus.tls.edges.{edge}: {self.no_such_rig(rig)}")
         return self
 
     @property
@@ -294,7 +296,13 @@ class LabConfig(Section):
         for rig in self.rigs:
             if rig.name == name:
                 return rig
-        raise InputError(f"no rig is called {name!r}; this lab has {', '.join(r.name for r in self.rigs)}")
+        raise self.no_such_rig(name)
+
+    def no_such_rig(self, name: str, added: Iterable[str] = ()) -> InputError:
+        """What to say where no rig has that name; `added` are rigs beside those of the file."""
+        names = list(dict.fromkeys([*(rig.name for rig in self.rigs), *added]))
+        more = f" and {len(names) - NAMED} more (hilrig rig list)" if len(names) > NAMED else ""
+        return InputError(f"no rig is called {name!r}; this lab has {', '.join(names[:NAMED])}{more}")
 
 
 def read_rig(settings_json: str) -> RigSettings:

@@ -102,3 +102,5 @@ def test_a_file_that_is_no_text_is_said_in_one_line(tmp_path: Path) -> None:
 def test_a_rig_that_is_not_in_the_lab_is_refused_with_those_that_are() -> None:
     with pytest.raises(InputError, match="no rig is called 'rig9'; this lab has rig1"):
         LabConfig().rig("rig9")
+    with pytest.raises(InputError, match=r"this lab has rig1, (rig\d+, ){14}rig16 and 1984 more \(hilrig rig list\)$"):
+        parse_lab("[rigs]\ncount = 2000\n").rig("rig9999")

@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 
 from hilrig_runtime.bus import Bus
 from hilrig_runtime.config import LabConfig
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.errors import OperationError
 from hilrig_runtime.presence import rosters
 from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import Roster
@@ -21,8 +21,6 @@ ANSWER_WITHIN_S: Final = 3.0
 """How long a service has to answer; a link to it may have to be made first."""
 PATIENCE_S: Final = 0.5
 """Who waits longer is told for what."""
-NAMED: Final = 16
-"""Rigs that a refusal names before it says "and … more"."""
 SERVING: Final = ("sim", "edge")
 """Services that have each rig, also one that was added."""
 
@@ -85,7 +83,8 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
             return
         waited_s = time.monotonic() - begun_s
         if _all_heard(found, in_file) or waited_s > ANSWER_WITHIN_S:
-            raise _no_such_rig(rig, lab, found)
+            added = {name for roster in found if roster.service in SERVING for name in roster.rigs}
+            raise lab.no_such_rig(rig, sorted(added))
         if waited_s > PATIENCE_S and not told:
             told = True
             print(
@@ -94,13 +93,6 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
                 file=sys.stderr,
             )
         time.sleep(0.05)
-
-
-def _no_such_rig(rig: str, lab: LabConfig, found: Sequence[Roster]) -> InputError:
-    added = {name for roster in found if roster.service in SERVING for name in roster.rigs}
-    names = list(dict.fromkeys([*(known.name for known in lab.rigs), *sorted(added)]))
-    more = f" and {len(names) - NAMED} more (hilrig rig list)" if len(names) > NAMED else ""
-    return InputError(f"no rig is called {rig!r}; this lab has {', '.join(names[:NAMED])}{more}")
 
 
 def _all_heard(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
