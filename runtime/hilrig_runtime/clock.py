@@ -62,10 +62,6 @@ class ManualClock:
         self._monotonic_ns += duration_ns
         self._wall_ns += duration_ns
 
-    def step_wall(self, offset_ns: int) -> None:
-        """Step the wall clock alone, as an NTP correction does."""
-        self._wall_ns += offset_ns
-
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Move on to the deadline."""
         self.advance(max(0, deadline_ns - self._monotonic_ns))

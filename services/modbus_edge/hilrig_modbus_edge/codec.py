@@ -9,8 +9,6 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-EFFORT_PER_COUNT: Final = 1e-3
-"""N·m or N that one count of a torque register is."""
 COUNTS_PER_UNIT: Final = (100 * 180 / math.pi, 100 * 180 / math.pi, 100 * 1000.0, 100 * 180 / math.pi)
 """Counts of a position register for one rad, rad, m, rad."""
 FULL_SCALE: Final = 32767

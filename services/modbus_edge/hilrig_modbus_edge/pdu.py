@@ -192,4 +192,3 @@ _HANDLERS: Final[dict[int, Handler]] = {
     0x17: _read_write,
     0x2B: _identify,
 }
-FUNCTIONS: Final = tuple(_HANDLERS)

@@ -17,7 +17,6 @@ from hilrig_replay.run import Run
 from hilrig_replay.summary import Course, RunSummary, summarise, under_command
 from hilrig_runtime.errors import InputError
 
-ALIGNMENTS: Final = ("motion", "start")
 MOVING: Final = (0.01, 0.01, 0.005, 0.01)
 """A joint faster than this moves; rad/s, rad/s, m/s, rad/s."""
 SHORTEST_S: Final = 0.1

@@ -6,7 +6,7 @@ draws its delays anew from what was injected, several times over. Joints 1 and 2
 rig waits for its controller, and they do not feel it.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,12 +59,7 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values."""
-        sides = {
-            name: {key: getattr(side, key) for key in Observed.__slots__}
-            for name, side in (("live", self.live), ("virtual", self.virtual))
-        }
-        rest = ("phase_ms", "compute_ms", "latency_ks", "as_predicted")
-        return sides | {key: getattr(self, key) for key in rest}
+        return asdict(self)
 
 
 def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, folder: Path) -> Comparison:
