@@ -272,12 +272,13 @@ class LabConfig(Section):
         tls = self.edge.tls
         return {} if tls is None else {rig.name: tls.first_port + index for index, rig in enumerate(self.rigs)}
 
-    def addresses(self, rig: str) -> dict[str, str]:
-        """Where a rig's controllers connect: kind of connection to "host:port", those that `edge` listens on."""
-        ports = {"Modbus TCP": self.ports[rig]} if self.edge.plain else {}
-        if rig in self.tls_ports:
-            ports["Modbus TCP with TLS"] = self.tls_ports[rig]
-        return {kind: f"{self.edge.host}:{port}" for kind, port in ports.items()}
+    def addresses(self) -> dict[str, dict[str, str]]:
+        """Where each rig's controllers connect: kind of connection to "host:port", those that `edge` listens on."""
+        kinds = {"Modbus TCP": self.ports if self.edge.plain else {}, "Modbus TCP with TLS": self.tls_ports}
+        return {
+            rig.name: {kind: f"{self.edge.host}:{ports[rig.name]}" for kind, ports in kinds.items() if ports}
+            for rig in self.rigs
+        }
 
     def scene_of(self, rig: RigSettings) -> SceneConfig:
         """The scene around a rig: its own, or the lab's."""

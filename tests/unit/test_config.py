@@ -32,15 +32,15 @@ def test_a_class_of_rigs_is_one_table_and_single_ones_stand_beside_it() -> None:
 
 def test_a_large_lab_is_read_at_once() -> None:
     lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
-    assert lab.ports["seat-2000"] == 7019
+    assert lab.addresses()["seat-2000"] == {"Modbus TCP": "127.0.0.1:7019"}
 
 
 def test_addresses_are_those_that_the_edge_listens_on() -> None:
     tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
     plain, secured = "Modbus TCP", "Modbus TCP with TLS"
-    assert parse_lab("").addresses("rig1") == {plain: "127.0.0.1:5020"}
-    assert parse_lab(tls).addresses("rig1") == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
-    assert parse_lab("[edge]\nplain = false\n" + tls).addresses("rig1") == {secured: "127.0.0.1:8020"}
+    assert parse_lab("").addresses()["rig1"] == {plain: "127.0.0.1:5020"}
+    assert parse_lab(tls).addresses()["rig1"] == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
+    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: "127.0.0.1:8020"}
 
 
 def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:

@@ -43,7 +43,8 @@ def check(
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return
     table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is good", title_justify="left")
-    kinds = list(lab.addresses(lab.rigs[0].name))
+    addresses = lab.addresses()
+    kinds = list(addresses[lab.rigs[0].name])
     allows = any(rig.allow for rig in lab.rigs)
     for column in ("rig", *kinds, *(["may connect"] if allows else []), "step", "integrator"):
         table.add_column(column)
@@ -51,5 +52,5 @@ def check(
         substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
         allowed = [", ".join(map(str, rig.allow)) or "all"] if allows else []
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
-        table.add_row(rig.name, *lab.addresses(rig.name).values(), *allowed, *step)
+        table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
     Console().print(table)

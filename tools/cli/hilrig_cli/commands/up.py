@@ -40,8 +40,8 @@ def up(
     parts = shared([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
     with running_lab(lab, config, say, stopping, parts, ["--log-format", log_format]) as supervisor:
         if not stopping.is_set():
-            for rig in lab.rigs:
-                addresses = ", ".join(f"{kind} at {address}" for kind, address in lab.addresses(rig.name).items())
+            for rig, kinds in zip(lab.rigs, lab.addresses().values(), strict=True):
+                addresses = ", ".join(f"{kind} at {address}" for kind, address in kinds.items())
                 impairment = lab.impairment_of(rig).describe()
                 impaired = "" if impairment == "none" else f", impaired: {impairment}"
                 print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{impaired}")
