@@ -293,6 +293,14 @@ def test_without_jitter_the_mean_square_radius_is_the_square_of_the_spectral_rad
     assert mean_square_radius(chain, matrices) == pytest.approx(alone**2, rel=1e-3)
 
 
+def test_an_arm_that_is_not_commanded_neither_settles_nor_runs_away() -> None:
+    near = linearise(ARM, POSES[0])
+    phi, gamma = near.discretise(0.02)
+    chain = age_chain([ages_of(timeline(LoopTiming(), 300))])
+    matrices = turns(phi, gamma, linearise_law(pd(0.0), near, 0.02), chain.most)
+    assert mean_square_radius(chain, matrices) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_a_run_in_which_nothing_acts_has_no_latency() -> None:
     with pytest.raises(InputError, match="nothing acts"):
         age_chain([np.zeros(10, dtype=np.int64)])

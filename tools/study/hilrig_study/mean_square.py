@@ -11,14 +11,12 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from hilrig_study.controllers import LawController
 from hilrig_study.expected_cost import age_chain, mean_square_radius, turns
 from hilrig_study.margins import STABLE, linearise_law
 from hilrig_study.study_config import StudyConfig
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TICKS: Final = 4000
@@ -61,7 +59,7 @@ def stable_until(
         if not len(ages) or ages.max() > LARGEST_AGE:
             return math.nan
         chain = age_chain([ages])
-        return max(mean_square_radius(chain, joints) for joints in _apart(turns(phi, gamma, law, chain.most)))
+        return mean_square_radius(chain, turns(phi, gamma, law, chain.most))
 
     first = radius(0)
     if not first < STABLE:
@@ -74,10 +72,3 @@ def stable_until(
             return math.nan
         low, high = (middle, high) if found < STABLE else (low, middle)
     return math.inf if high == len(points) else points[low]
-
-
-def _apart(matrices: Sequence[Floats]) -> list[list[Floats]]:
-    """The loop as those of joints that nothing couples: what two of them have in common grows no faster than either."""
-    count, group = connected_components(np.abs(np.stack(matrices)).sum(axis=0) > 0, directed=False)
-    rows = [np.flatnonzero(group == number) for number in range(count)]
-    return [[matrix[np.ix_(own, own)] for matrix in matrices] for own in rows]
