@@ -160,6 +160,12 @@ def test_a_name_that_is_no_rig_s_is_refused_with_those_that_are(lab: RunningLab,
     assert done.stderr.endswith("hilrig: error: no rig is called 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
+def test_a_rig_that_is_given_twice_is_refused() -> None:
+    done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=PATIENT_S)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.endswith("hilrig: error: --rigs rig1,rig1: 'rig1' stands there 2 times, expected once\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -1,5 +1,6 @@
 """`hilrig sim`, `hilrig edge`, `hilrig recorder`: one service in this process, as `up` and compose start it."""
 
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,7 +40,7 @@ def sim(
     stop_with_parent: StopWithParent = False,
 ) -> None:
     """Run the simulation: command in, plant stepped in real time, state out."""
-    from hilrig_sim.loop import run
+    from hilrig_sim.service import run
 
     _run("sim", run, config, rigs, instance, log_format, stop_with_parent)
 
@@ -89,7 +90,9 @@ def _run(
         raise InputError(f"--instance {instance!r}: expected letters, digits, - and _, beginning with no sign")
     lab = load_lab(config)
     names = [rig.strip() for rig in rigs.split(",")] if rigs else None
-    for rig in names or ():
+    for rig, times in Counter(names).items():
+        if times > 1:
+            raise InputError(f"--rigs {rigs}: {rig!r} stands there {times} times, expected once")
         lab.rig(rig)
     start_logging(name, instance, log_format)
     run_service(name, run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)
