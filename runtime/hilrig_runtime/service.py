@@ -241,7 +241,7 @@ class Service:
         """Send and record an event; source and time are filled in."""
         event.source = self.source
         event.wall_ns = self.clock.wall_ns()
-        # Events of the service as a whole are told under the name of the service's topic-less rig.
+        # Of the service as a whole: under its own name.
         rig = event.rig or self.name
         sender = self._event_senders.get(rig)
         if sender is None:

@@ -1,4 +1,4 @@
-"""The simulation as a service: at each absolute deadline, command in, state out, then the plant moves on.
+"""The simulation of a lab's rigs, tick by tick: command in, state out, then the plant moves on.
 
 The order within a tick is the contract of docs/timing.md. The newest commands are latched, the tick is stamped, the
 state x_k is published with the effort that acts from now on, and only then is x_k+1 computed: a state leaves at the
@@ -11,14 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.rate import Rate, Tick
-from hilrig_runtime.realtime import freeze_garbage
+from hilrig_runtime.rate import Tick
 from hilrig_runtime.service import Service
-from hilrig_runtime.turns import Turns
 from hilrig_schemas import JointState, RigReport, topics
 from hilrig_sim.commands import StepTimes
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.membership import Membership
 from hilrig_sim.model import RigParameters
 from hilrig_sim.plant import Plant
 from hilrig_sim.reports import Reporter
@@ -30,32 +26,6 @@ AHEAD: Final = (4, 12, 40)
 """Which parts of a step before it: first for all, then for those whose commands came meanwhile."""
 ENOUGH: Final = 100
 """So small a part of a step before the tick nothing more is begun: the tick must not be late."""
-
-
-def run(service: Service) -> None:
-    """Simulate every rig of the lab until the service is to stop.
-
-    Raises:
-        InputError: the lab's parameters do not fit together.
-    """
-    lab = service.lab
-    parameters = [rig_parameters(lab, rig) for rig in service.rigs]
-    simulation = Simulation(service, parameters)
-    step_ns = lab.sim.step_ns
-    turns = Turns()
-    with Membership(service, simulation, turns):
-        rate = Rate(step_ns, service.clock)
-        freeze_garbage()
-        service.ready()
-        stopping = service.stopping
-        # What can't be computed is dealt with where it shows, not warned of.
-        with np.errstate(all="ignore"):
-            while not stopping.is_set():
-                simulation.look_ahead(rate.next_ns)
-                tick = rate.wait()
-                simulation.tick(tick)
-                turns.run_waiting()
-                service.beat(service.clock.monotonic_ns())
 
 
 class Simulation:

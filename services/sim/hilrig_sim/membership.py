@@ -9,7 +9,7 @@ import json
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from google.protobuf.message import DecodeError
 
@@ -20,13 +20,11 @@ from hilrig_runtime.service import Service
 from hilrig_runtime.turns import Turns
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.configured import rig_parameters
+from hilrig_sim.loop import Simulation
 from hilrig_sim.machine import machine_name
 from hilrig_sim.model import RigParameters
 from hilrig_sim.plant import Plant
 from hilrig_sim.urdf import urdf
-
-if TYPE_CHECKING:
-    from hilrig_sim.loop import Simulation
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,7 @@ class Constant:
 class Membership:
     """Answers for each rig what it is, and changes which there are; a context manager."""
 
-    def __init__(self, service: Service, simulation: "Simulation", turns: Turns) -> None:
+    def __init__(self, service: Service, simulation: Simulation, turns: Turns) -> None:
         self._service = service
         self._simulation = simulation
         self._turns = turns
