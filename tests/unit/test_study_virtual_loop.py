@@ -168,6 +168,13 @@ def test_runs_whose_phases_differ_step_together_as_alone() -> None:
         np.testing.assert_array_equal(together.positions[:, :, number], alone.positions[:, :, 0])
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_run_that_does_not_poll_now_is_asked_nothing_out_of_unused_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(np, "empty", lambda shape, dtype=np.float64: np.full(shape, np.finfo(np.float64).max, dtype))
+    lines = [timeline(LoopTiming(period_ns=15 * MS, phase_ns=phase * MS), 200) for phase in (0, 13)]
+    assert run(pd(0.5, 0.015), lines, ticks=200, linear=True).settled.all()
+
+
 def growth(outcome: Outcome, number: int, pose: tuple[float, float, float, float]) -> float:
     """Whether the distance from the pose is larger at the end than in the middle, as a ratio."""
     distance = np.linalg.norm((outcome.positions[:, :, number] - np.array(pose)) / [1, 1, 0.1, 1], axis=1)

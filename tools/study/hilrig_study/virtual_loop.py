@@ -107,8 +107,9 @@ def simulate(
     acting = np.stack([line.in_force[:ticks] for line in timelines], axis=1)
     polls = _Polls(timelines)
     column, rest = np.arange(runs), np.array(holding, dtype=np.float64)[:, np.newaxis]
-    seen = np.empty((4, ticks, runs))
-    """Positions as the registers said them at each tick."""
+    seen = np.zeros((4, ticks, runs))
+    """Positions as the registers said them at each tick. A run that does not poll is computed beside those that do,
+    perhaps with a tick to come, and passed over: what is read there must be a number, and no chance one."""
     commands = np.empty((4, polls.most + 1, runs))
     commands[:, NO_POLL] = rest
     flat_seen, flat_commands = seen.reshape(4, -1), commands.reshape(4, -1)
