@@ -6,7 +6,7 @@ This is the edge where people type, so it is pydantic, and units are those that 
 
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,8 +15,9 @@ from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model
 from hilrig_runtime.bus_config import BusConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.impairment_config import ImpairmentConfig
+from hilrig_runtime.mistakes import mistakes_in
 from hilrig_runtime.scene_config import SceneConfig
-from hilrig_runtime.sections import PATTERNS, Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_runtime.sections import Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas.topics import RESERVED_RIG_NAMES
 
@@ -354,46 +355,3 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
         raise InputError("\n".join(f"{where}: {mistake}" for mistake in mistakes_in(error))) from error
     lab._source = text
     return lab
-
-
-def mistakes_in(error: ValidationError) -> list[str]:
-    """A sentence for each mistake that a person made, with its place."""
-    return [_sentence(mistake) for mistake in _causes(error)]
-
-
-def _causes(error: ValidationError) -> list[Any]:
-    """The mistakes, without the complaint that a list is too short for lack of an item that is itself mistaken."""
-    mistakes = list(_flat(error, ()))
-
-    def follows_from_another(mistake: Any) -> bool:
-        place = mistake["loc"]
-        inner = (other["loc"] for other in mistakes if other is not mistake)
-        return mistake["type"] == "too_short" and any(loc[: len(place)] == place for loc in inner)
-
-    return [mistake for mistake in mistakes if not follows_from_another(mistake)]
-
-
-def _flat(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[Any]:
-    """Every mistake with its whole place; what a table's own validation found stands inside one of the lab's."""
-    for mistake in error.errors():
-        here: dict[str, Any] = {**mistake, "loc": (*place, *mistake["loc"])}
-        cause = mistake.get("ctx", {}).get("error")
-        if isinstance(cause, ValidationError):
-            yield from _flat(cause, here["loc"])
-        else:
-            yield here
-
-
-def _sentence(mistake: Any) -> str:
-    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"]).lstrip(".")
-    if mistake["type"] == "extra_forbidden":
-        return f"{place}: unknown key"
-    if mistake["type"] == "missing":
-        return f"{place}: is missing"
-    if mistake["type"] == "value_error":
-        return f"{place}: {mistake['ctx']['error']}" if place else str(mistake["ctx"]["error"])
-    if mistake["type"] == "string_pattern_mismatch":
-        expected = PATTERNS[mistake["ctx"]["pattern"]]
-    else:
-        expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-    return f"{place}: expected {expected}, found {mistake['input']!r}"

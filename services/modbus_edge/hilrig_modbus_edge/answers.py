@@ -13,9 +13,10 @@ from pydantic import ValidationError
 
 from hilrig_modbus_edge.device import Device
 from hilrig_runtime.bus import Bus, Handle
-from hilrig_runtime.config import RigSettings, mistakes_in, read_rig
+from hilrig_runtime.config import RigSettings, read_rig
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.impairment_config import ImpairmentConfig
+from hilrig_runtime.mistakes import mistakes_in
 from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest
 
 ANSWER_TIMEOUT_S: Final = 1.0

@@ -7,8 +7,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from hilrig_replay.run import Run
-from hilrig_runtime.config import load_lab, mistakes_in
+from hilrig_runtime.config import load_lab
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.mistakes import mistakes_in
 from hilrig_runtime.task_config import TaskConfig
 from hilrig_sim.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.model import RigParameters

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig, mistakes_in
+from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.impairment_config import ImpairmentSetting, Ways
+from hilrig_runtime.mistakes import mistakes_in
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import NotNegative, Number, Positive, Section, Vector4
 from hilrig_sim.configured import rig_parameters

@@ -81,9 +81,9 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     """
     from pydantic import ValidationError
 
-    from hilrig_runtime.config import mistakes_in
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.impairment_config import ImpairmentConfig
+    from hilrig_runtime.mistakes import mistakes_in
 
     try:
         ways = ImpairmentConfig(preset=preset or "none").ways
