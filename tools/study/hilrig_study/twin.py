@@ -91,14 +91,11 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     window = states["position"][begin : begin + ticks, :2]
     scenario = study.task.scenario()
     times = np.arange(len(window)) * step_ns * 1e-9
-    error = window - scenario.goal(times).T[:, :2]
-    tail = error[-max(1, len(error) // 5) :]
     size = np.maximum(np.abs(scenario.offset[:2]), np.abs(scenario.amplitude[:2]))
-    live = Observed(
-        *_latency(report.table["loop"] / 1e6),
-        error_rms_deg=_rms_deg(error),
-        settled=bool((np.sqrt((tail**2).mean(axis=0)) <= 0.5 * np.maximum(size, np.radians(0.1))).all()),
-    )
+    at_rest = 0.5 * np.maximum(size, np.radians(0.1))
+    (error,), (came_to_rest,) = _judged((window - scenario.goal(times).T[:, :2])[:, :, np.newaxis], at_rest)
+    live_samples = report.table["loop"] / 1e6
+    live = Observed(*_latency(live_samples), error_rms_deg=float(error), settled=bool(came_to_rest))
 
     loop = own.model_copy(
         update={
@@ -116,14 +113,11 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     cells["run"] = np.arange(TWINS)
     _, outcome = run_cells(twin_study, cells, folder, keep=True)
     twin_error = outcome.positions[:, :2] - scenario.goal(np.arange(ticks) * step_ns * 1e-9).T[:, :2, np.newaxis]
-    errors = np.array([_rms_deg(twin_error[:, :, twin]) for twin in range(TWINS)])
-    tails = np.sqrt((twin_error[-max(1, ticks // 5) :] ** 2).mean(axis=0))
-    settled = (tails <= 0.5 * np.maximum(size, np.radians(0.1))[:, np.newaxis]).all(axis=0)
+    errors, settled = _judged(twin_error, at_rest)
     timing = loop.timing(float(cell["step_ms"][0]), float(cell["poll_ms"][0]))
     samples = [line.samples_ns / 1e6 for line in timelines(twin_study, cells, timing, ticks)]
     every = np.concatenate(samples)
     virtual = Observed(*_latency(every), error_rms_deg=float(errors.mean()), settled=bool(settled.mean() > 0.5))
-    live_samples = report.table["loop"] / 1e6
     slack_ms = LOOP_TOLERANCE_STEPS * step_ns / 1e6 + 3 * float(every.std()) / np.sqrt(len(live_samples))
     slack_deg = ERROR_TOLERANCE * virtual.error_rms_deg + ERROR_FLOOR_DEG + 3 * float(errors.std())
     agree = abs(live.loop_mean_ms - virtual.loop_mean_ms) <= slack_ms
@@ -138,8 +132,12 @@ def _latency(samples_ms: Floats) -> tuple[float, float, float]:
     return float(p50), float(p95), float(samples_ms.mean())
 
 
-def _rms_deg(error: Floats) -> float:
-    return float(np.degrees(np.sqrt((error**2).mean())))
+def _judged(errors: Floats, at_rest: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Of runs' errors, rad, (T, 2, N): root mean square, degrees, and whether the last fifth is within `at_rest`, rad,
+    (2,)."""
+    tail = errors[-max(1, len(errors) // 5) :]
+    settled = (np.sqrt((tail**2).mean(axis=0)) <= at_rest[:, np.newaxis]).all(axis=0)
+    return np.degrees(np.sqrt((errors**2).mean(axis=(0, 1)))), settled
 
 
 def _circular_median(values: NDArray[np.int64], period: int) -> float:
