@@ -33,18 +33,14 @@ class GainTheory:
 def gain_theory(
     study: StudyConfig, controller: int, gain: float, step_ms: float, poll_ms: float, delays_ms: Sequence[float]
 ) -> tuple[GainTheory, dict[float, float]] | None:
-    """Theory of one controller at one gain, and the spectral radius at each constant added delay; None: it has no law.
-
-    The arm is discretised as the study steps it: by the simulation's integrator, or exactly.
-    """
+    """Theory of one controller at one gain, and the spectral radius at each added delay; None: it has no law."""
     rig, near = study.rig(step_ms), study.near()
     timing = study.loop.timing(step_ms, poll_ms)
     config = study.controllers[controller]
     built = config.build(rig, near, timing.period_ns * 1e-9, np.array([gain])) if config.kind != "file" else None
     if not isinstance(built, LawController):
         return None
-    method, substeps = (rig.sim.integrator, rig.sim.substeps) if study.plant == "arm" else ("exact", 1)
-    phi, gamma = near.discretise(timing.step_ns * 1e-9, method, substeps)
+    phi, gamma = study.discretised(step_ms)
     by_pattern: dict[tuple[int, ...], float] = {}
 
     def radius(delay_ms: float) -> float:

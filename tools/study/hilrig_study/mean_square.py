@@ -51,8 +51,7 @@ def stable_until(
     built = study.controllers[controller].build(rig, near, step_s, np.array([gain]))
     assert isinstance(built, LawController)
     law = linearise_law(built, near, step_s, step_s)
-    method, substeps = (rig.sim.integrator, rig.sim.substeps) if study.plant == "arm" else ("exact", 1)
-    phi, gamma = near.discretise(step_s, method, substeps)
+    phi, gamma = study.discretised(step_ms)
 
     def radius(number: int) -> float:
         ages = ages_at(points[number])

@@ -295,6 +295,13 @@ class StudyConfig(Section):
         """
         return linearise(self.rig().arm, _si(self.task.pose))
 
+    def discretised(self, step_ms: float) -> tuple[Floats, Floats]:
+        """Φ, (8, 8), and Γ, (8, 4), of the arm near the task's pose, as the study steps it: by the simulation's
+        integrator, or exactly."""
+        sim = self.rig(step_ms).sim
+        how = (sim.integrator, sim.substeps) if self.plant == "arm" else ()
+        return self.near().discretise(sim.step_ns * 1e-9, *how)
+
 
 def load_study(path: Path) -> StudyConfig:
     """Read a study's file.

@@ -135,8 +135,7 @@ def run_cells(
     if study.plant == "arm":
         plant = ArmPlant(rig, scenario.start, scenario.pose, len(cells))
     else:
-        phi, gamma = near.discretise(timing.step_ns * 1e-9)
-        plant = LinearArms(near, phi, gamma, scenario.start, len(cells))
+        plant = LinearArms(near, *study.discretised(float(first["step_ms"])), scenario.start, len(cells))
     gain = np.ascontiguousarray(cells["gain"])
     config = study.controllers[first["controller"]]
     controller = config.build(rig, near, timing.period_ns * 1e-9, gain, folder)
