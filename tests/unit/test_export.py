@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 import recordings
 from hilrig_recorder.writer import RunWriter
 from hilrig_replay.export import DRAFT_SUFFIX, TABLES, export_foxglove, export_tables, table
+from hilrig_replay.latency import measure
 from hilrig_replay.run import open_run
 from hilrig_replay.scene import rotate
 from hilrig_replay.shapes import Solid, solids_of
@@ -21,6 +23,8 @@ from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.kinematics import forward
 from hilrig_sim.model import ArmParameters
 from labs import hilrig
+
+PAGE = Path(__file__).parents[2] / "docs/recordings.md"
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,38 @@ def test_a_table_has_no_column_that_is_a_code(recording: Path) -> None:
     run = open_run(recording)
     states = table(run, run.states)
     assert {str(states.schema.field(name).type) for name in ("session", "held_part")} == {"string"}
+
+
+def test_every_column_is_documented_and_no_other(recording: Path, tmp_path: Path) -> None:
+    said: dict[str, set[str]] = {name: set() for name in TABLES}
+    for line in PAGE.read_text(encoding="utf-8").split("### Columns of the tables")[1].splitlines():
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if len(cells) == 5 and "`" in cells[1]:
+            for name in cells[0].split(", "):
+                said[name] |= set(re.findall(r"`(\w+\*?)`", cells[1]))
+    for path in export_tables(open_run(recording), tmp_path / "tables", "csv"):
+        there = set(pyarrow.csv.read_csv(path).column_names)
+        assert {re.sub("_(theta1|theta2|d3|theta4)$", "_*", column) for column in there} == said[path.stem]
+
+
+def test_the_stages_follow_from_the_columns_as_the_page_says(recording: Path, tmp_path: Path) -> None:
+    run = open_run(recording)
+    samples = measure(run).table
+    state_path, command_path, *_ = export_tables(run, tmp_path / "tables", "csv")
+    states, commands = pyarrow.csv.read_csv(state_path).to_pylist(), pyarrow.csv.read_csv(command_path).to_pylist()
+    by_seq = {command["seq"]: command for command in commands}
+    taken = [(state, by_seq[state["command_seq"]]) for state in states if state["loop_latency_ns"] > 0]
+    assert len(taken) == len(samples) > 50
+    by_hand = {
+        "loop": [s["loop_latency_ns"] for s, _ in taken],
+        "register_wait": [c["state_served_ns"] - c["state_arrived_ns"] - c["state_injected_ns"] for _, c in taken],
+        "controller": [c["write_arrived_ns"] - c["state_served_ns"] for _, c in taken],
+        "edge": [c["sent_ns"] - c["write_arrived_ns"] - c["command_injected_ns"] for _, c in taken],
+        "injected": [c["state_injected_ns"] + c["command_injected_ns"] for _, c in taken],
+        "tick_wait": [s["sampled_ns"] - s["command_arrived_ns"] for s, _ in taken],
+    }
+    for stage, expected in by_hand.items():
+        assert [int(value) for value in samples[stage]] == expected, stage
 
 
 def test_an_export_that_was_killed_is_in_nobody_s_way(recording: Path, tmp_path: Path) -> None:
