@@ -121,6 +121,10 @@ def test_a_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
     assert state.step == 4
     (overrun,) = [event for event in rig.events if event.kind == Event.OVERRUN]
     assert overrun.overrun_data.missed_steps == 5
+    # Late for the deadline that was meant, not for the one that was taken up again.
+    behind_ns = state.lateness_ns + 5 * 20_000_000
+    assert overrun.overrun_data.lateness_ns == behind_ns
+    assert overrun.text == f"the simulation came {behind_ns / 1e6:.1f} ms late and gave up 5 steps"
     rig.tick()
     assert rig.states[-1].missed_steps == 0
     assert rig.service.counters.overruns == 1

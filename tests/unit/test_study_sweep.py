@@ -1,6 +1,7 @@
 """A study as a whole: its file, its sweep, a student's controller, its results and pictures."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -256,9 +257,10 @@ def test_the_command_leaves_table_json_pictures_and_a_rerun_file(tmp_path: Path)
     assert json.loads((out / "study.json").read_text()) == said
     table = pyarrow.parquet.read_table(out / "runs.parquet")
     assert table.num_rows == 6
-    assert {"controller", "gain", "delay_ms", "cost", "settled", "spectral_radius", "loop_p50_ms"} <= set(
-        table.column_names
-    )
+    # The page says what each column is, and of no other.
+    page = (ROOT / "docs/studies.md").read_text(encoding="utf-8").split("| column of `runs.parquet` |")[1]
+    cells = [line.split("|")[1] for line in page.split("\n\n")[0].splitlines()[2:]]
+    assert set(re.findall(r"`(\w+)`", "".join(cells))) == set(table.column_names)
     assert (out / "plane-1.png").stat().st_size > 10_000
     assert (out / "plane-1.svg").read_text().startswith("<?xml")
     assert RrdFile(out / "study.rrd").rows("/trace/A/error/θ1") == 150

@@ -70,14 +70,16 @@ class Reporter:
         )
         self._emit(event)
 
-    def tell_of_overrun(self, tick: Tick, step: int, now_ns: int) -> None:
+    def tell_of_overrun(self, tick: Tick, step: int, now_ns: int, step_ns: int) -> None:
         """A tick that came more than a step late, or gave up deadlines."""
         self._missed += tick.missed_steps
-        self._worst_ns = max(self._worst_ns, tick.lateness_ns)
+        # Behind the deadline that it was meant for: its lateness is against the one that was taken up again.
+        self._worst_ns = max(self._worst_ns, tick.lateness_ns + tick.missed_steps * step_ns)
         if now_ns - self._overrun_told_ns < OVERRUN_QUIET_NS:
             return
         data = OverrunData(lateness_ns=self._worst_ns, missed_steps=self._missed)
-        text = f"the simulation came {self._worst_ns / 1e6:.1f} ms late and gave up {self._missed} steps"
+        steps = f"{self._missed} step{'' if self._missed == 1 else 's'}"
+        text = f"the simulation came {self._worst_ns / 1e6:.1f} ms late and gave up {steps}"
         self._emit(Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data))
         self._overrun_told_ns = now_ns
         self._missed = self._worst_ns = 0
