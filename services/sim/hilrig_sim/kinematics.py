@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim.model import JOINT_NAMES, ArmParameters
+from hilrig_sim.model import JOINT_NAMES, JOINT_SCALE, ArmParameters
 
 Floats = NDArray[np.float64]
 
@@ -238,8 +238,7 @@ def _turns(arm: ArmParameters, theta4: float) -> list[float]:
 
 
 def _limit_sentence(arm: ArmParameters, joint: int, value: float) -> str:
-    scale = 1e3 if joint == 2 else math.degrees(1.0)
-    unit = _UNITS[joint]
+    scale, unit = JOINT_SCALE[joint], _UNITS[joint]
     return (
         f"{JOINT_NAMES[joint]} would be {value * scale:.1f}{unit}, its limits are "
         f"{arm.lower[joint] * scale:.1f}{unit} to {arm.upper[joint] * scale:.1f}{unit}"

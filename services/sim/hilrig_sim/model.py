@@ -24,6 +24,8 @@ Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 
 JOINT_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
+JOINT_SCALE: Final = (math.degrees(1.0), math.degrees(1.0), 1e3, math.degrees(1.0))
+"""From rad and m to the degrees and mm that people read."""
 
 
 def _positive(**values: float) -> None:

@@ -16,6 +16,7 @@ from hilrig_replay.distribution import Statistics, differences, median, percenti
 from hilrig_replay.fitness import Stalls
 from hilrig_replay.run import Run
 from hilrig_replay.spool import Spool
+from hilrig_sim.model import JOINT_SCALE
 
 MS: Final = 1e6
 EDGE_STALL_NS: Final = 5_000_000
@@ -64,9 +65,6 @@ class Evidence:
                 self._windows.append((records.states, records.commands, records.traffic))
         return self._windows
 
-
-_SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""From rad and m to the registers' degrees and mm."""
 
 Floats = NDArray[np.float64]
 Rule = Callable[[Evidence], Finding | None]
@@ -289,7 +287,7 @@ def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[flo
     # Polls that saw the same state say nothing about which one was used.
     fresh = np.concatenate(([True], np.diff(commands["basis_step"].astype(np.int64)) > 0))
     commands, at = commands[fresh], at[fresh]
-    read = np.round(states["position"][at] * _SHOWN, 2)
+    read = np.round(states["position"][at] * JOINT_SCALE, 2)
     slow = np.vander(np.linspace(-1, 1, length), 4)
     found = []
     for start in range(2, len(commands) - length + 1, length):

@@ -13,11 +13,9 @@ from hilrig_replay.palette import EFFORT_SYMBOLS, INK, JOINT_COLORS, JOINT_SYMBO
 from hilrig_replay.scene import reach_outline
 from hilrig_replay.summary import Course, RunSummary
 from hilrig_runtime.task_config import TaskConfig
-from hilrig_sim.model import RigParameters
+from hilrig_sim.model import JOINT_SCALE, RigParameters
 
 TASK_COLOR: Final = "#2e9e57"
-SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""From rad and m to degrees and mm."""
 
 
 def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
@@ -26,7 +24,7 @@ def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | 
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     position, effort = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     for joint in range(4):
-        color, values = JOINT_COLORS[joint], course.position[:, joint] * SHOWN[joint]
+        color, values = JOINT_COLORS[joint], course.position[:, joint] * JOINT_SCALE[joint]
         position.plot(course.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
         effort.plot(course.time_s, course.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint])
     label(position, "Positions: θ in °, d3 in mm", "", "")
@@ -49,7 +47,7 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
         axes = figure.add_subplot(grid[joint, 0])
         for number, summary in enumerate(runs):
             color, course = RUN_COLORS[number % len(RUN_COLORS)], summary.course
-            values = course.position[:, joint] * SHOWN[joint]
+            values = course.position[:, joint] * JOINT_SCALE[joint]
             axes.plot(course.time_s, values, color=color, linewidth=1.1, label=summary.session)
         unit = "mm" if joint == 2 else "°"
         label(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")

@@ -38,15 +38,13 @@ from hilrig_replay.samples import STAGES, Matcher, join_commands
 from hilrig_replay.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_replay.timebase import Timebase
 from hilrig_runtime.task_config import TaskConfig
-from hilrig_sim.model import PartParameters, RigParameters
+from hilrig_sim.model import JOINT_SCALE, PartParameters, RigParameters
 from hilrig_sim.urdf import urdf
 
 _SAFE: Final = "safe zero"
 _NOBODY: Final = "nobody"
 _TRAIL_COLOR: Final = "#f2b134"
 _BASELINE_COLOR: Final = "#5b6570"
-_SHOWN: Final = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""From rad and m to degrees and mm."""
 _REACH_COLOR: Final = "#3f6f8f"
 _TASK_COLOR: Final = "#6fd08c"
 _SMALLEST_TARGET: Final = 0.004
@@ -236,8 +234,8 @@ class RigView:
     def _add_states(self, states: Rows) -> None:
         times = self._times(states)
         q = np.ascontiguousarray(states["position"])
-        self._scalars("position", times, q * _SHOWN)
-        self._scalars("velocity", times, states["velocity"] * _SHOWN)
+        self._scalars("position", times, q * JOINT_SCALE)
+        self._scalars("velocity", times, states["velocity"] * JOINT_SCALE)
         self._scalars("effort/applied", times, states["effort"])
         self._scalars("lateness", times, behind_ns(states, self._drawn.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from hilrig_replay.latency_plot import save_figure
 from hilrig_replay.palette import INK, RUN_COLORS
+from hilrig_sim.model import JOINT_SCALE
 from hilrig_study.gain_theory import GainTheory
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
 
 Floats = NDArray[np.float64]
 
-SHOWN: Final = np.array([180 / math.pi, 180 / math.pi, 1000.0, 180 / math.pi])
-"""From rad and m to degrees and mm."""
 FAILED: Final = "#5b5b5b"
 BOUNDARY: Final = "#d62728"
 DELAY_MARGIN: Final = "#ffffff"
@@ -77,7 +76,7 @@ def traces(study: StudyConfig, folder: Path) -> list[Trace]:
             said = f"fails at {results['failed_s'][0]:.2f} s"
         # A run that has failed is over: what is parked is no trace.
         going = np.where(np.isnan(results["failed_s"]) | (time_s <= results["failed_s"]), 1.0, np.nan)[:, np.newaxis]
-        error = going * (outcome.positions[:, :, 0] - goal) * SHOWN
+        error = going * (outcome.positions[:, :, 0] - goal) * JOINT_SCALE
         found.append(Trace(letter, point, number, time_s, error, going * outcome.efforts[:, :, 0], said))
     return found
 
