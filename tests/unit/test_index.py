@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from mcap.records import Metadata
 
 import recordings
@@ -47,6 +48,27 @@ def test_loop_latency_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("hilrig_replay.index.measure_entry", lambda *_: pytest.fail("was measured again"))
     again = RunIndex(tmp_path)
     assert again.measure(again.load()) == [entry]
+
+
+def test_a_file_that_is_damaged_between_good_ends_is_named_when_it_is_measured(tmp_path: Path) -> None:
+    path = make(tmp_path)
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[0]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle : middle + 64] = bytes(64)
+    path.write_bytes(data)
+    index = RunIndex(tmp_path)
+    [entry] = index.measure(index.load())
+    assert entry.trouble.startswith("damaged")
+    assert "hilrig recover" in entry.trouble
+    assert (entry.fit, entry.loop_p50_ms) == (False, None)
+    index.save()
+    # It is known from then on.
+    assert RunIndex(tmp_path).load() == [entry]
+    assert "damaged" in hilrig("runs", tmp_path).stdout
 
 
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:

@@ -22,11 +22,12 @@ from mcap.records import Metadata, MetadataIndex, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from hilrig_replay.latency import measure
+from hilrig_replay.recording_file import DamagedRecordingError
 from hilrig_replay.run import open_run
 from hilrig_runtime.errors import HilrigError, InputError
 
 INDEX_NAME: Final = ".hilrig-index.json"
-INDEX_VERSION: Final = 1
+INDEX_VERSION: Final = 2
 VERDICT_SUFFIX: Final = ".verified"
 """What `hilrig verify` found stands beside a recording, in a file of the recording's name and this."""
 RECORDING: Final = "recording"
@@ -174,11 +175,14 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
 
 
 def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
-    """An entry with the latency of its loop, read from its recording."""
+    """An entry with the latency of its loop, read from its recording; what damage that finds stands in `trouble`."""
+    path = folder / entry.path
     try:
-        report = measure(open_run(folder / entry.path))
+        report = measure(open_run(path))
     except HilrigError as error:
-        return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),))
+        # Whole, and yet without a figure: how it ended says more than that it can't be measured.
+        trouble = error.said if isinstance(error, DamagedRecordingError) else ""
+        return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), trouble=trouble)
     loop = report.loop_ms
     return replace(
         entry,

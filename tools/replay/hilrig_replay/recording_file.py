@@ -65,6 +65,15 @@ class RawMessage(NamedTuple):
     payload: bytes
 
 
+class DamagedRecordingError(InputError):
+    """A file whose inside is not what it should be."""
+
+    def __init__(self, path: Path, detail: str) -> None:
+        self.said = f"damaged ({detail or 'it ends too early'}): `hilrig recover {path}` saves what is whole"
+        """What is wrong, without the file's name."""
+        super().__init__(f"{path}: {self.said}")
+
+
 @dataclass(frozen=True, slots=True)
 class RecordingFile:
     """A recording that was found to be one; open it with `open_recording`."""
@@ -114,7 +123,7 @@ class RecordingFile:
                             topic = wanted[record.channel_id]
                             yield RawMessage(topic, record.sequence, record.log_time, record.publish_time, record.data)
         except (McapError, ZstdError, struct.error, ValueError, RuntimeError, OSError) as error:
-            raise damaged(self.path, str(error)) from error
+            raise DamagedRecordingError(self.path, str(error)) from error
 
     def _with(self, channels: Iterable[int], low: int, high: int) -> Rows:
         """The chunks that may have messages of some channels from a range of time."""
@@ -157,7 +166,7 @@ def open_recording(path: Path) -> RecordingFile:
     except OSError as error:
         raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
     except (McapError, ZstdError, struct.error, ValueError, KeyError, RuntimeError, StopIteration) as error:
-        raise damaged(path, str(error)) from error
+        raise DamagedRecordingError(path, str(error)) from error
     topic_of_channel = _topics(path, contents)
     counts = dict.fromkeys(RECORDED, 0)
     for channel, count in contents.counts.items():
@@ -174,11 +183,6 @@ def open_recording(path: Path) -> RecordingFile:
         _topic_of_channel=topic_of_channel,
         _chunks=chunks[np.argsort(chunks["offset"], kind="stable")],
     )
-
-
-def damaged(path: Path, detail: str) -> InputError:
-    """What to say of a file whose inside is not what it should be."""
-    return InputError(f"{path}: damaged ({detail or 'it ends too early'}): `hilrig recover {path}` saves what is whole")
 
 
 def _check_ends(path: Path, stream: IO[bytes]) -> None:

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from hilrig_replay.columns import Names, Rows
-from hilrig_replay.recording_file import RecordingFile, damaged, open_recording
+from hilrig_replay.recording_file import DamagedRecordingError, RecordingFile, open_recording
 from hilrig_replay.records import Decoder, Records, join_records
 from hilrig_replay.timebase import Timebase
 from hilrig_runtime.errors import InputError
@@ -210,7 +210,7 @@ class Run:
                     count = 0
                     yield decoder.take()
         except DecodeError as error:
-            raise damaged(self.path, f"a message can't be decoded: {error}") from error
+            raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
             yield decoder.take()
 
