@@ -3,49 +3,46 @@
 A client in C reads 4 positions and writes 4 torques, again and again, on 1, 2 and 16 connections. Ours is measured
 twice: the protocol alone (each write takes the lease, feeds the watchdog and is encoded, but goes nowhere), and the
 whole edge, with every write published on the bus to a subscriber, and recorded. Each connection has a rig of its own,
-for a rig has one writer. Then what an idle edge costs, one at 50 Hz, and 10,000 connections one after the other.
+for a rig has one writer. And the C server once more, while two other processes do with the bus what the simulation and
+the edge do: where there are two cores, all of it takes one from a request or the controller, whoever answers. Then
+what an idle edge costs, one at 50 Hz, and 10,000 connections one after the other.
 """
 
-import asyncio
-import gc
 import json
-import logging
-import multiprocessing
 import os
 import statistics
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import harness
 from harness import Report, build_c, progress
-from pymodbus.server import ModbusTcpServer
-from pymodbus.simulator import DataType, SimData, SimDevice
+from modbus_servers import (
+    NowhereBus,
+    lab_of,
+    serve_alone,
+    serve_stock,
+    serve_whole,
+    serving,
+    serving_c,
+    serving_c_beside_the_bus,
+)
 
-from hilrig_cli.demo import free_ports
-from hilrig_modbus_edge.bridge import run as run_edge
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Connection as ModbusConnection
 from hilrig_modbus_edge.server import Limits, RigServer
 from hilrig_modbus_edge.settings import DeviceSettings
-from hilrig_runtime.bus import KEPT, Publisher
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.memory_bus import MemoryBus
-from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
 from hilrig_runtime.service import Arrival, Service
-from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_schemas import JointState, RigBatch, topics
+from hilrig_schemas import JointState, topics
 
 QUESTION = "How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?"
 CONNECTIONS = (1, 2, 16)
 STOCK, C_SERVER, ALONE, WHOLE = "pymodbus's server", "libmodbus server in C", "ours, protocol alone", "ours, whole"
+C_BESIDE = "libmodbus server in C, the bus beside it"
 
 Figures = dict[str, Any]
 
@@ -58,12 +55,15 @@ def measure(report: Report, quick: bool) -> None:
         C_SERVER: lambda _: serving_c(c_server),
         ALONE: lambda connections: serving(serve_alone, connections),
         WHOLE: lambda connections: serving(serve_whole, connections),
+        C_BESIDE: lambda _: serving_c_beside_the_bus(c_server),
     }
     measured: dict[tuple[str, int], list[Figures]] = {}
     for number in range(runs):
         # The servers take turns, so that a slow moment of the machine does not fall on one of them.
         for connections in CONNECTIONS:
             for name, start in servers.items():
+                if name == C_BESIDE and connections != 2:
+                    continue
                 progress(f"{name}, {connections} connections, run {number + 1} of {runs}")
                 with start(connections) as (port, step, pid):
                     before = cpu_seconds(pid)
@@ -84,6 +84,8 @@ def measure(report: Report, quick: bool) -> None:
     report.bar("whole edge against libmodbus, 2 connections", at_two[WHOLE] / at_two[C_SERVER], ">=", 0.33)
     slow = middle(measured[WHOLE, 2], "read_us", "p99") / middle(measured[C_SERVER, 2], "read_us", "p99")
     report.bar("p99 of a read, whole edge against libmodbus, 2 connections", slow, "<=", 2.0)
+    beside = middle(measured[WHOLE, 2], "read_us", "p99") / middle(measured[C_BESIDE, 2], "read_us", "p99")
+    report.add(f"{WHOLE}, 2 connections", "read p99 against libmodbus, the bus beside it", beside, "ratio")
     measure_at_50_hz(report, client, servers, 2.0 if quick else 10.0)
     measure_own_code(report, middle(measured[ALONE, 2], "cpu_us"), middle(measured[WHOLE, 2], "cpu_us"))
     measure_resources(report, client, quick)
@@ -178,161 +180,6 @@ def middle(figures: list[Figures], *path: str) -> float:
             value = value[key]
         values.append(float(value))
     return statistics.median(values)
-
-
-Server = tuple[int, int, int]
-"""First port, step to the next connection's port, process id."""
-
-
-@contextmanager
-def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterator[Server]:
-    """Run a server of ours in a process of its own; it says that it is ready, and ends when told."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    port = free_ports(20_000, rigs)
-    process = context.Process(target=serve, args=(port, rigs, there))
-    process.start()
-    there.close()
-    try:
-        yield port, here.recv(), process.pid or 0
-    finally:
-        here.close()
-        process.join(10)
-        if process.is_alive():
-            process.kill()
-
-
-@contextmanager
-def serving_c(program: Path) -> Iterator[Server]:
-    port = free_ports(20_000)
-    with subprocess.Popen([program, str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        if process.stdout.readline() != "ready\n":
-            sys.exit(3)
-        try:
-            yield port, 0, process.pid
-        finally:
-            process.stdin.close()
-
-
-def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG001
-    """pymodbus's own server with registers in memory."""
-
-    # It tells of every connection that goes.
-    logging.disable()
-
-    async def body() -> None:
-        device = SimDevice(0, simdata=[SimData(0, count=16, values=0, datatype=DataType.REGISTERS)])
-        server = ModbusTcpServer(device, address=("127.0.0.1", port))
-        await server.serve_forever(background=True)
-        control.send(0)
-        await asyncio.get_running_loop().run_in_executor(None, wait_for_end, control)
-        await server.shutdown()
-
-    asyncio.run(body())
-
-
-class NowhereBus(MemoryBus):
-    """A bus that carries states and nothing else: what is published goes nowhere, and costs nothing."""
-
-    def publisher(self, key: str, traffic: topics.Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
-        return _Nowhere()
-
-
-class _Nowhere(Publisher):
-    def put(self, payload: bytes) -> None:
-        """Nobody listens."""
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def serve_alone(port: int, rigs: int, control: Connection) -> None:
-    """The edge with a bus that leads nowhere; nothing is kept for a recorder, and no policy but the ordinary one."""
-    prefer_latency()
-    lab = lab_of(port, rigs)
-    bus = NowhereBus()
-    with Service("edge", lab, bus) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
-        serve_ours(service, bus.hub.deliver, control)
-
-
-def serve_whole(port: int, rigs: int, control: Connection) -> None:
-    """The edge as `hilrig edge` runs it; another process takes the simulation's place and hears every command."""
-    prefer_latency()
-    go_realtime(REALTIME_PRIORITIES["edge"])
-    lab = lab_of(port, rigs)
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    sim = context.Process(target=send_states, args=(lab, there))
-    sim.start()
-    there.close()
-    here.recv()
-    try:
-        with Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
-            serve_ours(service, None, control)
-    finally:
-        here.close()
-        sim.join(10)
-
-
-def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, control: Connection) -> None:
-    lab = service.lab
-    alive = topics.alive_key(lab.name, "edge", "*")
-
-    def watch() -> None:
-        while not service.bus.alive(alive):
-            if deliver is not None:
-                for rig in lab.rigs:
-                    state = JointState(rig=rig.name, step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-                    batch = RigBatch(rigs=[rig.name], messages=[state.SerializeToString()])
-                    deliver(topics.STATES.key(lab.name, "sim", "1"), batch.SerializeToString())
-            time.sleep(0.01)
-        control.send(1)
-        wait_for_end(control)
-        service.stop()
-
-    threading.Thread(target=watch, daemon=True).start()
-    gc.collect()
-    gc.freeze()
-    run_edge(service)
-
-
-def send_states(lab: LabConfig, control: Connection) -> None:
-    """In the simulation's place: states at 50 Hz, and every command received."""
-    go_realtime(REALTIME_PRIORITIES["sim"])
-    with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
-        states = service.batch_sender(topics.STATES)
-        for rig in lab.rigs:
-            service.add_to_batch(states, topics.STATE, rig.name)
-        service.latest_of_batches(topics.COMMANDS)
-        control.send(1)
-        step = 0
-        while not control.poll(0.02):
-            step += 1
-            made = [
-                JointState(rig=rig.name, step=step, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-                for rig in lab.rigs
-            ]
-            states.send([state.SerializeToString() for state in made])
-            service.beat(service.clock.monotonic_ns())
-
-
-def lab_of(port: int, rigs: int) -> LabConfig:
-    return LabConfig.model_validate(
-        {
-            "edge": {"first_port": port, "max_connections": 64, "max_connections_per_host": 64},
-            "bus": {"first_port": free_ports(7447, 3)},
-            "rigs": [{"name": f"rig{number + 1}"} for number in range(rigs)],
-        }
-    )
-
-
-def wait_for_end(control: Connection) -> None:
-    """Return when the other end of the pipe is closed."""
-    with suppress(EOFError, OSError):
-        control.recv()
 
 
 def cpu_seconds(pid: int) -> float:

@@ -14,7 +14,7 @@ from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.memory_bus import MemoryBus
 from hilrig_runtime.service import Service
-from hilrig_schemas import Event, LeaseRequest, LeaseStatus, topics
+from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, TorqueCommand, topics
 from waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -76,6 +76,37 @@ def test_what_was_sent_is_on_the_record_byte_for_byte() -> None:
         arrived_ns = [arrived_ns for traffic in asked for arrived_ns in traffic.arrived_ns]
         assert arrived_ns == sorted(arrived_ns)
         assert all(0 <= after_ns < 1_000_000_000 for traffic in asked for after_ns in traffic.answered_after_ns)
+
+
+def test_a_controller_as_fast_as_it_can_be_costs_a_few_messages_a_step_and_all_it_said_is_told() -> None:
+    steps = 50
+    with running_edge() as rig, rig.client() as plc, MemoryBus(rig.hub) as simulation:
+        departures: list[TorqueCommand] = []
+
+        def receive(_: str, payload: bytes) -> None:
+            (command,) = RigBatch.FromString(payload).messages
+            departures.append(TorqueCommand.FromString(command))
+
+        def write(number: int) -> bytes:
+            return struct.pack(">BHHBH", 16, 0, 1, 2, number % 1000)
+
+        simulation.subscribe(topics.COMMANDS.key(rig.lab.name, "edge", "*"), receive)
+        written = 0
+        begin_ns = now_ns()
+        for step in range(steps):
+            rig.state()
+            while now_ns() < begin_ns + (step + 1) * rig.lab.sim.step_ns:
+                # As fast as it can be also where the system gives it little time.
+                plc.send(b"".join(plc.frame(write(number)) for number in range(written, written + 16)))
+                for _ in range(16):
+                    plc.receive()
+                written += 16
+        said = [round(command.effort[0] * 1000) for command in rig.commands if command.controller]
+        assert said == [number % 1000 for number in range(written)]
+    sequences = [command.seq for command in departures]
+    assert sequences == sorted(sequences)
+    # Twice a step; until it shows that there are many, each by itself; more often where a state comes late.
+    assert len(departures) < written / 8
 
 
 # -- one writer

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from hilrig_modbus_edge import departures
-from hilrig_modbus_edge.departures import GATHER_NS, LAST_NS, MANY, NEAR_NS, PARTS, Departures
+from hilrig_modbus_edge.departures import FEW, GATHER_NS, LAST_NS, MANY, NEAR_NS, PARTS, Departures
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.health import Counters
 from hilrig_runtime.service import LatestOfBatches
@@ -141,23 +141,85 @@ def test_what_is_fresh_takes_along_what_can_wait() -> None:
     assert edge.left[1:] == [(5_000 * US + GATHER_NS, {"rig1": b"second", "rig2": b"first"})]
 
 
-def test_shortly_before_the_tick_and_while_it_is_late_commands_leave_at_short_distances() -> None:
+def test_shortly_before_the_tick_the_words_of_one_who_says_few_leave_at_short_distances() -> None:
     edge = Edge()
     edge.be_many()
-    edge.send("rig1", b"first")
+    first_ns = STEP_NS - LAST_NS
+    edge.go_to(first_ns)
+    for number in range(FEW):
+        edge.go_to(first_ns + number * 100 * US)
+        edge.send("rig1", b"%d" % number)
+    edge.go_to(STEP_NS)
+    times = [at_ns for at_ns, _ in edge.left]
+    assert times[0] == first_ns
+    distances = {after - before for before, after in itertools.pairwise(times)}
+    # The next begins to wait with the first command after a departure.
+    assert max(distances) <= STEP_NS // PARTS + 100 * US
+    assert min(distances) >= STEP_NS // PARTS
+    assert edge.left[-1][1] == {"rig1": b"%d" % (FEW - 1)}
+
+
+def test_shortly_before_the_tick_one_who_asks_again_and_again_waits_for_the_next_states() -> None:
+    edge = Edge()
+    edge.be_many()
+    for number in range(FEW):
+        edge.send("rig1", b"%d" % number)
     edge.go_to(STEP_NS - LAST_NS)
     edge.left.clear()
-    for number in range(400):
+    for number in range(FEW, 50):
         edge.go_to(STEP_NS - LAST_NS + number * 10 * US)
         edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS + 4_000 * US)
+    # The tick of the simulation, and its states.
+    edge.go_to(STEP_NS)
+    edge.tick()
+    edge.send("rig1", b"first on the next states")
+    edge.go_to(10_000 * US)
+    assert edge.left == [(GATHER_NS, {"rig1": b"first on the next states"})]
+
+
+def test_what_waits_for_the_next_states_leaves_though_they_do_not_come_and_nobody_writes_again() -> None:
+    edge = Edge()
+    edge.be_many()
+    for _ in range(FEW):
+        edge.send("rig1", b"before")
+    edge.go_to(STEP_NS - 1_000 * US)
+    edge.left.clear()
+    edge.send("rig1", b"last")
+    edge.go_to(2 * STEP_NS)
+    assert edge.left == [(STEP_NS + GATHER_NS, {"rig1": b"last"})]
+
+
+def test_while_the_tick_is_late_commands_leave_at_short_distances() -> None:
+    edge = Edge()
+    edge.be_many()
+    for number in range(FEW):
+        edge.send("rig1", b"%d" % number)
+    edge.go_to(STEP_NS + GATHER_NS)
+    edge.left.clear()
+    for number in range(400):
+        edge.go_to(STEP_NS + GATHER_NS + number * 10 * US)
+        edge.send("rig1", b"%d" % number)
+    edge.go_to(STEP_NS + 8_000 * US)
     times = [at_ns for at_ns, _ in edge.left]
-    assert times[0] == STEP_NS - LAST_NS + STEP_NS // PARTS
     distances = {after - before for before, after in itertools.pairwise(times)}
     # The next begins to wait with the first command after a departure.
     assert max(distances) <= STEP_NS // PARTS + 10 * US
     assert min(distances) >= STEP_NS // PARTS
     assert edge.left[-1][1] == {"rig1": b"399"}
+
+
+def test_the_moment_after_the_last_departure_is_the_nearest_one() -> None:
+    edge = Edge()
+    just_after_ns = edge.departures.after_last("rig1", edge.ticked_ns + STEP_NS - LAST_NS)
+    assert 0 < just_after_ns - (edge.ticked_ns + STEP_NS - LAST_NS) <= 200 * US
+    for steps in (1, 2, 10):
+        for off_ns in (-STEP_NS // 2 + 1, -1, 0, 1, STEP_NS // 2 - 1):
+            at_ns = just_after_ns + steps * STEP_NS
+            assert edge.departures.after_last("rig1", at_ns + off_ns) == at_ns
+
+
+def test_while_no_state_has_come_every_moment_is_as_good() -> None:
+    assert Edge().departures.after_last("a rig without a state", 12_345) == 12_345
 
 
 @pytest.mark.parametrize("step_ns", [1_000_000, 5_000_000])
@@ -220,8 +282,8 @@ def test_timers_do_not_become_more() -> None:
         edge.departures.look()
         edge.clock.advance(STEP_NS - edge.since_tick_ns)
         edge.tick()
-        # A first word, a last one, and what comes within the last millisecond.
-        assert len(edge.left) <= (step + 1) * 9
+        # A first word and a last one.
+        assert len(edge.left) <= (step + 1) * 2 + 1
 
 
 def test_when_there_are_few_again_what_waits_leaves_at_once() -> None:

@@ -218,9 +218,13 @@ class Edge:
                 now_ns = monotonic_ns()
                 for seat in seats[turn::turns]:
                     seat.look_after(now_ns)
-            self._commands.look()
-            service.beat(monotonic_ns())
+                if not turn:
+                    self._commands.look()
+                    service.beat(monotonic_ns())
             deadline_ns += (missed + 1) * TICK_NS
+            if seats and service.lab.sim.step_ns <= TICK_NS:
+                # Requests are held up by departures anyway; they are not to be held up twice.
+                deadline_ns = self._commands.after_last(seats[0].device.rig, deadline_ns)
 
     def _close(self) -> None:
         self._closing.close()

@@ -4,9 +4,11 @@ A message costs its sender, threads of the bus on both sides and the simulation 
 are taken from the very requests that are to be answered. So where commands are many they leave together, and each early
 enough for the tick that it is meant for. A rig's first word on a new state is what a loop is measured by; more of them
 before the next state come from a controller that asks again and again, and replace each other: the newest leaves.
+What else the edge has to do, and can choose when, it does right after the last of them.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hilrig_runtime.clock import Clock
@@ -24,6 +26,12 @@ LAST_NS: Final = 1_500_000
 its way to go."""
 PARTS: Final = 50
 """Of a step, one of which lies between two departures after that."""
+FEW: Final = 8
+"""Words on one state that still leave then: one who writes each torque by itself is not to be cut in two by a tick. Who
+has said more than that says the same again right after it."""
+
+
+_JUST_AFTER_NS: Final = 50_000
 
 
 class Timer(Protocol):
@@ -31,6 +39,15 @@ class Timer(Protocol):
 
     def cancel(self) -> None:
         """Do not call."""
+
+
+@dataclass(slots=True)
+class _Said:
+    """What a rig said on its newest state."""
+
+    state_ns: int
+    """When that came, monotonic clock; 0: none has."""
+    words: int = 0
 
 
 class Departures:
@@ -60,8 +77,7 @@ class Departures:
         """By rig, its newest command, encoded."""
         self._count = 0
         self._many = False
-        self._said: dict[str, int] = {}
-        """By rig, when the state came that was its newest at its last command, ns, monotonic clock."""
+        self._said: dict[str, _Said] = {}
         self._timer: Timer | None = None
         self._due_ns = 0
         """When it comes."""
@@ -80,13 +96,19 @@ class Departures:
         if to_tick_ns < -self._step_ns:
             # The simulation is silent: there is no tick to be in time for.
             to_tick_ns = self._step_ns
-        if self._said.get(rig) != state_ns:
-            self._said[rig] = state_ns
+        said = self._said.get(rig)
+        if said is None or said.state_ns != state_ns:
+            said = self._said[rig] = _Said(state_ns)
+        said.words += 1
+        if said.words == 1:
             self._leave_at(now_ns + (0 if to_tick_ns < NEAR_NS else GATHER_NS))
         elif to_tick_ns > LAST_NS:
             self._leave_at(now_ns + to_tick_ns - LAST_NS)
-        else:
+        elif said.words <= FEW:
             self._leave_at(now_ns + self._apart_ns)
+        else:
+            # Where the tick is late they are late enough.
+            self._leave_at(now_ns + max(to_tick_ns + GATHER_NS, self._apart_ns))
 
     def look(self) -> None:
         """Once a tick of the edge: decide from how many there were since then whether they wait for each other."""
@@ -94,6 +116,15 @@ class Departures:
         self._count = 0
         if not self._many:
             self.flush()
+
+    def after_last(self, rig: str, when_ns: int) -> int:
+        """Of the moments at which a rig's last command before a tick has just left, the nearest to `when_ns`, and that
+        itself while the rig's simulation has said nothing; ns, monotonic clock."""
+        state = self._newest_state(rig)
+        if state is None:
+            return when_ns
+        half_ns = self._step_ns // 2
+        return when_ns + (state.arrived_ns - LAST_NS + _JUST_AFTER_NS - when_ns + half_ns) % self._step_ns - half_ns
 
     def flush(self) -> None:
         """Send what waits."""
