@@ -11,9 +11,8 @@ from typing import Any, Final
 
 from hilrig_runtime.bus_config import BusTlsConfig
 from hilrig_schemas import topics
-from hilrig_schemas.topics import RIG_TOPICS, ROOT, SERVICE_TOPICS, Traffic, alive_key
+from hilrig_schemas.topics import RIG_TOPICS, ROOT, SERVICE_TOPICS, SERVICES, Traffic, alive_key
 
-SERVICES: Final = ("sim", "edge", "recorder")
 TOOLS: Final = ("operator", "viewer")
 """An operator asks services to do things; a viewer only looks."""
 

@@ -19,7 +19,7 @@ from hilrig_runtime.mistakes import mistakes_in
 from hilrig_runtime.scene_config import SceneConfig
 from hilrig_runtime.sections import Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
 from hilrig_runtime.task_config import TaskConfig
-from hilrig_schemas.topics import RESERVED_RIG_NAMES
+from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
 MOST_RIGS = 10_000
 """More than any machine steps in real time; a mistyped count is found here."""
@@ -167,7 +167,7 @@ class RigSettings(Section):
 
     @model_validator(mode="after")
     def _no_reserved_name(self) -> "RigSettings":
-        if self.name in RESERVED_RIG_NAMES:
+        if self.name in RESERVED_RIG_NAMES or self.name in SERVICES:
             raise ValueError(f"{self.name!r} is a reserved name: call the rig otherwise")
         return self
 

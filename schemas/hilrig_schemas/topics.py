@@ -2,7 +2,8 @@
 
 No key string stands anywhere else. A key is `hil/<lab>/<rig>/<name>` for what concerns a rig and
 `hil/<lab>/<name>/<service>/<instance>` for what concerns a service; their names, as `log` and
-`health`, are therefore no names for a rig.
+`health`, are therefore no names for a rig. Nor are the services' own: an event that concerns one of
+them as a whole stands in the rig's place.
 """
 
 import re
@@ -108,6 +109,9 @@ RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in 
 
 ALIVE: Final = "alive"
 RESERVED_RIG_NAMES: Final = frozenset({topic.name for topic in SERVICE_TOPICS} | {ALIVE})
+"""What stands in a rig's place in the keys of services."""
+SERVICES: Final = ("sim", "edge", "recorder")
+"""What a lab is made of; see `Service.emit` for the keys that have one in a rig's place."""
 
 
 def alive_key(lab: str, service: str, instance: str) -> str:

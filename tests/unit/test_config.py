@@ -60,6 +60,7 @@ def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
         ("[sim]\nstep_ms = nan\n", r"sim\.step_ms: expected"),
         ('[[rigs]]\nname = "a b"\n', r"rigs\[0\]\.name: .*found 'a b'"),
         ('[[rigs]]\nname = "log"\n', r"rigs\[0\]: 'log' is a reserved name"),
+        ('[[rigs]]\nname = "edge"\n', r"rigs\[0\]: 'edge' is a reserved name"),
         ('[[rigs]]\nname="a"\n[[rigs]]\nname="a"\n', r"two rigs are called 'a'"),
         ('[[rigs]]\nname="a"\nport=5020\n[[rigs]]\nname="b"\nport=5020\n', r"port 5020 is taken by another rig"),
         ("[[rigs]]\nport = 70000\n", r"rigs\[0\]\.port: expected less than or equal to 65535, found 70000"),

@@ -82,8 +82,9 @@ class Edge:
             # Sockets listen before the first state is there: whoever connects early is served as soon as it can be
             # done. All or none: a rig without its port must not leave the others' open.
             try:
+                ports, tls_ports = lab.ports, lab.tls_ports
                 for rig, seat in self._seats.items():
-                    seat.bind(lab.ports[rig], lab.tls_ports.get(rig))
+                    seat.bind(ports[rig], tls_ports.get(rig))
             except OperationError:
                 # Who has the port may be another edge of the lab, with which the bus was not linked yet.
                 service.look_for_elders()
