@@ -148,6 +148,7 @@ def test_the_first_writer_holds_the_rig_and_others_are_refused_with_06(bench: Be
     refused = bench.events[-1]
     assert refused.kind == Event.LEASE_REFUSED
     assert (refused.controller_data.controller, refused.controller_data.holder) == ("10.0.0.2:1000", "10.0.0.1:1000")
+    assert refused.text == "10.0.0.2:1000 may not write to rig1: 10.0.0.1:1000 holds it"
 
 
 def test_a_write_that_is_wrong_takes_no_lease(bench: Bench) -> None:
@@ -306,12 +307,14 @@ def test_the_time_out_is_set_by_register_within_bounds(bench: Bench) -> None:
     assert bench.read(client, registers.ECHO, 2) == [0, 150]
 
 
-def test_a_new_session_starts_with_the_labs_time_out(bench: Bench) -> None:
+def test_a_new_session_starts_with_the_labs_time_out_and_no_echo_word(bench: Bench) -> None:
     one, other = bench.connect(), bench.connect(host="10.0.0.2")
-    bench.write(one, registers.WATCHDOG, 150)
+    bench.write(one, registers.ECHO, 4711, 150)
+    bench.write(one, 0, 1)
     bench.device.disconnect(one, "done")
     bench.write(other, 0, 1)
-    assert bench.read(other, registers.WATCHDOG, 1) == [1000]
+    assert bench.read(other, registers.ECHO, 2) == [0, 1000]
+    assert [command.echo for command in bench.commands if command.controller] == [4711, 0]
 
 
 # -- sessions

@@ -143,12 +143,18 @@ class Tenure:
         holder = self.lease.holder
         return LeaseStatus(
             rig=self._rig,
-            holder="" if holder is None else holder.address,
+            holder=self._holder,
             silent_ns=0 if holder is None else self._monotonic_ns() - holder.last_request_ns,
             session="" if self.session is None else self.session.id,
             watchdog_tripped=self.watchdog.tripped,
             watchdog_timeout_ns=self.watchdog.timeout_ns,
         )
+
+    @property
+    def _holder(self) -> str:
+        """Address of who holds the rig; empty: nobody."""
+        holder = self.lease.holder
+        return "" if holder is None else holder.address
 
     def _take_lease(self, client: Client, now_ns: int) -> None:
         if not client.may_write:
@@ -156,7 +162,7 @@ class Tenure:
         if now_ns < client.barred_until_ns:
             self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
         if not self.lease.take(client):
-            self._refuse(client, now_ns, "another controller holds the rig", ExcCodes.DEVICE_BUSY)
+            self._refuse(client, now_ns, f"{self._holder} holds it", ExcCodes.DEVICE_BUSY)
         self._last_writer = client.address
         self._open_session(client)
         text = f"{client.address} holds {self._rig}"
@@ -166,9 +172,8 @@ class Tenure:
         count = self._throttle.count(client, now_ns)
         if count:
             text = f"{client.address} may not write to {self._rig}: {reason}{times(count)}"
-            holder = "" if self.lease.holder is None else self.lease.holder.address
             self._journal.tell_of_controller(
-                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=holder
+                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=self._holder
             )
         raise ModbusError(code)
 
@@ -195,8 +200,9 @@ class Tenure:
         identity = session_id(self._rig, wall_ns, self._letters)
         self.session = Session(self._rig, identity, self._session_count, client.address, client.host.address, wall_ns)
         self._commander.session = self._journal.session = identity
-        # A time-out that the one before set by register was his.
+        # A time-out that the one before set by register was his, and so was his echo word.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
+        self._commander.echo = 0
         event = self._journal.event(Event.SESSION_START, Event.INFO, f"session {identity} of {client.address}")
         event.session_data.controller = client.address
         event.session_data.reason = "a controller took the rig"
