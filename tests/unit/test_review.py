@@ -13,6 +13,7 @@ from hilrig_replay.compare import Origin, compare, origin_of, save_comparison_pl
 from hilrig_replay.report import report
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import tips
+from hilrig_replay.selection import names_of
 from hilrig_replay.summary import COURSE_POINTS, summarise
 from hilrig_runtime.config import parse_lab
 from hilrig_runtime.errors import InputError
@@ -255,6 +256,21 @@ def test_a_run_that_was_replayed_and_a_copied_file_are_named_and_honest_ones_are
     assert {run["name"] for run in found.runs} == {"anna", "ben", "carl", "dora"}
     assert "dora" in page.text.split("Ranked")[0]
     assert report([anna, ben]).alike == ()
+
+
+def test_files_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    paths = []
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        paths.append(named(tmp_path / day, "anna", Script(seconds=1.0)).path)
+    third = named(tmp_path, "ben", Script(seconds=1.0)).path
+    page = _Page(report([*paths, third]).html)
+    assert set(names_of([*paths, third]).values()) == {
+        str(tmp_path / "monday/anna"),
+        str(tmp_path / "tuesday/anna"),
+        "ben",
+    }
+    assert all(str(path.with_suffix("")) in page.text for path in paths)
 
 
 def test_what_a_recording_says_is_text_and_never_markup(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from hilrig_replay.motion_plot import motion_figure
 from hilrig_replay.palette import EFFORT_SYMBOLS, STAGE_NAMES
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import parameters_of
+from hilrig_replay.selection import names_of
 from hilrig_replay.summary import RunSummary, summarise
 from hilrig_replay.verify import Verification, verify
 from hilrig_runtime.errors import InputError
@@ -101,9 +102,10 @@ def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | 
     """
     pages: list[_Page] = []
     left_out: list[str] = []
+    names = names_of(paths)
     for path in paths:
         try:
-            pages.append(_page(open_run(path), verified, task))
+            pages.append(_page(open_run(path), names[path], verified, task))
         except InputError as error:
             if len(paths) == 1:
                 raise
@@ -151,7 +153,7 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
     )
 
 
-def _page(run: Run, verified: bool, task: TaskConfig | None) -> _Page:
+def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:
     summary = summarise(run, task)
     parameters = parameters_of(run.parameters_json)
     targets = task or task_of(run)
@@ -159,7 +161,7 @@ def _page(run: Run, verified: bool, task: TaskConfig | None) -> _Page:
     if summary.latency.loop_ms is not None:
         pictures.append(_picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
     # A class has many runs: the samples of each are let go once they are drawn.
-    summary = replace(summary, latency=summary.latency.without_table())
+    summary = replace(summary, name=name, latency=summary.latency.without_table())
     return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
 
 

@@ -1,6 +1,7 @@
-"""Which recordings are meant: files, and folders with all that is in them."""
+"""Which recordings are meant: files, and folders with all in them; and what each is called beside the others."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from hilrig_runtime.errors import InputError
@@ -22,3 +23,9 @@ def recordings(given: Iterable[Path]) -> list[Path]:
         else:
             found.append(path)
     return list(dict.fromkeys(found))
+
+
+def names_of(paths: Sequence[Path]) -> dict[Path, str]:
+    """A name for each of several recordings: its file's, with its folder where two files are called the same."""
+    stems = Counter(path.stem for path in paths)
+    return {path: path.stem if stems[path.stem] == 1 else str(path.with_suffix("")) for path in paths}

@@ -33,7 +33,7 @@ def latency(
     """
     from hilrig_replay.latency import measure
     from hilrig_replay.run import open_run
-    from hilrig_replay.selection import recordings
+    from hilrig_replay.selection import names_of, recordings
     from hilrig_runtime.errors import InputError
 
     paths = recordings(runs)
@@ -64,7 +64,8 @@ def latency(
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:
-        print_overview({path.stem: each for path, each in reports})
+        names = names_of(paths)
+        print_overview({names[path]: each for path, each in reports})
         for bad in unreadable:
             print(bad["reason"], file=sys.stderr)
     if unreadable or not all(each.fit for _, each in reports):
