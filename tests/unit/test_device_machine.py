@@ -51,7 +51,7 @@ class Model:
         if self.holder is None:
             self.holder = client
             if self.session_host != client.host.address:
-                self.timeout_ms = WATCHDOG_MS
+                self.timeout_ms, self.echo = WATCHDOG_MS, 0
             self.session_host = client.host.address
         if self.holder is not client:
             return False

@@ -59,8 +59,8 @@ def latency(
         # Of many runs only the figures are kept.
         reports.append((path, report.without_table()))
     if as_json:
-        plain = [{"path": str(path), **each.as_dict()} for path, each in reports]
-        print(json.dumps(plain[0] if len(paths) == 1 else {"runs": plain, "unreadable": unreadable}))
+        many = {"runs": [{"path": str(path), **each.as_dict()} for path, each in reports], "unreadable": unreadable}
+        print(json.dumps(reports[0][1].as_dict() if len(paths) == 1 else many))
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:
