@@ -28,10 +28,9 @@ PARTS: Final = 50
 """Of a step, one of which lies between two departures after that."""
 FEW: Final = 8
 """Words on one state that still leave then: one who writes each torque by itself is not to be cut in two by a tick. Who
-has said more than that says the same again right after it."""
-
-
-_JUST_AFTER_NS: Final = 50_000
+has said more than that says something newer right after it."""
+JUST_AFTER_NS: Final = 50_000
+"""So long after the last departure the edge turns to other things."""
 
 
 class Timer(Protocol):
@@ -89,26 +88,8 @@ class Departures:
         if not self._many:
             self.flush()
             return
-        state = self._newest_state(rig)
-        state_ns = 0 if state is None else state.arrived_ns
         now_ns = self._monotonic_ns()
-        to_tick_ns = state_ns + self._step_ns - now_ns
-        if to_tick_ns < -self._step_ns:
-            # The simulation is silent: there is no tick to be in time for.
-            to_tick_ns = self._step_ns
-        said = self._said.get(rig)
-        if said is None or said.state_ns != state_ns:
-            said = self._said[rig] = _Said(state_ns)
-        said.words += 1
-        if said.words == 1:
-            self._leave_at(now_ns + (0 if to_tick_ns < NEAR_NS else GATHER_NS))
-        elif to_tick_ns > LAST_NS:
-            self._leave_at(now_ns + to_tick_ns - LAST_NS)
-        elif said.words <= FEW:
-            self._leave_at(now_ns + self._apart_ns)
-        else:
-            # Where the tick is late they are late enough.
-            self._leave_at(now_ns + max(to_tick_ns + GATHER_NS, self._apart_ns))
+        self._leave_at(now_ns + self._waits_ns(rig, now_ns))
 
     def look(self) -> None:
         """Once a tick of the edge: decide from how many there were since then whether they wait for each other."""
@@ -124,7 +105,7 @@ class Departures:
         if state is None:
             return when_ns
         half_ns = self._step_ns // 2
-        return when_ns + (state.arrived_ns - LAST_NS + _JUST_AFTER_NS - when_ns + half_ns) % self._step_ns - half_ns
+        return when_ns + (state.arrived_ns - LAST_NS + JUST_AFTER_NS - when_ns + half_ns) % self._step_ns - half_ns
 
     def flush(self) -> None:
         """Send what waits."""
@@ -135,6 +116,27 @@ class Departures:
         if waiting:
             self._put(RigBatch(source=self._source, rigs=waiting, messages=waiting.values()).SerializeToString())
             waiting.clear()
+
+    def _waits_ns(self, rig: str, now_ns: int) -> int:
+        """How long a word of a rig can wait, ns."""
+        state = self._newest_state(rig)
+        state_ns = 0 if state is None else state.arrived_ns
+        to_tick_ns = state_ns + self._step_ns - now_ns
+        if to_tick_ns < -self._step_ns:
+            # The simulation is silent: there is no tick to be in time for.
+            to_tick_ns = self._step_ns
+        said = self._said.get(rig)
+        if said is None or said.state_ns != state_ns:
+            said = self._said[rig] = _Said(state_ns)
+        said.words += 1
+        if said.words == 1:
+            return 0 if to_tick_ns < NEAR_NS else GATHER_NS
+        if to_tick_ns > LAST_NS:
+            return to_tick_ns - LAST_NS
+        if said.words <= FEW:
+            return self._apart_ns
+        # Where the tick is late they are late enough.
+        return max(to_tick_ns + GATHER_NS, self._apart_ns)
 
     def _leave_at(self, when_ns: int) -> None:
         if self._timer is not None:
