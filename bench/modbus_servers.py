@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
@@ -36,21 +37,29 @@ Server = tuple[int, int, int]
 
 
 @contextmanager
-def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterator[Server]:
-    """Run a server of ours in a process of its own; it says that it is ready, and ends when told."""
+def running(body: Callable[..., None], *arguments: Any) -> Iterator[tuple[Any, int]]:
+    """Run `body`, with the arguments and the other end of a pipe, in a process of its own: what it said when it was
+    ready, and its process id."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    port = free_ports(20_000, rigs)
-    process = context.Process(target=serve, args=(port, rigs, there))
+    process = context.Process(target=body, args=(*arguments, there))
     process.start()
     there.close()
     try:
-        yield port, here.recv(), process.pid or 0
+        yield here.recv(), process.pid or 0
     finally:
         here.close()
         process.join(10)
         if process.is_alive():
             process.kill()
+
+
+@contextmanager
+def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterator[Server]:
+    """Run a server of ours."""
+    port = free_ports(20_000, rigs)
+    with running(serve, port, rigs) as (step, pid):
+        yield port, step, pid
 
 
 @contextmanager
@@ -123,23 +132,8 @@ def serve_whole(port: int, rigs: int, control: Connection) -> None:
     prefer_latency()
     go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
-    with simulation_of(lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
+    with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
         serve_ours(service, None, control)
-
-
-@contextmanager
-def simulation_of(lab: LabConfig) -> Iterator[None]:
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    sim = context.Process(target=send_states, args=(lab, there))
-    sim.start()
-    there.close()
-    here.recv()
-    try:
-        yield
-    finally:
-        here.close()
-        sim.join(10)
 
 
 def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, control: Connection) -> None:
@@ -174,7 +168,7 @@ def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
     lab = lab_of(port, rigs)
     names = [rig.name for rig in lab.rigs]
     key = topics.COMMAND.key(lab.name, names[0])
-    with simulation_of(lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
+    with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
         states = service.latest_of_batches(topics.STATES)
         put = service.publisher(topics.COMMANDS).put
         command = TorqueCommand(rig=names[0], effort=[0.1] * 4, session="a" * 24, controller="127.0.0.1:50000")
