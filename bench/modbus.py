@@ -32,9 +32,10 @@ from modbus_servers import (
     serving_c_beside_the_bus,
 )
 
+from hilrig_modbus_edge.admission import Limits
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Connection as ModbusConnection
-from hilrig_modbus_edge.server import Limits, RigServer
+from hilrig_modbus_edge.server import RigServer
 from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_runtime.service import Arrival, Service
 from hilrig_schemas import JointState, topics

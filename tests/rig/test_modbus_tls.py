@@ -8,16 +8,18 @@ import stat
 import struct
 import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
 
 from edge_rig import EdgeRig, free_ports, running_edge
 from hilrig_modbus_edge.certificates import (
+    ROLE_OID,
     Identity,
     issue_client,
     issue_server,
@@ -25,6 +27,7 @@ from hilrig_modbus_edge.certificates import (
     names_in,
     role_of,
 )
+from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
@@ -110,7 +113,7 @@ def test_an_operator_reads_and_writes(rig: EdgeRig, lab: Lab) -> None:
 def test_an_observer_and_who_has_no_role_read_only(rig: EdgeRig, lab: Lab, name: str) -> None:
     answers = talk(rig, lab.client(name), READ, WRITE)
     assert answers == [bytes.fromhex("03 08 00 00 00 00 00 00 00 00"), bytes.fromhex("86 01")]
-    assert "read only" in rig.event(Event.LEASE_REFUSED).text
+    assert "may read only" in rig.event(Event.LEASE_REFUSED).text
 
 
 @pytest.mark.parametrize(("no_role", "answer"), [("operator", "06 00 00 03 E8"), ("observer", "86 01")])
@@ -147,6 +150,96 @@ def test_a_certificate_that_is_not_right_is_refused_and_the_operator_reads_why(
     assert rig.service.counters.refused == 1
     # The next one is served.
     assert talk(rig, lab.client("operator"), READ)
+
+
+UTF8, PRINTABLE = b"\x0c", b"\x13"
+OPERATOR, OBSERVER = b"\x08operator", b"\x08observer"
+
+
+def client_with(lab: Lab, name: str, *values: bytes) -> ssl.SSLContext:
+    """A client whose certificate has these role extensions (DER), as nobody's tool should have made it."""
+    issued = issue_client(lab.authority, name, "", NOW, 30)
+    builder = (
+        x509.CertificateBuilder()
+        .issuer_name(lab.authority.certificate.subject)
+        .subject_name(issued.certificate.subject)
+        .public_key(issued.key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(NOW - timedelta(minutes=5))
+        .not_valid_after(NOW + timedelta(days=1))
+    )
+    for value in values:
+        # The builder refuses a second one of a kind.
+        role = x509.Extension(ROLE_OID, critical=False, value=x509.UnrecognizedExtension(ROLE_OID, value))
+        builder._extensions = [*builder._extensions, role]
+    lab.write(name, Identity(builder.sign(lab.authority.key, hashes.SHA256()), issued.key))
+    return lab.client(name)
+
+
+@pytest.mark.parametrize(
+    "roles",
+    [
+        pytest.param([UTF8 + OPERATOR, UTF8 + OBSERVER], id="two roles"),
+        pytest.param([UTF8 + OPERATOR, UTF8 + OPERATOR], id="one role twice"),
+        pytest.param([PRINTABLE + OPERATOR], id="another kind of string"),
+        pytest.param([UTF8 + OPERATOR + b"\0"], id="something behind it"),
+        pytest.param([UTF8 + b"\x09operator"], id="shorter than it says"),
+        pytest.param([UTF8 + b"\x02\xff\xfe"], id="no UTF-8"),
+        pytest.param([UTF8 + b"\x08Operator"], id="another case"),
+        pytest.param([UTF8 + b"\x00"], id="empty"),
+        pytest.param([b""], id="nothing"),
+    ],
+)
+def test_a_role_that_cannot_be_told_is_none(rig: EdgeRig, lab: Lab, roles: list[bytes]) -> None:
+    answers = talk(rig, client_with(lab, "odd", *roles), READ, WRITE)
+    assert answers == [bytes.fromhex("03 08 00 00 00 00 00 00 00 00"), bytes.fromhex("86 01")]
+    assert "has not the role operator" in rig.event(Event.LEASE_REFUSED).text
+
+
+def test_a_handshake_that_is_never_finished_is_given_up(
+    rig: EdgeRig, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hilrig_modbus_edge.tls.HANDSHAKE_TIMEOUT_S", 0.2)
+    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+    hello = lab.client("operator").wrap_bio(incoming, outgoing, server_hostname="localhost")
+    with pytest.raises(ssl.SSLWantReadError):
+        hello.do_handshake()
+    with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as slow:
+        slow.sendall(outgoing.read())
+        while slow.recv(4096):
+            pass
+    assert "longer than 0.2 seconds" in rig.event(Event.CONNECTION_REFUSED).text
+    assert talk(rig, lab.client("operator"), READ)
+
+
+@pytest.mark.parametrize("size", [300, 5_000, 300_000])
+def test_what_is_no_modbus_right_behind_the_handshake_closes_the_connection(
+    rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, size: int
+) -> None:
+    with (
+        socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as plain,
+        lab.client("operator").wrap_socket(plain, server_hostname="localhost") as secured,
+    ):
+        with suppress(OSError):
+            secured.sendall(READ + b"\xa5" * size)
+        with suppress(OSError):
+            while secured.recv(4096):
+                pass
+    eventually(lambda: rig.service.counters.connections == 0)
+    assert rig.service.counters.malformed == 1
+    assert talk(rig, lab.client("operator"), READ)
+    assert [record.name for record in caplog.records] == ["hilrig_modbus_edge.server"]
+
+
+def test_a_client_cannot_begin_a_handshake_anew(rig: EdgeRig, lab: Lab) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl (Debian's package of that name)")
+    address = f"localhost:{rig.lab.tls_ports['rig1']}"
+    files = ["-CAfile", "ca.pem", "-cert", "operator.pem", "-key", "operator.key"]
+    command = ["openssl", "s_client", "-tls1_2", "-connect", address, *files]
+    done = subprocess.run(command, check=False, cwd=lab.folder, input="R\n", capture_output=True, text=True, timeout=10)
+    assert "RENEGOTIATING" in done.stderr
+    assert "no renegotiation" in done.stderr
 
 
 def test_a_client_without_tls_is_refused_and_holds_nobody_up(rig: EdgeRig, lab: Lab) -> None:
@@ -232,18 +325,40 @@ def test_openssl_as_a_client(rig: EdgeRig, lab: Lab) -> None:
 
 @pytest.mark.parametrize("key", ["certificate", "key", "authority"])
 def test_a_file_that_cannot_be_used_is_named(lab: Lab, tmp_path: Path, key: str) -> None:
-    from hilrig_modbus_edge.tls import TlsPolicy
-
-    def policy(path: Path) -> None:
-        tls = lab.tls(1) | {key: str(path)}
-        TlsPolicy(LabConfig.model_validate({"edge": {"tls": tls}}).edge.tls)
-
     with pytest.raises(InputError, match=rf"edge\.tls\.{key}.*missing.*can't be read"):
-        policy(tmp_path / "missing")
+        policy_of(lab, **{key: tmp_path / "missing"})
     wrong = tmp_path / "wrong"
     wrong.write_text("no PEM")
     with pytest.raises(InputError, match=r"wrong.*PEM"):
-        policy(wrong)
+        policy_of(lab, **{key: wrong})
+
+
+def policy_of(lab: Lab, **files: Path) -> None:
+    tls = lab.tls(1) | {key: str(path) for key, path in files.items()}
+    TlsPolicy(LabConfig.model_validate({"edge": {"tls": tls}}).edge.tls)
+
+
+def test_an_encrypted_key_is_told_instead_of_asking_at_a_terminal(lab: Lab, tmp_path: Path) -> None:
+    key = tmp_path / "secret.key"
+    encryption = serialization.BestAvailableEncryption(b"secret")
+    private = serialization.load_pem_private_key((lab.folder / "edge.key").read_bytes(), None)
+    key.write_bytes(private.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption))
+    with pytest.raises(InputError, match=r"edge\.tls\.key.*secret\.key is encrypted.*openssl pkey"):
+        policy_of(lab, key=key)
+
+
+def test_a_key_that_everybody_can_read_is_told_once(lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    key = tmp_path / "open.key"
+    key.write_bytes((lab.folder / "edge.key").read_bytes())
+    key.chmod(0o600)
+    policy_of(lab, key=key)
+    assert not caplog.records
+    key = key.rename(tmp_path / "opened.key")
+    key.chmod(0o644)
+    policy_of(lab, key=key)
+    policy_of(lab, key=key)
+    [record] = caplog.records
+    assert "chmod 600" in record.getMessage()
 
 
 def test_the_command_makes_what_the_edge_and_its_clients_need(tmp_path: Path) -> None:

@@ -91,11 +91,12 @@ def names_in(certificate: x509.Certificate) -> set[str]:
 
 
 def role_of(certificate_der: bytes) -> str:
-    """The role in a client's certificate; empty: it names none that can be read."""
-    extensions = x509.load_der_x509_certificate(certificate_der).extensions
+    """The role in a client's certificate; empty: it names none that can be read, or more than one."""
     try:
+        extensions = x509.load_der_x509_certificate(certificate_der).extensions
         value = extensions.get_extension_for_oid(ROLE_OID).value
-    except x509.ExtensionNotFound:
+    except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
+        # The TLS library let it pass, for it does not look into what it does not know.
         return ""
     return _text_of(value.value) if isinstance(value, x509.UnrecognizedExtension) else ""
 

@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
+from hilrig_modbus_edge.admission import Limits
 from hilrig_modbus_edge.departures import Departures
 from hilrig_modbus_edge.device import Device
-from hilrig_modbus_edge.server import Limits, RigServer, bind
+from hilrig_modbus_edge.server import RigServer, bind
 from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST

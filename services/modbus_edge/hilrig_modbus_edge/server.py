@@ -9,13 +9,12 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable
-from dataclasses import dataclass
-from ipaddress import IPv4Network, IPv6Network, ip_address
 from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.client import Client, address_of
+from hilrig_modbus_edge.admission import Admission, Limits
+from hilrig_modbus_edge.client import Client
 from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.framing import HEADER, MAX_FRAME, MIN_FRAME, Request, split
 from hilrig_modbus_edge.pdu import answer, exception
@@ -33,7 +32,8 @@ BUFFER_BYTES: Final = 2048
 SLICE: Final = 16
 """Requests of one connection before the others have their turn; the TCP guide's limit of transactions, too."""
 BACKLOG: Final = 128
-REFUSAL_PERIOD_NS: Final = 1_000_000_000
+MALFORMED_PERIOD_NS: Final = 1_000_000_000
+"""A host that sends no Modbus is told of once in so long."""
 _PDU: Final = HEADER.size
 """Where it begins in a frame."""
 _TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
@@ -43,31 +43,18 @@ _pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Who may connect, and how many."""
-
-    connections: int = 32
-    connections_per_host: int = 16
-    idle_ns: int = 60_000_000_000
-    """A connection without a request for so long is closed, ns; 0: never."""
-    allow: tuple[IPv4Network | IPv6Network, ...] = ()
-    """Networks that may connect; none: all."""
-
-
 class RigServer:
     """The connections of one rig."""
 
     def __init__(self, device: Device, limits: Limits, clock: Clock, counters: Counters) -> None:
         self.device = device
-        self.limits = limits
+        self._idle_ns = limits.idle_ns
         self.counters = counters
         self.traffic = TrafficRecord(device.rig)
         self.connections: set[Connection] = set()
-        self.gates: set[TlsGate] = set()
-        """Connections whose TLS handshake is going on."""
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
-        self._throttle = Throttle(REFUSAL_PERIOD_NS)
+        self._admission = Admission(device, limits, clock.monotonic_ns, counters)
+        self._throttle = Throttle(MALFORMED_PERIOD_NS)
         self._doors: list[asyncio.Task[None]] = []
         self._tls_servers: list[asyncio.Server] = []
 
@@ -82,30 +69,18 @@ class RigServer:
             self._doors.append(loop.create_task(accept_connections(loop, listening, self._welcome)))
         else:
             # asyncio's own transports know TLS.
-            server = await loop.create_server(lambda: TlsGate(self, policy), sock=listening, backlog=BACKLOG)
+            server = await loop.create_server(
+                lambda: TlsGate(self._admission, policy, self.take), sock=listening, backlog=BACKLOG
+            )
             self._tls_servers.append(server)
 
     def _welcome(self, transport: DirectTransport) -> None:
-        peer = self.admit(transport)
+        peer = self._admission.admit(transport)
         if peer is not None:
             self.take(transport, *peer)
 
-    def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
-        """Who connected, if he may; else None, and the connection is closed."""
-        peer = transport.get_extra_info("peername")
-        # A peer that is gone already has no name.
-        if peer:
-            host, port = peer[:2]
-            reason = self.why_refused(host)
-            if not reason:
-                tune(transport.get_extra_info("socket"))
-                return host, port
-            self.refuse(host, port, reason)
-        transport.abort()
-        return None
-
     def take(
-        self, transport: asyncio.Transport, host: str, port: int, *, may_write: bool = True, early: bytes = b""
+        self, transport: asyncio.Transport, host: str, port: int, may_write: bool = True, early: bytes = b""
     ) -> None:
         """Serve a controller from now on; `early` are bytes of his that have come already."""
         connection = Connection(self, transport, self.device.connect(host, port, may_write=may_write))
@@ -114,41 +89,21 @@ class RigServer:
         transport.set_protocol(connection)
         connection.feed(early)
 
-    def why_refused(self, host: str) -> str:
-        """Why a host may not connect now, for people; empty: it may."""
-        limits = self.limits
-        if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
-            return "its address is not in the rig's networks (allow in lab.toml)"
-        if len(self.connections) + len(self.gates) >= limits.connections:
-            return f"the rig has {limits.connections} connections already (edge.max_connections)"
-        # Who is still shaking hands counts, or one host could keep all others out with it.
-        of_host = self.device.connections_of(host) + sum(gate.host == host for gate in self.gates)
-        if of_host >= limits.connections_per_host:
-            return f"its host has {limits.connections_per_host} connections already (edge.max_connections_per_host)"
-        return ""
-
-    def refuse(self, host: str, port: int, reason: str) -> None:
-        """Say that a connection was refused, once in a while."""
-        self.counters.refused += 1
-        times = self._throttle.count((host, reason), self.monotonic_ns())
-        if times:
-            self.device.connection_refused(address_of(host, port), reason, times)
-
     def count_malformed(self, client: Client, why: str) -> None:
         """Count a connection that is closed for what it sent, and say so, once in a while."""
         self.counters.malformed += 1
-        times = self._throttle.count((client.host.address, "malformed"), self.monotonic_ns())
+        times = self._throttle.count(client.host.address, self.monotonic_ns())
         if times:
             more = f" ({times} times)" if times > 1 else ""
             logger.warning("rig %s: %s sent no Modbus: %s%s", self.device.rig, client.address, why, more)
 
     def close_idle(self, now_ns: int) -> None:
         """Close the connections that have asked for nothing for too long; ns, monotonic clock."""
-        if not self.limits.idle_ns:
+        if not self._idle_ns:
             return
         for connection in list(self.connections):
-            if now_ns - connection.client.last_request_ns >= self.limits.idle_ns:
-                connection.close(f"idle for {self.limits.idle_ns / 1e9:g} s")
+            if now_ns - connection.client.last_request_ns >= self._idle_ns:
+                connection.close(f"idle for {self._idle_ns / 1e9:g} s")
 
     def close(self, reason: str) -> None:
         """Stop listening and close every connection."""
@@ -156,7 +111,7 @@ class RigServer:
             door.cancel()
         for server in self._tls_servers:
             server.close()
-        for gate in list(self.gates):
+        for gate in list(self._admission.gates):
             gate.close()
         for connection in list(self.connections):
             connection.close(reason)
@@ -208,6 +163,9 @@ class Connection(asyncio.BufferedProtocol):
                 pdu = self._view[_PDU:nbytes].tobytes()
                 self._transport.write(self._reply(transaction, unit, pdu, now_ns))
                 return
+        if self._transport.is_closing():
+            # asyncio's TLS goes on reading what had come already.
+            return
         filled = self._filled + nbytes
         requests, used, malformed = split(self._buffer[:filled])
         self._filled = filled - used
@@ -242,10 +200,12 @@ class Connection(asyncio.BufferedProtocol):
 
     def feed(self, data: bytes) -> None:
         """Take bytes that came before this connection was there."""
-        for start in range(0, len(data), MAX_FRAME):
-            part = data[start : start + MAX_FRAME]
-            self._buffer[self._filled : self._filled + len(part)] = part
-            self.buffer_updated(len(part))
+        while data and not self._transport.is_closing():
+            room = self.get_buffer(-1)
+            count = min(len(room), len(data))
+            room[:count] = data[:count]
+            self.buffer_updated(count)
+            data = data[count:]
 
     def close(self, reason: str) -> None:
         """Close the connection and say why."""
@@ -301,17 +261,6 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
             f"rig {rig!r} can't listen on {host}:{port}: {reason}; stop what listens there, or choose another port in "
             f"lab.toml ({setting}, or the rig's own)"
         ) from error
-
-
-def tune(connected: socket.socket) -> None:
-    """Send each answer at once, and let the system find out within some 10 s that a peer is gone without a word."""
-    # asyncio sets this on sockets that it made itself; it does not recognise one from `socket.create_server`.
-    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    # The names that a system does not have it does not need: macOS says TCP_KEEPALIVE for TCP_KEEPIDLE.
-    for name, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPALIVE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
-        if hasattr(socket, name):
-            connected.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 assert BUFFER_BYTES > MAX_FRAME

@@ -158,7 +158,12 @@ class Tenure:
 
     def _take_lease(self, client: Client, now_ns: int) -> None:
         if not client.may_write:
-            self._refuse(client, now_ns, "its certificate lets it read only", ExcCodes.ILLEGAL_FUNCTION)
+            self._refuse(
+                client,
+                now_ns,
+                "its certificate has not the role operator, so it may read only",
+                ExcCodes.ILLEGAL_FUNCTION,
+            )
         if now_ns < client.barred_until_ns:
             self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
         if not self.lease.take(client):

@@ -5,19 +5,28 @@ a write that the role does not allow gets exception 01.
 """
 
 import asyncio
+import logging
+import os
+import re
 import ssl
+import stat
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
+from hilrig_modbus_edge.admission import Admission
 from hilrig_runtime.config import TlsConfig
 from hilrig_runtime.errors import InputError
 
-if TYPE_CHECKING:
-    from hilrig_modbus_edge.server import RigServer
-
 Right = Literal["operator", "observer", "refuse"]
 
+Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
+"""Serve a controller: its transport, host and port, whether it may write, and what it has sent already."""
+
 HANDSHAKE_TIMEOUT_S: Final = 5.0
+
+logger = logging.getLogger(__name__)
 
 
 class TlsPolicy:
@@ -35,15 +44,19 @@ class TlsPolicy:
         self.context = context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.verify_mode = ssl.CERT_REQUIRED
+        # A new handshake costs the edge more than who asks for it.
+        context.options |= ssl.OP_NO_RENEGOTIATION
         _check_readable("certificate", tls.certificate)
         _check_readable("key", tls.key)
         _check_readable("authority", tls.authority)
         try:
-            context.load_cert_chain(tls.certificate, tls.key)
+            # Not told what to do, the library asks for a password at the terminal, and a service waits for ever.
+            context.load_cert_chain(tls.certificate, tls.key, password=partial(_has_no_password, tls.key))
         except (ssl.SSLError, OSError) as error:
             raise InputError(
                 f"edge.tls: {tls.certificate} and {tls.key} are no certificate with its key (PEM): {error}"
             ) from error
+        _warn_if_exposed(tls.key)
         try:
             context.load_verify_locations(tls.authority)
         except (ssl.SSLError, OSError) as error:
@@ -57,13 +70,14 @@ class TlsPolicy:
 
 
 class TlsGate(asyncio.Protocol):
-    """A connection before its handshake is done; then `RigServer` gets it."""
+    """A connection before its handshake is done; `serve` gets it afterwards, with what it may do and sent already."""
 
     _transport: asyncio.Transport
 
-    def __init__(self, server: "RigServer", policy: TlsPolicy) -> None:
-        self._server = server
+    def __init__(self, admission: Admission, policy: TlsPolicy, serve: Serve) -> None:
+        self._admission = admission
         self._policy = policy
+        self._serve = serve
         self.host = ""
         self._early = bytearray()
         self._task: asyncio.Task[None] | None = None
@@ -72,55 +86,69 @@ class TlsGate(asyncio.Protocol):
         """See `asyncio.BaseProtocol`."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        peer = self._server.admit(transport)
+        peer = self._admission.admit(transport)
         if peer is not None:
             self.host = peer[0]
-            self._server.gates.add(self)
-            self._task = asyncio.get_running_loop().create_task(self._shake_hands(*peer))
+            self._admission.gates.add(self)
+            self._task = asyncio.get_running_loop().create_task(self._pass(*peer))
 
     def data_received(self, data: bytes) -> None:
         """Keep what comes right behind the handshake; see `asyncio.Protocol`."""
         self._early += data
 
     def close(self) -> None:
-        """Give up."""
+        """See `Gate.close`."""
         if self._task is not None:
             self._task.cancel()
         self._transport.abort()
 
-    async def _shake_hands(self, host: str, port: int) -> None:
-        server, loop = self._server, asyncio.get_running_loop()
+    async def _pass(self, host: str, port: int) -> None:
         try:
-            secured = await loop.start_tls(
-                self._transport,
-                self,
-                self._policy.context,
-                server_side=True,
-                ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
-            )
+            secured = await self._shake_hands()
         except (OSError, TimeoutError) as error:
-            server.refuse(host, port, f"no TLS: {_reason(error)}")
+            self._admission.refuse(host, port, f"no TLS: {_reason(error)}")
             self._transport.abort()
             return
         finally:
-            server.gates.discard(self)
+            self._admission.gates.discard(self)
         if secured is None or secured.is_closing():
             return
         certificate = secured.get_extra_info("ssl_object").getpeercert(binary_form=True)
         right = self._policy.right_of(certificate)
         if right == "refuse":
-            server.refuse(host, port, "its certificate names no role")
+            self._admission.refuse(host, port, "its certificate names no role that this lab knows")
             secured.abort()
             return
-        server.take(secured, host, port, may_write=right == "operator", early=bytes(self._early))
+        self._serve(secured, host, port, right == "operator", bytes(self._early))
+
+    async def _shake_hands(self) -> asyncio.Transport | None:
+        loop, context = asyncio.get_running_loop(), self._policy.context
+        return await loop.start_tls(
+            self._transport, self, context, server_side=True, ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S
+        )
 
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not accepted: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
-        return (error.reason or str(error)).lower().replace("_", " ")
+        # Where the library has no reason, its text has a code in front and a line of its own source behind.
+        return re.sub(r"^\[.*?] |\(_ssl.*$", "", error.reason or str(error)).strip().lower().replace("_", " ")
     return str(error) or "the handshake took too long"
+
+
+def _has_no_password(key: Path) -> str:
+    raise InputError(
+        f"edge.tls.key: {key} is encrypted, and there is nobody to ask for its password; write it without one: "
+        f"openssl pkey -in {key} -out rig.key, then chmod 600 rig.key"
+    )
+
+
+@cache
+def _warn_if_exposed(key: Path) -> None:
+    """Say, once, that whoever has an account here can read a key."""
+    if os.name == "posix" and key.stat().st_mode & stat.S_IROTH:
+        logger.warning("edge.tls.key: everybody on this machine can read %s; chmod 600 %s", key, key)
 
 
 def _check_readable(name: str, path: Path) -> None:
