@@ -138,3 +138,16 @@ def test_every_command_has_help() -> None:
         assert command.help, f"hilrig {command.name} does not say what it does"
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"hilrig {command.name}: {parameter.name} has no help"
+
+
+def test_the_labs_file_may_stand_before_or_behind_the_command_of_a_group(tmp_path: Path) -> None:
+    near, far = tmp_path / "near.toml", tmp_path / "far.toml"
+    for words, meant in (
+        (("record", "-c", far, "start", "rig1"), far),
+        (("record", "start", "-c", near, "rig1"), near),
+        (("record", "-c", far, "stop", "rig1", "-c", near), near),
+        (("rig", "--config", far, "list"), far),
+    ):
+        done = hilrig(*words)
+        assert done.returncode == 2, done.stderr
+        assert str(meant) in one_line(done.stderr)

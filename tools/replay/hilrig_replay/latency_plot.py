@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from hilrig_replay.distribution import tail
 from hilrig_replay.latency import LatencyReport
@@ -91,9 +92,10 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     for loop_ns in report.table.column("loop")():
         counts += np.histogram(np.minimum(loop_ns / 1e6, limit), edges)[0]
         beyond += int((loop_ns / 1e6 > limit).sum())
-    axes.hist(edges[:-1], edges.tolist(), weights=counts, color=STAGE_COLORS["register_wait"], log=True)
-    for multiple in np.arange(step, limit + step / 2, step):
-        axes.axvline(float(multiple), color="#bbbbbb", linewidth=0.8, zorder=0)
+    axes.stairs(counts, edges, baseline=0.5, fill=True, color=STAGE_COLORS["register_wait"])
+    _log_scale(axes)
+    steps = np.arange(step, limit + step / 2, step)
+    axes.vlines(steps, 0, 1, transform=axes.get_xaxis_transform(), color="#bbbbbb", linewidth=0.8, zorder=0)
     marks = (("p50", statistics.p50), ("p95", statistics.p95), ("p99", statistics.p99), ("p99.9", statistics.p999))
     for row, (name, value) in enumerate(marks):
         axes.axvline(value, color=_MARK, linewidth=0.9, linestyle=(0, (4, 2)))
@@ -140,7 +142,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
 def _tail(axes: Axes, report: LatencyReport) -> None:
     loop_ns, share_above = tail(report.table.column("loop"))
     axes.step(loop_ns / 1e6, share_above, where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
-    axes.set_yscale("log")
+    _log_scale(axes)
     axes.grid(color="#e5e5e5", linewidth=0.6)
     for share, name in ((0.5, "p50"), (0.05, "p95"), (0.01, "p99"), (0.001, "p99.9")):
         if share >= share_above[-1]:
@@ -182,6 +184,13 @@ def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
     axes.set_ylim(0, 1.1 * float(slowest.max()))
     axes.axhline(report.step_ms, color="#bbbbbb", linewidth=0.8, zorder=0)
     _label(axes, "Over time", "time in the run, s", "loop latency, ms")
+
+
+def _log_scale(axes: Axes) -> None:
+    # Ticks between the decades, and their powers set as formulas, would take as long to draw as all else.
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
 def _label(axes: Axes, title: str, x: str, y: str) -> None:

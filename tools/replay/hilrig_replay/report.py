@@ -1,25 +1,20 @@
 """A run, or a class of runs, as one HTML file that needs nothing else: no network, no script, no other file."""
 
-from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from io import BytesIO
-from itertools import pairwise
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.image import imsave
-from numpy.typing import NDArray
-
+from hilrig_replay.all_cores import all_cores
 from hilrig_replay.assignment import task_of
 from hilrig_replay.distribution import Statistics
 from hilrig_replay.distribution_plot import distribution_figure
 from hilrig_replay.latency_plot import latency_figure
 from hilrig_replay.likeness import alike
 from hilrig_replay.motion_plot import motion_figure
+from hilrig_replay.page_pictures import picture
 from hilrig_replay.palette import EFFORT_SYMBOLS, STAGE_NAMES
 from hilrig_replay.run import Run, open_run
 from hilrig_replay.scene import parameters_of
@@ -32,6 +27,8 @@ from hilrig_runtime.task_config import TaskConfig
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 _GRAVE: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
 """Kinds of events that a teacher looks for."""
+_WORTH_PROCESSES: Final = 4
+"""Fewer runs are done sooner than processes are started for them."""
 
 STYLE: Final = """
 :root { color-scheme: light; font: 15px/1.5 system-ui, sans-serif; color: #24292f; background: #f5f6f8; }
@@ -89,27 +86,37 @@ class Report:
     """Which runs were driven by the same torques, one sentence a pair."""
 
 
-def report(paths: Sequence[Path], *, verified: bool = False, task: TaskConfig | None = None) -> Report:
+def report(
+    paths: Sequence[Path],
+    *,
+    verified: bool = False,
+    task: TaskConfig | None = None,
+    tick: Callable[[float], None] | None = None,
+    workers: int | None = 1,
+) -> Report:
     """The report of one run, or of several with an overview that ranks them; those that can't be read are named in it.
 
     Args:
         paths: recordings.
         verified: re-simulate each run too, and say whether it came out the same.
         task: what the runs are graded by; None: each by what its own lab said.
+        tick: hears the share of the runs that are done.
+        workers: processes; None: one a core, where there are enough runs to be worth it.
 
     Raises:
         InputError: there is one only, or none that can be read: it is damaged, or not understood.
     """
     pages: list[_Page] = []
     left_out: list[str] = []
-    names = names_of(paths)
-    for path in paths:
-        try:
-            pages.append(_page(open_run(path), names[path], verified, task))
-        except InputError as error:
-            if len(paths) == 1:
-                raise
-            left_out.append(str(error))
+    for done, one in enumerate(_pages(paths, verified, task, workers), start=1):
+        if isinstance(one, _Page):
+            pages.append(one)
+        elif len(paths) == 1:
+            raise one
+        else:
+            left_out.append(str(one))
+        if tick is not None:
+            tick(done / len(paths))
     if not pages:
         raise InputError("no run can be reported:\n" + "\n".join(left_out))
     pages.sort(key=_rank)
@@ -153,13 +160,33 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
     )
 
 
+def _pages(
+    paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
+) -> Iterator[_Page | InputError]:
+    """Each run's page, or why there is none, in the order of `paths`."""
+    names = names_of(paths)
+    tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
+    if workers == 1 or len(paths) < _WORTH_PROCESSES:
+        yield from map(_page_or_reason, *tasks)
+    else:
+        with all_cores(len(paths), workers) as executor:
+            yield from executor.map(_page_or_reason, *tasks)
+
+
+def _page_or_reason(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | InputError:
+    try:
+        return _page(open_run(path), name, verified, task)
+    except InputError as error:
+        return error
+
+
 def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:
     summary = summarise(run, task)
     parameters = parameters_of(run.parameters_json)
     targets = task or task_of(run)
-    pictures = [_picture(motion_figure(summary.course, parameters, targets), "positions, efforts and the tool's way")]
+    pictures = [picture(motion_figure(summary.course, parameters, targets), "positions, efforts and the tool's way")]
     if summary.latency.loop_ms is not None:
-        pictures.append(_picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
+        pictures.append(picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
     # A class has many runs: the samples of each are let go once they are drawn.
     summary = replace(summary, name=name, latency=summary.latency.without_table())
     return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
@@ -282,7 +309,7 @@ def _overview(pages: Sequence[_Page]) -> str:
         )
     by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
     note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
-    distributions = _picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
+    distributions = picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
     return f"<section>{_ranking(header, rows)}{note}{distributions}</section>"
 
 
@@ -343,38 +370,3 @@ def _ranking(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         for row in rows
     )
     return f'<div class="scroll ranking"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _picture(figure: Figure, what: str) -> str:
-    """A picture in its columns, beside each other where the page is wide enough, else one below the other."""
-    figure.suptitle("")
-    pixels = _pixels(figure)
-    edges = [0, *_between_columns(figure), pixels.shape[1]]
-    images = "".join(_image(pixels[:, left:right], what) for left, right in pairwise(edges))
-    return f'<div class="picture">{images}</div>'
-
-
-def _between_columns(figure: Figure) -> list[int]:
-    """Where no panel is, from the left, px."""
-    spans = sorted((box.x0, box.x1) for axes in figure.axes if (box := axes.get_tightbbox()) is not None)
-    found, end = [], spans[0][1]
-    for begin, until in spans:
-        if begin > end:
-            found.append(int((begin + end) / 2))
-        end = max(end, until)
-    return found
-
-
-def _pixels(figure: Figure) -> NDArray[np.uint8]:
-    """A figure drawn: red, green, blue and opacity, shape (height, width, 4)."""
-    with BytesIO() as file:
-        figure.savefig(file, format="rgba")
-        return np.frombuffer(file.getvalue(), np.uint8).reshape(-1, int(figure.bbox.width), 4)
-
-
-def _image(pixels: NDArray[np.uint8], what: str) -> str:
-    with BytesIO() as file:
-        imsave(file, np.ascontiguousarray(pixels), format="png")
-        data = b64encode(file.getvalue()).decode()
-    width = pixels.shape[1]
-    return f'<img alt="{escape(what, quote=True)}" style="flex: {width}" src="data:image/png;base64,{data}">'

@@ -6,13 +6,9 @@ numbers on one core and on many.
 """
 
 import math
-import multiprocessing
-import os
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -21,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_modbus_edge.impairment import Impairment
+from hilrig_replay.all_cores import all_cores
 from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
 from hilrig_study.gain_theory import GainTheory, gain_theory
 from hilrig_study.mean_square import TICKS, stable_until
@@ -217,25 +214,21 @@ def sweep(
     found: list[GainTheory] = []
     constant = _constant(study, cells)
     total, done = len(parts) * 20 + len(asked), 0
-    with _executor(workers, len(parts) + len(asked)) as executor:
+    with all_cores(len(parts) + len(asked), workers) as executor:
         batches: dict[Future[NDArray[np.void]], NDArray[np.intp]] = {
             executor.submit(_results_of, study, cells[rows], folder): rows for rows in parts
         }
         theories: dict[Future[_Theory | None], _Asked] = {
             executor.submit(_theory_of, study, row, delays): row for row in asked.tolist()
         }
-        try:
-            for batch in as_completed(batches):
-                results[batches[batch]] = batch.result()
-                done += 20
-                tick(done / total)
-            for one in as_completed(theories):
-                one.result()
-                done += 1
-                tick(done / total)
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
+        for batch in as_completed(batches):
+            results[batches[batch]] = batch.result()
+            done += 20
+            tick(done / total)
+        for one in as_completed(theories):
+            one.result()
+            done += 1
+            tick(done / total)
         for theory_future, row in theories.items():
             answer = theory_future.result()
             if answer is None:
@@ -293,16 +286,3 @@ def _mean_square_until(study: StudyConfig, asked: _Asked) -> float:
         return line.ages()
 
     return stable_until(study, controller, gain, step_ms, np.sort(others[0].points).tolist(), ages_at)
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextmanager
-def _executor(workers: int | None, tasks: int) -> Iterator[Executor]:
-    count = min(workers or os.cpu_count() or 1, tasks)
-    # Spawned, never forked: a process of threads that is forked may hang.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
-        yield executor

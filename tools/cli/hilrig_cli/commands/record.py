@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AsJson, Config, config_for_commands
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 ANSWER_TIMEOUT_S = 5.0
 """How long a recorder has to answer."""
 
-app = typer.Typer(help="Record a rig by hand, whether a controller is there or not.", no_args_is_help=True)
+app = typer.Typer(
+    help="Record a rig by hand, whether a controller is there or not.",
+    no_args_is_help=True,
+    callback=config_for_commands,
+)
 
 Rig = Annotated[str, typer.Argument(help="Name of the rig.")]
 

@@ -34,6 +34,9 @@ def report(
     Runs of a class that were driven by the same torques, as when one was replayed, are named. Exit code 1: a recording
     of several could not be read; the page says which, and why.
     """
+    from rich.console import Console
+    from rich.progress import Progress
+
     from hilrig_replay.assignment import read_task
     from hilrig_replay.report import report as make_report
     from hilrig_replay.selection import recordings
@@ -42,7 +45,16 @@ def report(
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}")
     graded_by = None if task is None else read_task(task)
-    found = make_report(recordings(runs), verified=verify, task=graded_by)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        doing = progress.add_task("reading and drawing", total=1.0)
+        found = make_report(
+            recordings(runs),
+            verified=verify,
+            task=graded_by,
+            tick=lambda share: progress.update(doing, completed=share),
+            workers=None,
+        )
     try:
         out.write_text(found.html, encoding="utf-8")
     except OSError as error:

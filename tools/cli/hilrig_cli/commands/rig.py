@@ -6,14 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AsJson, Config, config_for_commands
 
 if TYPE_CHECKING:
     from hilrig_runtime.bus import Bus
     from hilrig_runtime.config import LabConfig, RigSettings
     from hilrig_schemas import Event, Roster
 
-app = typer.Typer(help="See which rigs a running lab has; add, take away or reset one.", no_args_is_help=True)
+app = typer.Typer(
+    help="See which rigs a running lab has; add, take away or reset one.",
+    no_args_is_help=True,
+    callback=config_for_commands,
+)
 
 Name = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
 

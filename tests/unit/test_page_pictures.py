@@ -1,0 +1,66 @@
+"""A figure in a page: an image for each column of its panels, with everything that belongs to it and nothing else."""
+
+import re
+from base64 import b64decode
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from hilrig_replay.page_pictures import picture
+from hilrig_replay.report import report
+from hilrig_runtime.errors import InputError
+from recordings import Script, record
+
+
+def images(html: str) -> list[np.ndarray]:
+    found = re.findall(r'flex: (\d+)" src="data:image/png;base64,([^"]+)"', html)
+    pixels = [imread(BytesIO(b64decode(data))) for _, data in found]
+    assert [image.shape[1] for image in pixels] == [int(width) for width, _ in found]
+    return pixels
+
+
+def dark_columns(image: np.ndarray) -> np.ndarray:
+    return np.flatnonzero((image[:, :, :3] < 0.9).any(axis=(0, 2)))
+
+
+@pytest.mark.parametrize("columns", [1, 2, 4])
+def test_a_figure_is_cut_between_its_columns_and_through_no_label(columns: int) -> None:
+    figure = Figure(figsize=(11, 4), layout="constrained", dpi=110)
+    for axes in np.atleast_2d(figure.subplots(2, columns)).flat:
+        # Labels stand out on both sides of a panel: the last tick's to the right, the axis's own to the left.
+        axes.set(xlim=(0, 1000), ylabel="samples", xticks=[0, 1000])
+        axes.set_yticks([0, 1], ["a long name", "another"])
+    pieces = images(picture(figure, "panels"))
+    assert len(pieces) == columns
+    assert sum(piece.shape[1] for piece in pieces) == 1210
+    for piece in pieces:
+        dark = dark_columns(piece)
+        assert dark[0] > 1
+        assert dark[-1] < piece.shape[1] - 2
+    # Each has the names left of its panels: before the longest line, its axis, there is more than a label's width.
+    for piece in pieces:
+        axis = (piece[:, :, :3] < 0.3).all(axis=2).sum(axis=0).argmax()
+        assert axis - dark_columns(piece)[0] > 60
+
+
+def test_many_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
+    paths = [record(tmp_path / f"run-{number}.mcap", Script(seconds=1.0 + number)) for number in range(3)]
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(paths[0].read_bytes()[:2000])
+    shares: list[float] = []
+    alone, together = report([*paths, torn]), report([*paths, torn], workers=2, tick=shares.append)
+    assert together == alone
+    assert [run["name"] for run in together.runs] == [run["name"] for run in alone.runs]
+    assert len(together.left_out) == 1
+    assert shares == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_a_report_of_one_damaged_file_says_so(tmp_path: Path) -> None:
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(b"")
+    with pytest.raises(InputError, match="empty"):
+        report([torn], workers=None)

@@ -1,0 +1,39 @@
+"""Processes for work that is worth all cores: one a core, each with its share of the tasks."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+
+from hilrig_runtime.errors import OperationError
+
+
+@contextmanager
+def all_cores(tasks: int, workers: int | None = None) -> Iterator[Executor]:
+    """Give an executor; whoever leaves the context by an exception waits for no task that has not begun.
+
+    Args:
+        tasks: that there are; there are no more processes than that.
+        workers: processes; default: one a core.
+
+    Raises:
+        OperationError: a process ended before its task.
+    """
+    count = min(workers or os.cpu_count() or 1, tasks)
+    # Spawned, never forked: a process of threads that is forked may hang.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
+        try:
+            yield executor
+        except BrokenProcessPool as error:
+            raise OperationError("a process that did a part of the work ended; memory may be short") from error
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
