@@ -57,6 +57,7 @@ check: .venv/dev ## format, lint, types, floors
 
 gen: .venv/dev ## generated code and tables, from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
+	$(BIN)/python tests/wire_contract.py
 	$(BIN)/python docs/make_configuration.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python tests/conformance.py > docs/modbus-conformance.md

@@ -20,7 +20,7 @@ from hilrig_recorder.writer import RunWriter
 from hilrig_replay import foxglove_messages as foxglove
 from hilrig_replay.columns import Names, Rows
 from hilrig_replay.recording_file import RawMessage
-from hilrig_replay.records import Decoder, Records, join_records
+from hilrig_replay.records import Decoder, Records, join_records, name_of
 from hilrig_replay.run import ALL, BLOCK_ROWS, Run
 from hilrig_replay.scene import ArmPicture, read_arm
 from hilrig_replay.shapes import Solid, fixed_joints, solids_of
@@ -239,7 +239,7 @@ class _Drawing:
 
     def event(self, log_ns: int, event: Event) -> None:
         """Tell an event."""
-        level = foxglove.LOG_LEVELS.get(Event.Severity.Name(event.severity), 0)
+        level = foxglove.LOG_LEVELS.get(name_of(Event.Severity, event.severity), 0)
         message = foxglove.Log(level=level, message=event.text, name=event.source)
         _stamp(message.timestamp, event.wall_ns)
         self._put("/log", log_ns, event.wall_ns, message)

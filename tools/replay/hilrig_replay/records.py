@@ -100,16 +100,16 @@ class Decoder:
 
 def _event_row(payload: bytes) -> tuple[Any, ...]:
     event = Event.FromString(payload)
-    kind = _name(Event.Kind, event.kind)
-    severity = _name(Event.Severity, event.severity)
+    kind = name_of(Event.Kind, event.kind)
+    severity = name_of(Event.Severity, event.severity)
     return (event.wall_ns, event.step, kind, severity, event.text, event.source, event)
 
 
-def _name(enum: Any, number: int) -> str:
+def name_of(enum: Any, number: int) -> str:
+    """Name of an enum's value; its number, where a later version added it."""
     try:
         return str(enum.Name(number))
     except ValueError:
-        # A kind that a later minor version added: still worth its line.
         return str(number)
 
 

@@ -1,0 +1,49 @@
+"""A recording of an earlier version, as its recorder wrote it, says today what it said then.
+
+`before-columns-of-requests.mcap`: two seconds of a controller, with one record a Modbus request. It has been read when
+it was made; these figures are of then.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from hilrig_recorder.recover import recover
+from hilrig_replay.latency import measure
+from hilrig_replay.run import open_run
+from hilrig_replay.verify import verify
+from labs import hilrig
+
+OLD = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
+
+
+def test_all_of_its_messages_are_read() -> None:
+    run = open_run(OLD)
+    assert (len(run.states), len(run.commands), len(run.events), len(run.traffic)) == (370, 97, 5, 190)
+    assert set(run.traffic["function"]) == {3, 16}
+    assert set(run.traffic["exception"]) == {0}
+    assert (run.traffic["answered_ns"] > run.traffic["arrived_ns"]).all()
+    assert run.names[int(run.traffic["controller"][0])] == run.controller
+
+
+def test_its_latencies_are_those_of_then() -> None:
+    report = measure(open_run(OLD))
+    assert report.samples == 94
+    assert report.loop_ms is not None
+    assert (report.loop_ms.p50, report.loop_ms.max) == pytest.approx((39.999632, 60.0488), abs=1e-6)
+    assert (report.lost.transport, report.lost.recorder) == (0, 0)
+    assert report.reasons == ("94 samples only: 500 are needed for a 99th percentile",)
+
+
+def test_its_steps_are_simulated_again() -> None:
+    verification = verify(OLD)
+    assert verification.same
+    assert (verification.steps, verification.gaps) == (357, 0)
+
+
+def test_it_is_whole_and_every_table_of_it_can_be_exported(tmp_path: Path) -> None:
+    assert recover(OLD, tmp_path / "new.mcap").path is None
+    exported = hilrig("export", OLD, "--csv", tmp_path / "tables", "--foxglove", tmp_path / "drawn.mcap")
+    assert exported.returncode == 0, exported.stderr
+    rows = {path.name: len(path.read_text().splitlines()) - 1 for path in (tmp_path / "tables").iterdir()}
+    assert sorted(rows.values()) == [5, 97, 190, 370], rows
