@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from hilrig_sim import kinematics, newton_euler
 from hilrig_sim.dynamics import forward_dynamics
-from hilrig_sim.model import ArmParameters, RigParameters
+from hilrig_sim.model import ArmParameters, RigParameters, SceneParameters, StepParameters
+from hilrig_sim.plant import Plant
 from hilrig_sim.urdf import POINT_INERTIA, POINT_MASS, urdf
 
 Floats = NDArray[np.float64]
 CASES = 300
 TOLERANCE = 1e-7
+NOTHING_BELOW = SceneParameters(table_height=-1.0)
 
 
 def random_arm(rng: np.random.Generator) -> ArmParameters:
@@ -119,6 +121,56 @@ def test_reduced_form_and_recursion_accelerate_as_the_engine_does(engine: type[M
         worst_general = max(worst_general, float(np.linalg.norm(general - expected) / scale))
     assert worst_reduced <= TOLERANCE
     assert worst_general <= TOLERANCE
+
+
+def plant_on_a_stop(rng: np.random.Generator, joint: int, step_ns: int) -> tuple[Plant, Any, Floats]:
+    """A plant that holds something, joint 1 or 2 at its upper stop; Pinocchio's model of it; and an effort."""
+    arm, payload = replace(random_arm(rng), external_force_z=0.0, external_torque_z=0.0), rng.uniform(0, 2)
+    peer = Pinocchio(arm)
+    peer.hold(payload)
+    position, velocity, effort = random_state(rng, arm)
+    position[joint] = arm.upper[joint]
+    plant = Plant([RigParameters(arm=arm, sim=StepParameters(step_ns=step_ns), scene=NOTHING_BELOW)])
+    plant.place(0, position, velocity)
+    plant.dynamics.set_payload(np.array([payload]))
+    return plant, peer, effort
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_an_impact_at_a_stop_is_pinocchios_inelastic_impact_along_that_joint(joint: int) -> None:
+    rng = np.random.default_rng(1914)
+    for _ in range(50):
+        plant, peer, effort = plant_on_a_stop(rng, joint, step_ns=1)
+        before = plant.velocity[:, 0]
+        before[joint] = abs(before[joint])
+        along = np.eye(4)[joint : joint + 1]
+        expected = pinocchio.impulseDynamics(peer.model, peer.data, plant.position[:, 0], before, along, 0.0, 0.0)
+        plant.step(effort[:, np.newaxis], np.array([False]))
+        np.testing.assert_allclose(plant.velocity[:, 0], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_what_is_pressed_onto_a_stop_leaves_the_rest_an_arm_with_that_joint_locked(joint: int) -> None:
+    rng, step_ns, pressed = np.random.default_rng(1687), 100, 0
+    for _ in range(50):
+        plant, peer, effort = plant_on_a_stop(rng, joint, step_ns)
+        position, velocity = plant.position[:, 0].copy(), plant.velocity[:, 0]
+        velocity[joint], effort[joint] = 0.0, 60.0
+        driven = effort - np.array(plant.rigs[0].arm.friction) * velocity
+        free = pinocchio.aba(peer.model, peer.data, position, velocity, driven)
+        if free[joint] <= 0:
+            continue
+        pressed += 1
+        others = [one for one in range(4) if one != joint]
+        locked = pinocchio.buildReducedModel(peer.model, [joint + 1], position)
+        locked.armature = np.array(peer.model.armature)[others]
+        before = velocity.copy()
+        expected = pinocchio.aba(locked, locked.createData(), position[others], before[others], driven[others])
+        plant.step(effort[:, np.newaxis], np.array([False]))
+        assert plant.velocity[joint, 0] == 0.0
+        found = (plant.velocity[others, 0] - before[others]) / (step_ns * 1e-9)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * float(np.abs(expected).max()))
+    assert pressed > 30
 
 
 def test_reduced_form_is_the_recursion_with_point_masses() -> None:

@@ -49,10 +49,12 @@ def test_mass_matrix_is_symmetric_and_positive_definite(
     assert np.all(np.linalg.eigvalsh(matrix) > 0)
 
 
-def test_what_goes_in_less_friction_is_what_there_is() -> None:
+@pytest.mark.parametrize("payload", [0.0, 1.2])
+def test_what_goes_in_less_friction_is_what_there_is(payload: float) -> None:
     arm = replace(ARM, friction=(0.4, 0.3, 2.0, 0.02), external_force_z=1.0, external_torque_z=0.1)
     plant = plant_at((-1.0, 0.5, 0.10, 0.0), (0.5, -0.5, 0.0, 1.0), replace(BARE, arm=arm), step_ns=1_000_000)
-    effort = np.array([[1.5], [-0.8], [-3.8], [0.02]])
+    plant.dynamics.set_payload(np.array([payload]))
+    effort = np.array([[1.5], [-0.8], [-3.8 - payload * GRAVITY], [0.02]])
     drive = effort[:, 0] + np.array([0.1, 0.1, -1.0, 0.1])
     friction = np.array(arm.friction)
     begin, worked = energy(plant), 0.0

@@ -91,6 +91,44 @@ def test_a_held_part_stays_where_it_sits_on_the_magnet_and_turns_with_it() -> No
     assert abs(yaw) > 0.1
 
 
+@pytest.mark.parametrize("table_m", [1.3, 1.0], ids=["table everywhere", "table with an edge"])
+@pytest.mark.parametrize("tray", [False, True], ids=["on the table", "on a tray"])
+def test_a_tip_that_came_into_a_part_from_the_side_holds_it_at_the_height_at_which_it_stands(
+    table_m: float, tray: bool
+) -> None:
+    base = TABLE + (0.008 if tray else 0.0)
+    scene = SceneParameters(
+        parts=(part("a", 0.3, -0.2, below=base),), trays=(TRAY,) if tray else (), table_size=(table_m, table_m)
+    )
+    plant = Plant([RigParameters(scene=scene)])
+    go_to(plant, 0.3, -0.2, base + 0.026)
+    d3 = plant.position[2, 0]
+    (event, *_) = steps(plant, 1, hold(plant), ON)
+    assert event.happening is Happening.PART_PICKED
+    # Neither is the part pressed into what it stands on nor the quill pushed up; and further down it does not go.
+    pressed = hold(plant)
+    pressed[2] += 8.0
+    for _ in range(60):
+        plant.step(pressed, ON)
+        assert plant.position[2, 0] == pytest.approx(d3, abs=1e-8)
+        assert plant.world.z[0, 0] - 0.015 == pytest.approx(base, abs=1e-8)
+    # What a recorded pose gives back is the same plant, to the last bit.
+    world, again = plant.world, Plant([RigParameters(scene=scene)])
+    pose = tuple(float(of[0, 0]) for of in (world.x, world.y, world.z, world.yaw))
+    again.place(0, plant.position[:, 0], plant.velocity[:, 0], [pose], held=0)
+    lifted = hold(plant)
+    lifted[2] -= 1.0
+    for effort in (pressed, lifted):
+        for _ in range(20):
+            plant.step(effort, ON)
+            again.step(effort, ON)
+            np.testing.assert_array_equal(again.position, plant.position)
+    assert plant.tool(np.array([0]))[2, 0] - world.z[0, 0] == pytest.approx(0.011, abs=1e-8)
+    assert world.z[0, 0] - 0.015 > base + 0.01
+    steps(plant, 60, hold(plant), OFF)
+    assert world.z[0, 0] - 0.015 == pytest.approx(base, abs=1e-8)
+
+
 def test_to_take_a_part_along_costs_energy_and_keeps_momentum() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1, mass=1.0))
     plant.velocity[:, 0] = 0.8, -0.5, 0.0, 0.0

@@ -21,6 +21,8 @@ Ints = NDArray[np.int64]
 NONE: Final = -1
 """`held` where the magnet holds nothing."""
 ALL: Final = slice(None)
+_GRAIN: Final = 2.0**-30
+"""How far a tip is inside a part is kept to this, m: what is found anew from a recorded pose is the same to the bit."""
 
 
 class World:
@@ -190,7 +192,7 @@ class World:
         """Move the parts that these rigs hold to where their tools are: poses (x, y, z, yaw), (4, K)."""
         rows = self.held[rigs]
         self.x[rows, rigs], self.y[rows, rigs] = self.footprint_centre(rigs, tip)
-        self.z[rows, rigs] = tip[2] - self.half_height[rows, rigs]
+        self.z[rows, rigs] = tip[2] - self.held_height[rigs] + self.half_height[rows, rigs]
         self.yaw[rows, rigs] = tip[3] + self._grip[2, rigs]
         self._moved(rigs)
 
@@ -218,9 +220,12 @@ class World:
         self._grip[1, rigs] = c * dy - s * dx
         self._grip[2, rigs] = self.yaw[rows, rigs] - yaw
         self.held[rigs] = rows
-        self.held_height[rigs] = 2 * self.half_height[rows, rigs]
+        half = self.half_height[rows, rigs]
+        # A tip that came into a part from the side holds it where it stands: pushed down, it would sink into the table.
+        inside = np.maximum(self.z[rows, rigs] + half - z, 0.0)
+        self.held_height[rigs] = 2 * half - np.rint(inside / _GRAIN) * _GRAIN
         self._held_radius[rigs] = self._radius[rows, rigs]
-        self.z[rows, rigs] = z - self.half_height[rows, rigs]
+        self.z[rows, rigs] = z - self.held_height[rigs] + half
         self._hold_changed()
         self._moved(rigs)
         self._refresh_highest(rigs)
