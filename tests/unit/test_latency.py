@@ -115,7 +115,7 @@ def test_the_report_has_what_scripts_rely_on(tmp_path: Path) -> None:
     assert list(plain["stages_ms"]) == list(STAGES)
     assert all(set(statistics) == keys for statistics in plain["stages_ms"].values())
     assert plain["step_ms"] == 20.0
-    assert plain["lost"] == {"transport": 0, "recorder": 0}
+    assert plain["lost"] == {"transport": 0, "recorder": 0, "file": 0}
     assert plain["fit"] is True
     assert plain["reasons"] == []
 

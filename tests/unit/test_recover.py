@@ -9,6 +9,7 @@ from typing import IO, Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
 
 import recordings
@@ -61,6 +62,12 @@ def read(path: Path) -> list[Found]:
         list(reader.iter_attachments())
         list(reader.iter_metadata())
     return found
+
+
+def words_of(path: Path) -> dict[str, dict[str, str]]:
+    """What a file says of itself."""
+    with path.open("rb") as stream:
+        return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
 
 
 def chunk_ends(path: Path) -> list[int]:
@@ -185,10 +192,9 @@ def test_a_recovered_recording_says_what_it_is(tmp_path: Path) -> None:
     data = bytearray(source.read_bytes())
     source.write_bytes(data)
     recover(source, tmp_path / "run.mcap")
-    with (tmp_path / "run.mcap").open("rb") as stream:
-        names = [record.name for record in make_reader(stream).iter_metadata()]
-    assert "hilrig.session" in names
-    assert "hilrig.recovered" in names
+    found = words_of(tmp_path / "run.mcap")
+    assert "hilrig.session" in found
+    assert found["hilrig.recovered"]["damaged_bytes"] == "0"
 
 
 def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path: Path) -> None:
@@ -197,10 +203,48 @@ def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path:
         writer.add_metadata("hilrig.loss", {"transport": str(transport), "recorder": str(recorder)})
     writer.close()
     recover(writer.part, writer.path)
-    with writer.path.open("rb") as stream:
-        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    found = words_of(writer.path)
     assert found["hilrig.summary"]["ended"] == "recovered"
+    assert "had no end" in found["hilrig.summary"]["reason"]
     assert (found["hilrig.summary"]["lost_transport"], found["hilrig.summary"]["lost_recorder"]) == ("3", "4")
+
+
+def test_a_file_that_lost_its_last_words_does_not_say_that_it_had_no_end(tmp_path: Path) -> None:
+    path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
+    good_file(path)
+    data = bytearray(path.read_bytes())
+    words = next(at for at, item in scan(data) if isinstance(item, Metadata) and item.name == "hilrig.summary")
+    data[words + 9 : words + 40] = bytes(31)
+    path.write_bytes(data)
+    assert is_whole(data)
+    recover(path, new)
+    assert words_of(new)["hilrig.summary"]["reason"] == "how it ended stood where the file is damaged"
+
+
+def test_a_loss_that_is_no_number_is_passed_over(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap")
+    writer.add_metadata("hilrig.loss", {"transport": "3", "recorder": "-4\x00"})
+    writer.close()
+    recover(writer.part, writer.path)
+    assert words_of(writer.path)["hilrig.summary"]["lost_transport"] == "3"
+    assert words_of(writer.path)["hilrig.summary"]["lost_recorder"] == "0"
+
+
+@pytest.mark.parametrize("torn", [False, True])
+def test_what_is_torn_off_the_end_is_told_apart(tmp_path: Path, torn: bool) -> None:
+    path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
+    good_file(path)
+    ends = chunk_ends(path)
+    data = bytearray(path.read_bytes())
+    if torn:
+        del data[ends[-1] - 10 :]
+    else:
+        data[ends[3] - 10 : ends[3]] = bytes(10)
+    path.write_bytes(data)
+    recovery = recover(path, new)
+    assert recovery.damaged_bytes > 0
+    assert recovery.torn_bytes == (recovery.damaged_bytes if torn else 0)
+    assert words_of(new)["hilrig.recovered"]["torn_bytes"] == str(recovery.torn_bytes)
 
 
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:

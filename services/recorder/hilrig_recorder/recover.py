@@ -20,6 +20,8 @@ from hilrig_recorder.writer import LIBRARY, RunWriter
 from hilrig_runtime.errors import InputError, OperationError
 
 RECOVERING_SUFFIX: Final = ".recovering"
+_UNFINISHED: Final = "the file had no end: its recorder was killed, or it was cut off; what came last may be missing"
+_DAMAGED: Final = "how it ended stood where the file is damaged"
 _HEAD_BYTES: Final = 64 * 1024
 
 
@@ -38,6 +40,8 @@ class Recovery:
     """Chunks that are there but not whole."""
     damaged_bytes: int = 0
     """Bytes of the original that hold nothing whole: the torn end, and damage in between."""
+    torn_bytes: int = 0
+    """Those of them that belong to a record which the end of the file cut off."""
     orphans: int = 0
     """Messages whose channel is not known any more."""
     reasons: list[str] = field(default_factory=list)
@@ -128,14 +132,15 @@ def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: Tru
 def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
     recovery = Recovery(source)
     view = map_file(source)
-    if is_whole(view) and _is_intact(view, source, go_on):
+    finished = is_whole(view)
+    if finished and _is_intact(view, source, go_on):
         return recovery
     if path.exists():
         raise OperationError(f"{path}: exists; choose another name for what is recovered from {source.name}")
     part = path.with_name(path.name + RECOVERING_SUFFIX)
     try:
         part.unlink(missing_ok=True)
-        _Copy(view, recovery).write(path, part, go_on)
+        _Copy(view, recovery, finished).write(path, part, go_on)
     except OSError as error:
         raise OperationError(f"{path}: can't be written: {error.strerror}") from error
     recovery.path = path
@@ -182,9 +187,10 @@ def _held(source: Path) -> Iterator[None]:
 
 
 class _Copy:
-    def __init__(self, view: memoryview, recovery: Recovery) -> None:
+    def __init__(self, view: memoryview, recovery: Recovery, finished: bool) -> None:
         self._view = view
         self._recovery = recovery
+        self._finished = finished
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._declared: set[int] = set()
@@ -229,6 +235,8 @@ class _Copy:
                     self._copy_message(writer, item)
             elif isinstance(item, Damage):
                 recovery.damaged_bytes += item.length
+                if item.offset + item.length == len(self._view):
+                    recovery.torn_bytes = item.length
                 recovery.reasons.append(f"{item.length} bytes at {item.offset}: {item.reason}")
             elif isinstance(item, Schema | Channel):
                 self._declare(writer, item)
@@ -278,7 +286,9 @@ class _Copy:
         self._has_summary |= item.name == "hilrig.summary"
         if item.name.startswith("hilrig.loss"):
             for name in self._notes:
-                self._notes[name] += int(item.metadata.get(name.removeprefix("lost_"), "0"))
+                # Metadata has no checksum: a figure may be none.
+                figure = item.metadata.get(name.removeprefix("lost_"), "")
+                self._notes[name] += int(figure) if figure.isdecimal() else 0
         writer.add_metadata(item.name, item.metadata)
 
     def _last_words(self, ours: bool) -> dict[str, dict[str, str]]:
@@ -290,6 +300,7 @@ class _Copy:
                 "chunks": str(recovery.chunks),
                 "damaged_chunks": str(recovery.damaged_chunks),
                 "damaged_bytes": str(recovery.damaged_bytes),
+                "torn_bytes": str(recovery.torn_bytes),
                 "orphans": str(recovery.orphans),
                 "software_version": version("hilrig"),
             }
@@ -297,7 +308,7 @@ class _Copy:
         if ours and not self._has_summary:
             words["hilrig.summary"] = {
                 "ended": "recovered",
-                "reason": "the recorder did not finish this file; its last second may be missing",
+                "reason": _DAMAGED if self._finished else _UNFINISHED,
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),
                 **{name: str(count) for name, count in self._notes.items()},

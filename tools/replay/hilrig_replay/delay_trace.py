@@ -34,7 +34,7 @@ def delay_trace(run: Run) -> TraceDelay:
 
     report = measure(run, count)
     # A command that was lost is missed twice: in its sender's numbers, and behind its sample.
-    missing = max(report.lost.transport + report.lost.recorder, effective - report.samples)
+    missing = max(report.lost.total, effective - report.samples)
     if missing:
         raise InputError(f"{run.path}: no trace of delays: it has gaps, {missing} messages are missing")
     if report.samples < ENOUGH:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.columns import Rows
 from hilrig_replay.distribution import Statistics, median
-from hilrig_replay.run import Run
+from hilrig_replay.run import Losses, Run
 from hilrig_replay.samples import STAGES
 from hilrig_replay.spool import Spool
 
@@ -31,7 +31,16 @@ class Lost:
     """Messages that are missing in a recording, count."""
 
     transport: int
+    """On the way to the recorder."""
     recorder: int
+    """In the recorder."""
+    file: int = 0
+    """In the file, which was damaged."""
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.transport + self.recorder + self.file
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +131,11 @@ class FitnessWatch:
 
     def lost(self) -> Lost:
         """What is missing: as the recorder counted, or as the senders' numbers show, whichever is more."""
-        said = self._run.losses
-        transport = max(self._gaps - (said.recorder if said else 0), said.transport if said else 0)
-        return Lost(transport, said.recorder if said else 0)
+        said = self._run.losses or Losses(0, 0)
+        untold = max(0, self._gaps - said.transport - said.recorder)
+        if self._run.damaged:
+            return Lost(said.transport, said.recorder, max(said.file, untold))
+        return Lost(said.transport + untold, said.recorder)
 
     def reasons(self, unmatched: int) -> Iterator[str]:
         """Why the recording is not fit, once all of it was taken in, `unmatched` samples apart; none: it is."""
@@ -135,6 +146,8 @@ class FitnessWatch:
             yield f"{_count(lost.transport, 'message')} lost on the way to the recorder"
         if lost.recorder:
             yield f"{_count(lost.recorder, 'message')} lost in the recorder"
+        if lost.file:
+            yield f"{_count(lost.file, 'message')} lost in the file, which was damaged"
         if run.losses is None:
             yield "the recording does not say whether something was lost (it did not end in order)"
         if overruns:

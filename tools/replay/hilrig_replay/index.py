@@ -27,7 +27,7 @@ from hilrig_replay.run import open_run
 from hilrig_runtime.errors import HilrigError, InputError
 
 INDEX_NAME: Final = ".hilrig-index.json"
-INDEX_VERSION: Final = 2
+INDEX_VERSION: Final = 3
 VERDICT_SUFFIX: Final = ".verified"
 """What `hilrig verify` found stands beside a recording, in a file of the recording's name and this."""
 RECORDING: Final = "recording"
@@ -63,6 +63,8 @@ class RunEntry:
     reason: str = ""
     lost_transport: int = 0
     lost_recorder: int = 0
+    lost_file: int = 0
+    """Messages that were in it before it was damaged."""
     overruns: int = 0
     missed_steps: int = 0
     clock_steps: int = 0
@@ -270,6 +272,7 @@ def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
     if statistics is None:
         raise _UnusableError("it has no statistics; `hilrig recover` makes them")
     session, summing_up = (_metadata(stream, places.get(name)) for name in ("hilrig.session", "hilrig.summary"))
+    held = int(summing_up.get("messages", 0)) if "hilrig.recovered" in places else 0
     entry = _described(blank, session)
     return replace(
         entry,
@@ -280,6 +283,7 @@ def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
         reason=summing_up.get("reason", ""),
         lost_transport=int(summing_up.get("lost_transport", 0)),
         lost_recorder=int(summing_up.get("lost_recorder", 0)),
+        lost_file=max(0, held - statistics.message_count),
         overruns=int(summing_up.get("overruns", 0)),
         missed_steps=int(summing_up.get("missed_steps", 0)),
         clock_steps=int(summing_up.get("clock_steps", 0)),

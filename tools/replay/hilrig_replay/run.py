@@ -35,6 +35,8 @@ class Losses:
     """Messages that never reached the recorder, count."""
     recorder: int
     """Messages that reached it and could not be written, count."""
+    file: int = 0
+    """Messages that were in the file before it was damaged, and could not be recovered, count."""
 
 
 class Run:
@@ -124,7 +126,17 @@ class Run:
     def losses(self) -> Losses | None:
         """What the recorder counted as lost; None: the file does not say it."""
         transport, recorder = self.number("summary", "lost_transport"), self.number("summary", "lost_recorder")
-        return None if transport is None or recorder is None else Losses(transport, recorder)
+        if transport is None or recorder is None:
+            return None
+        held = self.number("summary", "messages") or 0
+        missing = max(0, held - sum(self.file.counts.values())) if self.damaged else 0
+        return Losses(transport, recorder, missing)
+
+    @property
+    def damaged(self) -> bool:
+        """Whether it was saved from damage in its middle, so that messages between others may be missing."""
+        not_whole = self.number("recovered", "damaged_bytes") or 0
+        return not_whole > (self.number("recovered", "torn_bytes") or 0) or bool(self.number("recovered", "orphans"))
 
     @property
     def recovered(self) -> bool:

@@ -100,6 +100,8 @@ def print_report(report: "LatencyReport") -> None:
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
     lost = f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
+    if report.lost.file:
+        lost += f", {report.lost.file} in the file"
     console.print(lost if report.loop_ms is None else jitter + lost)
     for finding in report.findings:
         console.print(Text(f"• {finding.text}"))

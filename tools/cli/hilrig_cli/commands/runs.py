@@ -107,7 +107,7 @@ def _sort_key(sort: SortKey) -> "Callable[[RunEntry], Any]":
         SortKey.SIZE: lambda entry: entry.size,
         SortKey.P50: lambda entry: entry.loop_p50_ms or 0.0,
         SortKey.P99: lambda entry: entry.loop_p99_ms or 0.0,
-        SortKey.LOST: lambda entry: entry.lost_transport + entry.lost_recorder,
+        SortKey.LOST: _lost,
     }
     return keys[sort]
 
@@ -166,7 +166,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     table.add_column("fit", no_wrap=True)
     table.add_column("ended")
     for entry in entries:
-        lost = entry.lost_transport + entry.lost_recorder
+        lost = _lost(entry)
         begun = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
         table.add_row(
             Path(entry.path).name.removesuffix(".mcap"),
@@ -183,6 +183,10 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     console.print(table)
     if total > len(entries):
         Console(stderr=True).print(f"{total - len(entries)} more: --limit 0 shows all")
+
+
+def _lost(entry: "RunEntry") -> int:
+    return entry.lost_transport + entry.lost_recorder + entry.lost_file
 
 
 def _ending(entry: "RunEntry") -> str:

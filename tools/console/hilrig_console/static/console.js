@@ -336,7 +336,7 @@ function showRuns(list) {
       row.append(made("td", {class: "long", colspan: "8"}, run.trouble), links);
       return row;
     }
-    const lost = run.lost_transport + run.lost_recorder;
+    const lost = run.lost_transport + run.lost_recorder + run.lost_file;
     const fit = made("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
     const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1)];
     row.append(made("td", {}, run.controller || "nobody"), ...figures.map((text) => made("td", {class: "n"}, text)),
