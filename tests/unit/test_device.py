@@ -174,6 +174,79 @@ def test_refusals_are_told_once_a_second_with_their_number(bench: Bench) -> None
     assert "(67 times)" in refusals[1]
 
 
+def test_a_host_that_is_refused_with_a_new_connection_each_time_is_told_of_once_a_second(bench: Bench) -> None:
+    bench.write(bench.connect(), 0, 5)
+    for number in range(100):
+        bench.clock.advance(15 * MS)
+        other = bench.connect(host="10.0.0.2", port=number)
+        with pytest.raises(ModbusError):
+            bench.write(other, 0, 6)
+        bench.device.disconnect(other, "done")
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert len(refusals) == 2
+    assert "10.0.0.2:67 may not write" in refusals[1]
+    assert "(67 times)" in refusals[1]
+
+
+def one_shot(bench: Bench, port: int, host: str = "10.0.0.1") -> int:
+    """A connection for one write; the exception that this gets, or 0."""
+    client = bench.connect(host=host, port=port)
+    try:
+        bench.write(client, 0, port)
+    except ModbusError as error:
+        return error.code
+    finally:
+        bench.device.disconnect(client, "it closed the connection")
+    return 0
+
+
+def test_a_chain_of_one_shot_connections_is_told_of_once_a_second(bench: Bench) -> None:
+    for port in range(100):
+        one_shot(bench, port)
+        bench.wait(20)
+    told = [event.text for event in bench.events if event.kind in (Event.LEASE_GRANTED, Event.LEASE_LOST)]
+    assert told == [
+        "10.0.0.1:0 holds rig1",
+        "10.0.0.1:0 holds rig1 no more: it closed the connection",
+        "10.0.0.1:50 holds rig1 (50 times)",
+        "10.0.0.1:50 holds rig1 no more: it closed the connection",
+    ]
+
+
+def test_who_stays_is_told_though_his_host_was_told_of_a_moment_ago(bench: Bench) -> None:
+    one_shot(bench, 1)
+    stays = bench.connect(port=2)
+    bench.write(stays, 0, 5)
+    bench.wait(999)
+    assert bench.kinds()[-1] == "LEASE_LOST"
+    bench.wait(1)
+    assert bench.events[-1].text == "10.0.0.1:2 holds rig1"
+    bench.wait(1000)
+    assert bench.kinds().count("LEASE_GRANTED") == 2
+    bench.device.disconnect(stays, "it closed the connection")
+    assert bench.kinds()[-1] == "LEASE_LOST"
+
+
+def test_what_a_teacher_takes_is_told_in_any_case(bench: Bench) -> None:
+    one_shot(bench, 1)
+    bench.write(bench.connect(port=2), 0, 5)
+    bench.device.release("by the teacher")
+    assert [event.text for event in bench.events[-2:]] == [
+        "10.0.0.1:2 holds rig1",
+        "10.0.0.1:2 holds rig1 no more: by the teacher",
+    ]
+
+
+def test_two_hosts_that_take_turns_do_not_make_a_session_of_each_write(bench: Bench) -> None:
+    codes = set()
+    for number in range(150):
+        codes.add(one_shot(bench, number, host=f"10.0.0.{1 + number % 2}"))
+        bench.wait(20)
+    assert codes == {0, 6}
+    assert bench.kinds().count("SESSION_START") == 4
+    assert any("took it less than a second ago" in event.text for event in bench.events)
+
+
 def test_the_lease_ends_with_the_connection(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)

@@ -14,7 +14,7 @@ from device_bench import MS, Bench
 from hilrig_modbus_edge.client import Client
 from hilrig_modbus_edge.pdu import answer
 
-WATCHDOG_MS, LEASE_MS, GRACE_MS = 1000, 5000, 5000
+WATCHDOG_MS, LEASE_MS, GRACE_MS, HANDOVER_MS = 1000, 5000, 5000, 1000
 WORD = st.integers(0, 0xFFFF)
 
 
@@ -30,6 +30,7 @@ class Model:
     tripped: bool = False
     heard_ms: dict[int, int] = field(default_factory=dict)
     session_host: str | None = None
+    handover_due_ms: int = 0
     gone_ms: int = 0
 
     def pass_time(self) -> None:
@@ -49,6 +50,10 @@ class Model:
     def write(self, client: Client) -> bool:
         """Whether a right write of this client is done."""
         if self.holder is None:
+            if self.session_host not in (None, client.host.address):
+                if self.now_ms < self.handover_due_ms:
+                    return False
+                self.handover_due_ms = self.now_ms + HANDOVER_MS
             self.holder = client
             if self.session_host != client.host.address:
                 self.timeout_ms, self.echo = WATCHDOG_MS, 0

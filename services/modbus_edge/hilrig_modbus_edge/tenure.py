@@ -13,18 +13,18 @@ from pymodbus.constants import ExcCodes
 from hilrig_modbus_edge.client import Client
 from hilrig_modbus_edge.commander import Commander
 from hilrig_modbus_edge.errors import ModbusError
-from hilrig_modbus_edge.journal import Journal, times
+from hilrig_modbus_edge.handover import Handover
+from hilrig_modbus_edge.journal import Journal
 from hilrig_modbus_edge.lease import Lease
 from hilrig_modbus_edge.session import Session
 from hilrig_modbus_edge.settings import MS, DeviceSettings, Outlet
-from hilrig_modbus_edge.throttle import Throttle
 from hilrig_modbus_edge.watchdog import Watchdog
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.session_id import session_id
 from hilrig_schemas import Event, LeaseStatus
 
-REFUSAL_PERIOD_NS: Final = 1_000 * MS
-"""A client whose writes are refused is told of once in so long."""
+HANDOVER_PERIOD_NS: Final = 1_000 * MS
+"""From host to host a rig goes once in so long: two that take turns with each write would make a recording of each."""
 
 
 class Tenure:
@@ -52,9 +52,11 @@ class Tenure:
         self._commander = commander
         self._journal = journal
         self._letters = random.SystemRandom() if letters is None else letters
-        self._throttle = Throttle(REFUSAL_PERIOD_NS)
+        self._handover = Handover(rig, journal)
         self._session_count = 0
         self._last_writer = ""
+        self._handover_due_ns = 0
+        """When another host may end a session again, ns, monotonic clock."""
         self._begin_session = begin_session
 
     def accept(self, client: Client, now_ns: int) -> None:
@@ -104,13 +106,14 @@ class Tenure:
     def disconnected(self, client: Client, reason: str) -> None:
         """A connection ended; the lease ends with it, the torque stands until the watchdog trips."""
         if self.lease.holder is client:
-            self._lose_lease(reason)
+            self._lose_lease(reason, of_itself=True)
 
     def check(self, now_ns: int) -> None:
         """Trip, lose the lease, end the session: what has become due; ns, monotonic clock."""
         silent_ns = self.watchdog.check(now_ns)
         if silent_ns:
             self._trip(silent_ns, now_ns)
+        self._handover.check(now_ns)
         if self.lease.expired(now_ns):
             self._lose_lease(f"no request for {self._settings.lease_ns / 1e9:g} s")
         if self.session is not None and self.session.over(now_ns, self._settings.grace_ns):
@@ -157,32 +160,29 @@ class Tenure:
         return "" if holder is None else holder.address
 
     def _take_lease(self, client: Client, now_ns: int) -> None:
+        session = self.session
         if not client.may_write:
-            self._refuse(
-                client,
-                now_ns,
-                "its certificate has not the role operator, so it may read only",
-                ExcCodes.ILLEGAL_FUNCTION,
-            )
+            reason = "its certificate has not the role operator, so it may read only"
+            self._refuse(client, now_ns, reason, ExcCodes.ILLEGAL_FUNCTION)
         if now_ns < client.barred_until_ns:
             self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
-        if not self.lease.take(client):
+        if self.lease.holder is not None:
             self._refuse(client, now_ns, f"{self._holder} holds it", ExcCodes.DEVICE_BUSY)
+        if session is not None and session.host != client.host.address:
+            if now_ns < self._handover_due_ns:
+                self._refuse(client, now_ns, f"{session.host} took it less than a second ago", ExcCodes.DEVICE_BUSY)
+            self._handover_due_ns = now_ns + HANDOVER_PERIOD_NS
+            self._end_session(f"{client.address} took the rig")
+        self.lease.take(client)
         self._last_writer = client.address
-        self._open_session(client)
-        text = f"{client.address} holds {self._rig}"
-        self._journal.tell_of_controller(Event.LEASE_GRANTED, Event.INFO, text, client.address)
+        self._go_on_with_session(client)
+        self._handover.taken(client, now_ns)
 
     def _refuse(self, client: Client, now_ns: int, reason: str, code: ExcCodes) -> None:
-        count = self._throttle.count(client, now_ns)
-        if count:
-            text = f"{client.address} may not write to {self._rig}: {reason}{times(count)}"
-            self._journal.tell_of_controller(
-                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=self._holder
-            )
+        self._handover.refused(client, reason, self._holder, now_ns)
         raise ModbusError(code)
 
-    def _lose_lease(self, reason: str) -> None:
+    def _lose_lease(self, reason: str, *, of_itself: bool = False) -> None:
         holder = self.lease.release()
         if holder is None:
             return
@@ -191,15 +191,12 @@ class Tenure:
         if not self._commander.moves:
             # There is nothing to stop.
             self.watchdog.rest()
-        text = f"{holder.address} holds {self._rig} no more: {reason}"
-        self._journal.tell_of_controller(Event.LEASE_LOST, Event.INFO, text, holder.address, reason=reason)
+        self._handover.left(holder, reason, of_itself=of_itself)
 
-    def _open_session(self, client: Client) -> None:
+    def _go_on_with_session(self, client: Client) -> None:
         if self.session is not None:
-            if self.session.host == client.host.address:
-                self.session.gone_ns = None
-                return
-            self._end_session(f"{client.address} took the rig")
+            self.session.gone_ns = None
+            return
         self._session_count += 1
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._letters)
