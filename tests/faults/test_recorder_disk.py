@@ -181,3 +181,44 @@ def test_a_folder_that_can_not_be_written_is_one_line_and_exit_3(tmp_path: Path)
     assert len(errors) == 1
     assert "recordings can't be written there" in errors[0]
     assert "Traceback" not in recorder.log.read_text()
+
+
+@pytest.mark.rig
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere an open file can't be moved or deleted")
+@pytest.mark.parametrize("what", ["file moved", "file deleted", "folder deleted"])
+def test_a_recording_that_is_moved_or_deleted_while_it_is_written_goes_on_in_a_next_file(
+    tmp_path: Path, what: str
+) -> None:
+    config, lab = make_lab(tmp_path)
+    elsewhere = tmp_path / "elsewhere.mcap"
+    with sending(lab, ["rig1"]) as senders:
+        with RecorderProcess(config) as recorder:
+            wait_ready(lab, recorder)
+            troubles = Troubles(lab)
+            try:
+                senders.begin("rig1")
+                eventually(lambda: holds_messages(lab, "rig1"))
+                [part] = files_of(lab, "rig1", "*.part")
+                if what == "file moved":
+                    part.rename(elsewhere)
+                elif what == "file deleted":
+                    part.unlink()
+                else:
+                    shutil.rmtree(lab.recorder.folder)
+                eventually(lambda: files_of(lab, "rig1", "*.2.mcap.part"))
+                eventually(lambda: any("moved or deleted while it was written" in text for text in troubles.heard))
+                sent = senders.count("rig1")
+                eventually(lambda: senders.count("rig1") > sent + 100)
+                senders.end("rig1")
+                [path] = eventually(lambda: files_of(lab, "rig1"))
+            finally:
+                troubles.close()
+        assert metadata(path)["hilrig.session"]["previous"] == part.name.removesuffix(".part")
+        found = recorded([path])
+        if what == "file moved":
+            # Finished where it is now; the two together have everything.
+            assert metadata(elsewhere)["hilrig.summary"]["ended"] == "continued"
+            found += recorded([elsewhere])
+            assert set(senders.sent["rig1"]) <= set(found)
+        assert len(found) == len(set(found))
+    assert "Traceback" not in recorder.log.read_text()

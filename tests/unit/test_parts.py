@@ -53,3 +53,10 @@ def test_what_is_older_than_what_was_looked_at_is_not_recorded_again() -> None:
         CHANNEL_OF_TOPIC["traffic"]: 940,
     }
     assert set(horizon_of(Tail("", set(), {}, 0)).values()) == {0}
+
+
+def test_a_file_that_was_moved_away_keeps_its_number(tmp_path: Path) -> None:
+    part = next_part(tmp_path, SESSION, f"{SESSION}.2.mcap")
+    assert (part.number, part.path.name) == (3, f"{SESSION}.3.mcap")
+    assert part.previous is not None
+    assert part.previous.name == f"{SESSION}.2.mcap"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from hilrig_recorder.writer import RunWriter
+from hilrig_recorder.writer import MovedError, RunWriter
 from hilrig_runtime.clock import Clock
 
 LOOK_PERIOD_NS: Final = 100_000_000
@@ -126,8 +126,15 @@ class Disk:
             writer.publish(durably=not self._hurry.is_set())
         except OSError as error:
             writer.close()
-            logger.error("%s: can't be finished, and waits to be recovered: %s", writer.part, error.strerror)
+            logger.error("%s", what_became_of(writer, error))
             self._on_ended(writer, error)
         else:
             logger.info("recorded %s", writer.path)
             self._on_ended(writer, None)
+
+
+def what_became_of(writer: RunWriter, error: OSError) -> str:
+    """Of a file that could not get its name, for people."""
+    if isinstance(error, MovedError):
+        return f"{writer.path}: {error.strerror}"
+    return f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}"

@@ -11,12 +11,12 @@ from mcap.records import Metadata
 
 from hilrig_recorder.channels import SCHEMA_VERSION
 from hilrig_recorder.chunk import compressor
-from hilrig_recorder.disk import Disk
+from hilrig_recorder.disk import Disk, what_became_of
 from hilrig_recorder.parts import NextPart, horizon_of, next_part, tail_of_session
 from hilrig_recorder.recording import SECOND_NS, Recording, Sink, Tally
 from hilrig_recorder.run_file import RunFile
 from hilrig_recorder.space import MIB, Space
-from hilrig_recorder.writer import RunWriter
+from hilrig_recorder.writer import MovedError, RunWriter
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import RecorderConfig
 from hilrig_schemas import Event, RigConfig
@@ -123,9 +123,13 @@ class Files:
         return {file.recording.rig for file in self._files.values() if not file.configurations}
 
     def fail(self, writer: RunWriter, error: OSError) -> None:
-        """End the file of `writer`, which the disk let down."""
+        """End the file of `writer`, which the disk let down, or which is not any more where it was."""
         for file in self._files.values():
-            if file.writer is writer:
+            if file.writer is not writer:
+                continue
+            if isinstance(error, MovedError):
+                file.moved = True
+            else:
                 file.fail(error)
 
     def ended(self, writer: RunWriter, error: OSError | None) -> None:
@@ -133,8 +137,7 @@ class Files:
         recording = self._ending.pop(writer)
         self._bytes_closed += writer.size
         if error is not None:
-            text = f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}"
-            self._report(recording, text)
+            self._report(recording, what_became_of(writer, error))
 
     def tick(self, now_ns: int) -> None:
         """Begin next files and end those that failed; some times a second."""
@@ -148,7 +151,7 @@ class Files:
                 self._end_failed(file, file.failure)
             elif self._space.full:
                 self._end_failed(file, OSError(errno.ENOSPC, "the disk is nearly full"))
-            elif self._is_due(file, now_ns):
+            elif file.moved or self._is_due(file, now_ns):
                 self._rotate(file)
 
     def release(self) -> None:
@@ -197,10 +200,12 @@ class Files:
 
     def _rotate(self, file: RunFile) -> None:
         recording = file.recording
-        following = self._open(recording, next_part(self.folder / recording.rig, recording.session))
+        before = file.writer.path.name
+        following = self._open(recording, next_part(self.folder / recording.rig, recording.session, before))
         if following is None:
             # The old file goes on; the trouble was told.
             file.opened_ns = self._clock.monotonic_ns()
+            file.moved = False
             return
         recording.sink = following
         self._finish(file, "continued", f"the session goes on in {following.writer.path.name}")

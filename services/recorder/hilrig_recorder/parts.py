@@ -26,14 +26,17 @@ class NextPart:
     """The one before; None: this is the first."""
 
 
-def next_part(folder: Path, session: str) -> NextPart:
-    """The file after the last of a session, whole or unfinished; the first may be deleted already."""
+def next_part(folder: Path, session: str, after: str = "") -> NextPart:
+    """The file after the last of a session, whole or unfinished, and behind the file of the name `after`.
+
+    Those before may be deleted or moved away already.
+    """
     try:
         names = [path.name for path in folder.iterdir()]
     except OSError:
         # Not there yet; what else may be wrong with it shows when the file is opened.
         names = []
-    number = max((_number(name, session) for name in names), default=0)
+    number = max(_number(name, session) for name in (*names, after))
     previous = folder / file_name(session, number) if number else None
     return NextPart(folder / file_name(session, number + 1), number + 1, previous)
 

@@ -28,6 +28,8 @@ class RunFile:
         self.opened_ns = clock.monotonic_ns()
         self.failure: OSError | None = None
         """What the disk said when it did not take something; None: it took everything."""
+        self.moved = False
+        """Whether somebody moved or deleted it."""
         self.sources: set[tuple[str, int]] = set()
         """Runs of services that contribute, by name and incarnation."""
         self.configurations: set[int] = set()

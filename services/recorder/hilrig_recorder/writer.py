@@ -24,6 +24,13 @@ from hilrig_recorder.summary import Contents, encoded
 LIBRARY: Final = "hilrig"
 
 
+class MovedError(OSError):
+    """The file is not any more where it was: somebody moved or deleted it, or its folder, while it was written."""
+
+    def __init__(self, part: Path) -> None:
+        super().__init__(errno.ENOENT, "it was moved or deleted while it was written", str(part))
+
+
 class RunWriter:
     """Writes one recording; use it from one thread, and `sync` from any one other, which may `finish` it too.
 
@@ -187,12 +194,26 @@ class RunWriter:
     # -- the disk ---------------------------------------------------------------------------------------------------
 
     def sync(self) -> None:
-        """Make what was written survive a power cut."""
+        """Make what was written survive a power cut.
+
+        Raises:
+            MovedError: under its name it would not be found; what is written goes on to where it is now.
+        """
         os.fsync(self._file.fileno())
+        self._find()
+
+    def _find(self) -> None:
+        try:
+            is_there = os.path.samestat(self.part.stat(), os.fstat(self._file.fileno()))
+        except FileNotFoundError:
+            is_there = False
+        if not is_there:
+            raise MovedError(self.part)
 
     def publish(self, *, durably: bool = True) -> Path:
         """Give the finished file its name, so that it survives a power cut; the path it has now."""
         try:
+            self._find()
             if durably:
                 self.sync()
         finally:
