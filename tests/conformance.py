@@ -37,10 +37,15 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.1", "01 of a coil that is not there is an illegal address", "01 00 01 00 01", "81 02"),
     Rule("AP 6.1", "01 across the end is an illegal address", "01 00 00 00 02", "81 02"),
     Rule("AP 6.1", "quantity is checked before address", "01 FF FF 00 00", "81 03"),
+    Rule("AP 6.1", "01 that is too short is an illegal value", "01 00 00 00", "81 03"),
+    Rule("AP 6.1", "01 that is too long is an illegal value", "01 00 00 00 01 00", "81 03"),
+    Rule("AP 6.1", "01 at address 65535 does not wrap", "01 FF FF 00 02", "81 02"),
     # Read Discrete Inputs
     Rule("AP 6.2", "02 pads the last byte with zeros", "02 00 05 00 03", "02 01 00"),
     Rule("AP 6.2", "02 with quantity 0 is an illegal value", "02 00 00 00 00", "82 03"),
     Rule("AP 6.2", "02 with quantity 2001 is an illegal value", "02 00 00 07 D1", "82 03"),
+    Rule("AP 6.2", "02 with quantity 2000 is legal: the address is what is wrong", "02 00 00 07 D0", "82 02"),
+    Rule("AP 6.2", "02 that is nothing but its code is an illegal value", "02", "82 03"),
     Rule("AP 6.2", "02 across the end is an illegal address", "02 00 0F 00 02", "82 02"),
     Rule("AP 6.2", "02 at address 65535 is an illegal address", "02 FF FF 00 01", "82 02"),
     # Read Holding Registers
@@ -64,6 +69,8 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.4", "04 reads input registers", "04 00 00 00 01", "04 02 00 01"),
     Rule("AP 6.4", "04 with quantity 0 is an illegal value", "04 00 00 00 00", "84 03"),
     Rule("AP 6.4", "04 with quantity 126 is an illegal value", "04 00 00 00 7E", "84 03"),
+    Rule("AP 6.4", "04 with quantity 125 is legal: the address is what is wrong", "04 00 00 00 7D", "84 02"),
+    Rule("AP 6.4", "04 at address 65535 does not wrap", "04 FF FF 00 02", "84 02"),
     Rule("AP 6.4", "04 across the map's end is an illegal address", "04 00 23 00 02", "84 02"),
     # Write Single Coil
     Rule("AP 6.5", "05 echoes the request", "05 00 00 FF 00", "05 00 00 FF 00"),
@@ -72,12 +79,16 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.5", "05 with FFFF is illegal", "05 00 00 FF FF", "85 03"),
     Rule("AP 6.5", "value is checked before address", "05 00 09 12 34", "85 03"),
     Rule("AP 6.5", "05 of a coil that is not there is an illegal address", "05 00 01 FF 00", "85 02"),
+    Rule("AP 6.5", "05 at address 65535 is an illegal address", "05 FF FF FF 00", "85 02"),
+    Rule("AP 6.5", "05 that is too long is an illegal value", "05 00 00 FF 00 00", "85 03"),
     Rule("AP 6.5", "an illegal value changes nothing", "01 00 00 00 01", "01 01 00", ("05 00 00 00 01",)),
     # Write Single Register
     Rule("AP 6.6", "06 echoes the request", "06 00 03 FF FF", "06 00 03 FF FF"),
     Rule("AP 6.6", "06 of a register that the rig owns is an illegal address", "06 00 04 00 01", "86 02"),
     Rule("AP 6.6", "06 of a register that is not there is an illegal address", "06 00 08 00 01", "86 02"),
     Rule("AP 6.6", "06 that is too long is an illegal value", "06 00 00 00 01 00", "86 03"),
+    Rule("AP 6.6", "06 that is too short is an illegal value", "06 00 00 00", "86 03"),
+    Rule("AP 6.6", "06 at address 65535 is an illegal address", "06 FF FF 00 01", "86 02"),
     # Write Multiple Coils
     Rule("AP 6.11", "15 answers address and quantity", "0F 00 00 00 01 01 01", "0F 00 00 00 01"),
     Rule("AP 6.11", "15 ignores the padding of its last byte", "01 00 00 00 01", "01 01 00", ("0F 00 00 00 01 01 FE",)),
@@ -93,6 +104,8 @@ RULES: tuple[Rule, ...] = (
         "AP 6.11", "15 whose byte count is not its quantity's is an illegal value", "0F 00 00 00 01 02 01 00", "8F 03"
     ),
     Rule("AP 6.11", "15 with less data than it says is an illegal value", "0F 00 00 00 09 02 01", "8F 03"),
+    Rule("AP 6.11", "15 with more data than it says is an illegal value", "0F 00 00 00 01 01 01 00", "8F 03"),
+    Rule("AP 6.11", "15 at address 65535 is an illegal address", "0F FF FF 00 01 01 01", "8F 02"),
     Rule("AP 6.11", "15 across the end is an illegal address", "0F 00 00 00 02 01 03", "8F 02"),
     # Write Multiple Registers
     Rule("AP 6.12", "16 answers address and quantity", "10 00 00 00 02 04 00 0A 01 02", "10 00 00 00 02"),
@@ -112,6 +125,9 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule("AP 6.12", "16 with less data than it says is an illegal value", "10 00 00 00 02 04 00 0A 01", "90 03"),
     Rule("AP 6.12", "16 with more data than it says is an illegal value", "10 00 00 00 01 02 00 0A 01 02", "90 03"),
+    Rule("AP 6.12", "16 at address 65535 does not wrap", "10 FF FF 00 02 04 00 0A 01 02", "90 02"),
+    Rule("AP 6.12", "16 across a gap is an illegal address", "10 00 63 00 02 04 00 0A 01 02", "90 02"),
+    Rule("AP 6.12", "quantity and byte count are checked before address", "10 FF FF 00 02 03 00 0A 01", "90 03"),
     Rule(
         "AP 6.12",
         "16 that touches a register of the rig is an illegal address",
@@ -123,6 +139,22 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.16", "22 echoes the request", "16 00 00 00 F2 00 25", "16 00 00 00 F2 00 25"),
     Rule("AP 6.16", "22 of a register of the rig is an illegal address", "16 00 04 00 F2 00 25", "96 02"),
     Rule("AP 6.16", "22 that is too short is an illegal value", "16 00 00 00 F2 00", "96 03"),
+    Rule("AP 6.16", "22 that is too long is an illegal value", "16 00 00 00 F2 00 25 00", "96 03"),
+    Rule("AP 6.16", "22 of a register that is not there is an illegal address", "16 00 08 00 F2 00 25", "96 02"),
+    Rule(
+        "AP 6.16",
+        "22 with an AND mask of ones leaves the register as it is",
+        "03 00 00 00 01",
+        "03 02 12 34",
+        ("06 00 00 12 34", "16 00 00 FF FF FF FF"),
+    ),
+    Rule(
+        "AP 6.16",
+        "22 with an AND mask of zeros writes the OR mask",
+        "03 00 00 00 01",
+        "03 02 AB CD",
+        ("06 00 00 12 34", "16 00 00 00 00 AB CD"),
+    ),
     # Read/Write Multiple Registers
     Rule("AP 6.17", "23 reads what it wrote", "17 00 00 00 01 00 00 00 01 02 00 2A", "17 02 00 2A"),
     Rule("AP 6.17", "23 reading 0 registers is an illegal value", "17 00 00 00 00 00 00 00 01 02 00 2A", "97 03"),
@@ -134,6 +166,25 @@ RULES: tuple[Rule, ...] = (
         "97 02",
     ),
     Rule("AP 6.17", "23 writing 0 registers is an illegal value", "17 00 00 00 01 00 00 00 00 00", "97 03"),
+    Rule("AP 6.17", "23 that is too short is an illegal value", "17 00 00 00 01 00 00 00 01", "97 03"),
+    Rule(
+        "AP 6.17",
+        "23 with more data than it says is an illegal value",
+        "17 00 00 00 01 00 00 00 01 02 00 2A 00",
+        "97 03",
+    ),
+    Rule(
+        "AP 6.17",
+        "23 reading a register that is not there is an illegal address",
+        "17 00 08 00 01 00 00 00 01 02 00 2A",
+        "97 02",
+    ),
+    Rule(
+        "AP 6.17",
+        "23 writing a register that is not there is an illegal address",
+        "17 00 00 00 01 00 08 00 01 02 00 2A",
+        "97 02",
+    ),
     Rule(
         "AP 6.17",
         "23 writing 122 registers is an illegal value",
@@ -168,6 +219,23 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.21", "43/14 of an object that is not there is an illegal address", "2B 0E 04 63", "AB 02"),
     Rule("AP 6.21", "43/14 with another read code is an illegal value", "2B 0E 05 00", "AB 03"),
     Rule("AP 6.21", "43/14 with read code 0 is an illegal value", "2B 0E 00 00", "AB 03"),
+    Rule(
+        "AP 6.21", "43/14 of an optional object that the device has not is an illegal address", "2B 0E 04 03", "AB 02"
+    ),
+    Rule(
+        "AP 6.21",
+        "43/14 streams from the object that it is asked for",
+        "2B 0E 02 05",
+        "2B 0E 02 82 00 00 01 05 05 53 43 41 52 41",
+    ),
+    Rule(
+        "AP 6.21",
+        "43/14 asked for more than its conformity level gives what there is",
+        "2B 0E 03 05",
+        "2B 0E 03 82 00 00 01 05 05 53 43 41 52 41",
+    ),
+    Rule("AP 6.21", "43/14 that is too short is an illegal value", "2B 0E 01", "AB 03"),
+    Rule("AP 6.21", "43/14 that is too long is an illegal value", "2B 0E 01 00 00", "AB 03"),
     Rule("AP 6.19", "43 with another MEI type is an illegal function", "2B 0D 01 00", "AB 01"),
     # Function codes
     Rule("AP 4.1", "function 0 is not valid", "00", "80 01"),
@@ -186,6 +254,11 @@ NAMED: tuple[tuple[str, str, str], ...] = (
         "AP 6.21",
         "the basic stream has vendor, product and revision",
         "test_identification_names_vendor_product_and_revision",
+    ),
+    (
+        "AP 6.21",
+        "a stream from an object that is not there begins with the first",
+        "test_identification_from_an_object_that_is_not_there_begins_with_the_first",
     ),
     (
         "AP 7",
@@ -213,6 +286,7 @@ NAMED: tuple[tuple[str, str, str], ...] = (
         "hundreds of them too",
         "test_hundreds_of_requests_at_once_are_answered_in_order",
     ),
+    ("AP 4.1", "a PDU has 1 to 253 bytes", "test_the_shortest_and_the_longest_request_are_answered"),
     ("TG 4.3.2", "a request may come in many segments", "test_a_request_may_come_byte_by_byte"),
     (
         "TG 4.3.2",

@@ -6,6 +6,7 @@ Each row of `RULES` is a request's PDU and what must come back; `docs/modbus-con
 import gc
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,18 @@ def test_identification_names_vendor_product_and_revision(client: RawClient) -> 
         rest = rest[2 + size :]
     assert list(objects) == [0, 1, 2]
     assert objects[0] == "hilrig"
+
+
+def test_identification_from_an_object_that_is_not_there_begins_with_the_first(client: RawClient) -> None:
+    for code in (1, 2, 3):
+        whole = client.ask(bytes((0x2B, 0x0E, code, 0x00)))
+        assert client.ask(bytes((0x2B, 0x0E, code, 0x63))) == whole
+
+
+def test_the_shortest_and_the_longest_request_are_answered(client: RawClient) -> None:
+    assert client.ask("07").hex() == "8701"
+    assert client.ask(b"\x64" + bytes(252)).hex() == "e401"
+    assert client.ask(b"\x10\x00\x00\x00\x7b\xf6" + bytes(246)).hex() == "9002"
 
 
 @pytest.mark.parametrize("unit", [0, 1, 255])
@@ -167,6 +180,9 @@ def test_answers_are_not_held_back(client: RawClient) -> None:
     [connection] = [c for c in _sockets() if c.getpeername() == client.socket.getsockname()]
     assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
     assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    if sys.platform == "linux":
+        # Else an answer on its way to a host without power is sent again for a quarter of an hour.
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 11_000
     begin = time.monotonic()
     for _ in range(20):
         client.send(client.frame(b"\x03\x00\x00\x00\x08"))

@@ -3,6 +3,7 @@
 import socket
 import statistics
 import struct
+import sys
 import threading
 import time
 
@@ -162,6 +163,30 @@ def test_a_session_lasts_over_reconnects_and_ends_after_its_grace() -> None:
         assert {command.session for command in rig.commands} == {session, ""}
         assert rig.commands[-1].session == ""
         eventually(lambda: not rig.sessions)
+
+
+TCP_REPAIR = 19
+"""Linux: a connection that is closed in this state is gone without a word, as if its host had lost its power."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can close a connection without a word")
+def test_a_controller_that_lost_its_power_comes_back_from_the_same_port_and_goes_on() -> None:
+    with running_edge() as rig:
+        holder = rig.client()
+        source = holder.socket.getsockname()
+        holder.write(0, 500)
+        try:
+            holder.socket.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
+        except OSError:
+            holder.close()
+            pytest.skip("needs the right to vanish without a word (CAP_NET_ADMIN)")
+        holder.close()
+        with socket.create_connection(("127.0.0.1", rig.port), timeout=10, source_address=source) as again:
+            again.sendall(bytes.fromhex("00 01 00 00 00 06 01 06 00 00 01 F4"))
+            assert again.recv(300).hex(" ") == "00 01 00 00 00 06 01 06 00 00 01 f4"
+        assert "the connection broke" in rig.event(Event.LEASE_LOST).text
+        assert rig.kinds().count("SESSION_START") == 1
+        eventually(lambda: rig.service.counters.connections == 0)
 
 
 def test_the_log_stream_states_the_open_sessions() -> None:

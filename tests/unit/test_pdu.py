@@ -120,3 +120,18 @@ def test_whatever_is_asked_is_answered(request: bytes) -> None:
     assert 2 <= len(reply) <= 253
     if reply[0] & 0x80:
         assert reply[1] in (1, 2, 3, 4)
+
+
+def test_a_wrong_address_is_said_before_what_cannot_be_done_now() -> None:
+    bench = Bench()
+    client = bench.connect()
+
+    def code(request: str) -> int:
+        return pdu.answer(bench.device, client, bytes.fromhex(request), bench.clock.monotonic_ns())[1]
+
+    # No state has come yet.
+    assert code("17 00 04 00 04 00 00 00 01 02 00 2A") == 4
+    assert code("17 00 04 00 04 00 08 00 01 02 00 2A") == 2
+    assert code("03 00 04 00 05") == 2
+    assert code("04 00 23 00 02") == 2
+    assert bench.device.lease.holder is None

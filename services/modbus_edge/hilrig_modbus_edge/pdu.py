@@ -129,6 +129,8 @@ def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int)
         and size == 2 * write_count == len(request) - _READ_WRITE.size
     ):
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
+    # Both ranges before the state: that an address is wrong is said also where none has come yet.
+    device.check_writable(write, write_count)
     device.check_readable(read, read_count)
     device.write_registers(client, write, request[_READ_WRITE.size :], arrived_ns)
     words = device.read_registers(client, Table.HOLDING_REGISTER, read, read_count)
