@@ -37,7 +37,8 @@ from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.server import Connection as ModbusConnection
 from hilrig_modbus_edge.server import RigServer
 from hilrig_modbus_edge.settings import DeviceSettings
-from hilrig_runtime.service import Arrival, Service
+from hilrig_runtime.messaging import Arrival
+from hilrig_runtime.service import Service
 from hilrig_schemas import JointState, topics
 
 QUESTION = "How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?"

@@ -10,7 +10,7 @@ from hilrig_modbus_edge.device import Device
 from hilrig_modbus_edge.registers import Table
 from hilrig_modbus_edge.settings import DeviceSettings
 from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import Event, JointState, TorqueCommand
 
 MS = 1_000_000

@@ -28,6 +28,9 @@ TURN_S: Final = 0.5
 """Of waiting for a signal."""
 _NO_ROOM: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
 """What a full or broken disk says to whoever writes."""
+_NO_HANDLES: Final = (errno.EMFILE, errno.ENFILE)
+_NO_THREAD: Final = "can't start new thread"
+"""What Python says where the system gives it none."""
 
 
 def stop_on_signals(stopping: threading.Event) -> None:
@@ -118,7 +121,23 @@ def _run_and_tell(main: Callable[[], int | None]) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return 130
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and str(error) != _NO_THREAD:
+            raise
+        print(
+            "hilrig: error: the system gives this process no more memory or threads: see its limits (ulimit -v, "
+            "ulimit -u; mem_limit and pids_limit of a container), or end what else runs here",
+            file=sys.stderr,
+        )
+        return OperationError.exit_code
     except OSError as error:
+        if error.errno in _NO_HANDLES:
+            print(
+                "hilrig: error: the system gives this process no more open files: allow it more (ulimit -n, or "
+                "LimitNOFILE of a service)",
+                file=sys.stderr,
+            )
+            return OperationError.exit_code
         if error.errno not in _NO_ROOM:
             raise
         _drop_output()

@@ -1,6 +1,8 @@
 """The life of a service's process: its share of the processor, the bus, the service, and the end."""
 
+import contextlib
 import logging
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -34,6 +36,7 @@ def run_service(
         HilrigError: the service can't start or can't go on; what it opened is closed.
     """
     _ask_for_time(name, lab)
+    allow_open_files()
     stopping = threading.Event()
     stop_on_signals(stopping)
     if stop_with_parent:
@@ -58,6 +61,17 @@ def _ask_for_time(name: str, lab: LabConfig) -> None:
     prefer_latency()
     if lab.realtime and not go_realtime(priority):
         logger.debug("the system grants no real-time policy: other programs may hold up this one")
+
+
+def allow_open_files() -> None:
+    """Have as many files open as the system lets this user: each connection is one, and 1,024 is a usual beginning."""
+    if sys.platform != "win32":
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        # Some systems call it unlimited and take less.
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:

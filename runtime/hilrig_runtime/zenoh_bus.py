@@ -17,6 +17,7 @@ from hilrig_runtime.zenoh_config import (
     finds_others_by_gossip,
     mesh_endpoint,
     system_reason,
+    unknown_host,
     zenoh_config,
 )
 from hilrig_runtime.zenoh_recording import CompleteStream, declare_recording_publisher
@@ -202,6 +203,11 @@ def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
 
 def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
     if bus.topology == "router":
+        host = unknown_host(bus.router)
+        if host:
+            return (
+                f"no zenoh router answers at {bus.router} (bus.router in lab.toml): the name {host!r} is not known here"
+            )
         certificate = "" if bus.tls is None else ", or it and our certificate do not trust each other: hilrig doctor"
         return f"no zenoh router answers at {bus.router} (bus.router in lab.toml){certificate}"
     if service not in MESH_ORDER:

@@ -8,6 +8,7 @@ everyone is its client, and there is no gossip, for it would lead past the route
 """
 
 import json
+import socket
 from pathlib import Path
 from typing import Any, Final
 
@@ -146,6 +147,16 @@ def _made(settings: dict[str, Any]) -> zenoh.Config:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def unknown_host(endpoint: str) -> str:
+    """The host of an endpoint ("tcp/host:port"), if this machine can't tell its address; empty: it can."""
+    host = endpoint.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError):
+        return host
+    return ""
 
 
 def system_reason(error: Exception) -> str:

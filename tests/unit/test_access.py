@@ -10,7 +10,7 @@ from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import parse_lab
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.health import Counters
-from hilrig_runtime.service import LatestOfBatches
+from hilrig_runtime.messaging import LatestOfBatches
 from hilrig_schemas import RigBatch
 from hilrig_schemas.topics import COMMANDS, all_topics
 

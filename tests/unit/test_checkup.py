@@ -163,7 +163,7 @@ def test_too_few_open_files_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 256))
     lab = parse_lab("[rigs]\ncount = 64\n")
     assert "256 may be open" in only_wrong(host.check_open_files(lab))
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (100_000, 100_000))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 100_000))
     assert by_level(host.check_open_files(lab))[Level.WRONG] == []
 
 

@@ -8,7 +8,7 @@ from device_bench import MS, Bench
 from hilrig_modbus_edge import registers
 from hilrig_modbus_edge.errors import ModbusError
 from hilrig_modbus_edge.registers import Status, Table
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import Event, JointState
 
 

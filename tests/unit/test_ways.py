@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hilrig_modbus_edge.course import Course
 from hilrig_modbus_edge.ways import Line, StateWay
 from hilrig_runtime.impairment_config import PRESETS, ImpairmentConfig
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 
 MS = 1_000_000
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hilrig_runtime.clock import Clock
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import RigBatch
 
 MANY: Final = 32

@@ -24,7 +24,7 @@ from hilrig_modbus_edge.settings import MS, DeviceSettings, Outlet
 from hilrig_modbus_edge.tenure import Tenure
 from hilrig_modbus_edge.watchdog import WatchdogState
 from hilrig_runtime.clock import Clock
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import Event, LeaseStatus
 
 # A name in an enumeration is looked up by a function; what each request asks for is looked up once.

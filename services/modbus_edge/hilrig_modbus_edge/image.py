@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 from hilrig_modbus_edge import codec
 from hilrig_modbus_edge.client import NO_BASIS, Basis
 from hilrig_modbus_edge.registers import MAP_VERSION, Status
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import JointState
 
 FRESH_NS: Final = 1_000_000_000

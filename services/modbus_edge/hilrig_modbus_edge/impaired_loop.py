@@ -14,7 +14,7 @@ from hilrig_modbus_edge.settings import Outlet
 from hilrig_modbus_edge.ways import StateWay
 from hilrig_runtime.clock import Clock
 from hilrig_runtime.impairment_config import ImpairmentConfig
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import Event, ImpairmentStatus
 
 

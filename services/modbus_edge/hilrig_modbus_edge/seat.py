@@ -16,7 +16,8 @@ from hilrig_modbus_edge.tls import TlsPolicy
 from hilrig_modbus_edge.traffic import MOST
 from hilrig_runtime.bus import Handle
 from hilrig_runtime.config import RigSettings
-from hilrig_runtime.service import Arrival, LatestOfBatches, Service
+from hilrig_runtime.messaging import Arrival, LatestOfBatches
+from hilrig_runtime.service import Service
 from hilrig_schemas import Event, RigReport, topics
 
 TRAFFIC_PERIOD_NS: Final = 200_000_000

@@ -6,6 +6,7 @@ read its answers is not read from either.
 """
 
 import asyncio
+import errno
 import logging
 import socket
 from collections.abc import Callable
@@ -256,11 +257,15 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise OperationError(
-            f"rig {rig!r} can't listen on {host}:{port}: {reason}; stop what listens there, or choose another port in "
-            f"lab.toml ({setting}, or the rig's own)"
-        ) from error
+        # The library adds the address to the system's words.
+        reason = (error.strerror or str(error)).partition(" (while")[0]
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            mend = "edge.host in lab.toml must be an address of this host"
+        elif error.errno in (errno.EMFILE, errno.ENFILE):
+            mend = "allow more open files (ulimit -n, or LimitNOFILE of the service)"
+        else:
+            mend = f"stop what listens there, or choose another port in lab.toml ({setting}, or the rig's own)"
+        raise OperationError(f"rig {rig!r} can't listen on {host}:{port}: {reason}; {mend}") from error
 
 
 assert BUFFER_BYTES > MAX_FRAME

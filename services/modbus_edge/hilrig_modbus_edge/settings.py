@@ -6,7 +6,7 @@ from typing import Final, Protocol
 
 from hilrig_runtime.config import EdgeConfig
 from hilrig_runtime.impairment_config import ImpairmentConfig
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import Event, TorqueCommand
 
 MS: Final = 1_000_000

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 
 T = TypeVar("T")
 Fates = Iterator[tuple[int, bool]]

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.service import Arrival
+from hilrig_runtime.messaging import Arrival
 from hilrig_schemas import JointState, PartState, RigReport
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.model import RigParameters

@@ -60,12 +60,12 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[Finding]:
 
 
 def check_open_files(lab: LabConfig) -> Iterator[Finding]:
-    """A process may open as many connections as the lab allows."""
+    """A process may open as many connections as the lab allows; a service takes all that its user may have."""
     if sys.platform == "win32":
         return
     import resource
 
-    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    _, limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = OWN_FILES + len(lab.rigs) * lab.edge.max_connections
     if limit == resource.RLIM_INFINITY or limit >= needed:
         yield good("open files", f"{limit} may be open, {needed} are enough")
@@ -75,7 +75,8 @@ def check_open_files(lab: LabConfig) -> Iterator[Finding]:
     yield say(
         "open files",
         f"{limit} may be open, {needed} are needed if every rig has edge.max_connections ({lab.edge.max_connections})",
-        f"ulimit -n {needed} (or LimitNOFILE of the service), a smaller edge.max_connections, or hilrig up --edges",
+        f"a higher limit for its user (ulimit -Hn {needed} as root, or LimitNOFILE of the service), a smaller "
+        "edge.max_connections, or hilrig up --edges",
     )
 
 

@@ -1,0 +1,96 @@
+"""Where the system gives no more, or a name is not known: one clear line each, with what to do."""
+
+import errno
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hilrig_modbus_edge import server
+from hilrig_runtime.config import parse_lab
+from hilrig_runtime.ending import run_main
+from hilrig_runtime.errors import OperationError
+from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.zenoh_config import unknown_host
+from labs import free_ports
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "no more memory or threads"),
+        (RuntimeError("can't start new thread"), "no more memory or threads"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "no more open files"),
+    ],
+)
+def test_what_the_system_does_not_give_is_one_line(
+    capsys: pytest.CaptureFixture[str], error: Exception, words: str
+) -> None:
+    def main() -> int:
+        raise error
+
+    assert run_main(main) == 3
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("hilrig: error: ")
+    assert words in line
+
+
+def test_any_other_error_is_no_such_thing() -> None:
+    def main() -> int:
+        raise RuntimeError("a mistake in the program")
+
+    with pytest.raises(RuntimeError, match="a mistake"):
+        run_main(main)
+
+
+@pytest.mark.parametrize(
+    ("host", "words"),
+    [
+        ("192.0.2.1", "Cannot assign requested address; edge.host in lab.toml must be an address of this host"),
+        ("no-such-host.invalid", "edge.host in lab.toml must be an address of this host"),
+    ],
+)
+def test_an_address_of_another_host_is_named_as_one(host: str, words: str) -> None:
+    with pytest.raises(OperationError) as caught:
+        server.bind("rig1", host, free_ports(1))
+    if sys.platform == "linux" or host != "192.0.2.1":
+        assert words in str(caught.value)
+    assert "while attempting" not in str(caught.value)
+
+
+def test_a_port_in_use_is_another_matter() -> None:
+    port = free_ports(1)
+    with (
+        server.bind("rig1", "127.0.0.1", port),
+        pytest.raises(OperationError, match=r"in use; stop what listens there, or choose another port"),
+    ):
+        server.bind("rig2", "127.0.0.1", port)
+
+
+def test_a_router_whose_name_is_not_known_is_told_apart_from_one_that_is_silent() -> None:
+    bus = parse_lab('[bus]\ntopology = "router"\nrouter = "tcp/no-such-host.invalid:7447"\n').bus
+    with pytest.raises(OperationError, match=r"the name 'no-such-host\.invalid' is not known here"):
+        ZenohBus(bus, "tool")
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tls/[::1]:7447", "tcp/localhost:1?rel=1"])
+def test_a_known_host_is_not_named(endpoint: str) -> None:
+    assert unknown_host(endpoint) == ""
+
+
+LIMITS = """
+import resource
+from hilrig_runtime.lifecycle import allow_open_files
+_, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+most = min(most, 4096)
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, most))
+allow_open_files()
+print(resource.getrlimit(resource.RLIMIT_NOFILE) == (most, most))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
+def test_a_service_may_open_all_the_files_that_its_user_may() -> None:
+    done = subprocess.run([sys.executable, "-c", LIMITS], check=True, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "True\n"
