@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def certs(
-    folder: Annotated[Path, typer.Argument(help="Where they are written.")] = Path("certs"),
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where they are written.")] = Path("certs"),
     config: Config = None,
     host: Annotated[
         list[str] | None,

@@ -11,7 +11,7 @@ from hilrig_cli.options import AsJson
 
 def check(
     file: Annotated[
-        Path | None, typer.Argument(metavar="[LAB.TOML]", help="The lab's file; without: the defaults.")
+        Path | None, typer.Argument(metavar="LAB.TOML", help="The lab's file; without: the defaults.")
     ] = None,
     template: Annotated[
         bool, typer.Option("--template", help="Print a lab's file with every key explained and its default, instead.")

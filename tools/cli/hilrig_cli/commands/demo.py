@@ -16,7 +16,7 @@ def demo(
             min=1.0, help="How long the controller runs, seconds; where it is not said, 20, or more to finish its work."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-out"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("demo-out"),
     as_json: AsJson = False,
 ) -> None:
     """Run the whole rig with the example controller, then measure, verify and draw what was recorded.

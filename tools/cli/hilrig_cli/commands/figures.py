@@ -10,7 +10,7 @@ from hilrig_cli.options import AsJson
 
 
 def figures(
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("figures"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("figures"),
     step_ms: Annotated[float, typer.Option(help="Step of the fixed-step methods, ms.")] = 20.0,
     as_json: AsJson = False,
 ) -> None:

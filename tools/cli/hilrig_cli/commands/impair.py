@@ -19,7 +19,7 @@ LOSSES = "none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
 
 
 def impair(
-    rig: Annotated[str, typer.Argument(help="The rig; without: all of the lab are shown.")] = "",
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig; without: all of the lab are shown.")] = "",
     preset: Annotated[
         str,
         typer.Option(metavar="NAME", help="none, wired, busy-wifi, vpn, mobile or paper-25-100ms.", show_default=False),

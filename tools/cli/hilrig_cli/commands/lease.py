@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def lease(
-    rig: Annotated[str, typer.Argument(help="The rig; without: all of the lab.")] = "",
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig; without: all of the lab.")] = "",
     release: Annotated[bool, typer.Option("--release", help="Take the rig from the controller that holds it.")] = False,
     config: Config = None,
     as_json: AsJson = False,

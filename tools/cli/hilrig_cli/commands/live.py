@@ -13,7 +13,7 @@ from hilrig_cli.options import Config
 
 def live(
     rig: Annotated[
-        str | None, typer.Argument(metavar="[RIG]", help="Which rig; without: the lab's first.", show_default=False)
+        str | None, typer.Argument(metavar="RIG", help="Which rig; without: the lab's first.", show_default=False)
     ] = None,
     config: Config = None,
     save: Annotated[

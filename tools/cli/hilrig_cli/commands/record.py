@@ -20,7 +20,7 @@ app = typer.Typer(
     callback=config_for_commands,
 )
 
-Rig = Annotated[str, typer.Argument(help="Name of the rig.")]
+Rig = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
 
 
 @app.command()

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 def recover(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="MCAP files, also foreign ones.")],
+    files: Annotated[list[Path], typer.Argument(metavar="RUN.MCAP…", help="MCAP files, also foreign ones.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="The new file; for one FILE only.", show_default=False)
+        Path | None, typer.Option("--out", "-o", help="The new file; for one file only.", show_default=False)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -32,7 +32,7 @@ def recover(
     from hilrig_runtime.errors import InputError
 
     if output is not None and len(files) > 1:
-        raise InputError(f"--output names one file, but {len(files)} are to be recovered")
+        raise InputError(f"--out names one file, but {len(files)} are to be recovered")
     recoveries = []
     for source in files:
         recovery = make_whole(source, output or recovered_path(source))

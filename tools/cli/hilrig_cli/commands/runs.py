@@ -36,7 +36,8 @@ class SortKey(StrEnum):
 
 def runs(
     folder: Annotated[
-        Path | None, typer.Argument(help="Where the recordings are; default: the lab's recorder.folder.")
+        Path | None,
+        typer.Argument(metavar="FOLDER", help="Where the recordings are; default: the lab's recorder.folder."),
     ] = None,
     config: Config = None,
     rig: Annotated[str, typer.Option(help="Only this rig's.")] = "",

@@ -16,7 +16,7 @@ def study(
     file: Annotated[
         Path | None, typer.Argument(metavar="STUDY.TOML", help="What is swept (docs/studies.md).", show_default=False)
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("study-out"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("study-out"),
     controller: Annotated[
         list[Path] | None,
         typer.Option(
