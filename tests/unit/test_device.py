@@ -289,7 +289,11 @@ def test_a_controller_that_lost_the_rig_to_the_teacher_does_not_get_it_back_at_o
     assert refusal.value.code == 6
     bench.write(other, 0, 7)
     bench.device.disconnect(other, "done")
-    bench.wait(5000)
+    bench.wait(4999)
+    with pytest.raises(ModbusError) as refusal:
+        bench.write(holder, 0, 8)
+    assert refusal.value.code == 6
+    bench.wait(1)
     bench.write(holder, 0, 8)
     assert bench.device.lease.holder is holder
 

@@ -77,6 +77,12 @@ def test_losses_of_a_bad_channel_come_in_bursts_of_the_length_that_was_asked() -
     assert chi.pvalue > 0.01, chi
 
 
+def test_a_channel_begins_as_it_is_in_the_long_run() -> None:
+    way = WayImpairment.model_validate({"loss": "gilbert:0.05,0.2"})
+    first = [Impairment(way, seed).draw(1)[1][0] for seed in range(400)]
+    assert stats.binomtest(sum(map(int, first)), len(first), 0.05 / 0.25).pvalue > 0.01
+
+
 def test_a_channel_may_lose_some_when_it_is_good_and_keep_some_when_it_is_bad() -> None:
     lost = Impairment(WayImpairment.model_validate({"loss": "gilbert:0.1,0.3,0.6,0.05"}), 5).draw(200_000)[1]
     assert lost.mean() == pytest.approx(0.25 * 0.6 + 0.75 * 0.05, rel=0.03)

@@ -50,6 +50,22 @@ def test_others_do_not_feel_a_rig_that_is_taken_away() -> None:
     assert motion() == motion(lambda lab: lab.simulation.remove(0, without(lab, 0)))
 
 
+def test_torques_and_magnets_that_stand_stay_with_their_rigs_when_one_before_them_is_taken_away() -> None:
+    def moved(lab: VirtualRig, *, remove: bool) -> dict[str, list[float]]:
+        for number, name in enumerate(("rig1", "rig2", "rig3"), start=1):
+            lab.command((0.5 * number, -0.2 * number, -4.9, 0.01), magnet=number == 2, rig=name)
+        lab.tick(2)
+        if remove:
+            lab.simulation.remove(0, without(lab, 0))
+        # Nothing is sent any more: what stands acts.
+        assert lab.simulation._magnet.tolist() == ([True, False] if remove else [False, True, False])
+        lab.tick(15)
+        return {state.rig: list(state.position) for state in lab.states[-2:]}
+
+    with VirtualRig(LAB) as all_three, VirtualRig(LAB) as two:
+        assert moved(all_three, remove=False) == moved(two, remove=True)
+
+
 def test_a_rig_that_was_added_moves_and_is_recorded() -> None:
     with VirtualRig(LAB) as lab:
         lab.tick(5)

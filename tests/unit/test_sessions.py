@@ -335,6 +335,20 @@ def test_a_gap_is_counted_as_lost_on_the_way() -> None:
     assert desk.shelf.losses == [(STATE.key(LAB, "rig1"), 7, 0)]
 
 
+@pytest.mark.parametrize(("waited", "set_back", "counted"), [(1, 0, 7), (4, 0, 0), (4, 3600, 0)])
+def test_a_gap_shortly_before_a_session_is_its_too(waited: int, set_back: int, counted: int) -> None:
+    desk = Desk()
+    desk.states(2)
+    for _ in range(7):
+        desk.sim.state("rig1", desk.wall)
+    desk.sim.batch()
+    desk.states(1)
+    desk.offset -= set_back * SECOND
+    desk.states(50 * waited)
+    desk.start()
+    assert desk.file.recording.tally.lost_transport == counted
+
+
 def test_a_gap_before_the_first_message_of_a_fresh_run_is_counted() -> None:
     desk = Desk()
     desk.start()

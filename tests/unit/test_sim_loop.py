@@ -1,6 +1,7 @@
 """The simulation's tick in virtual time: its order, its stamps, what it sends and what it tells of."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from hilrig_runtime.errors import InputError
 from hilrig_runtime.rate import Rate
 from hilrig_schemas import Event
 from hilrig_sim.configured import rig_parameters
+from hilrig_sim.limits import Happening, PlantEvent
 from hilrig_sim.model import RigParameters
 from hilrig_sim.plant import Plant
+from hilrig_sim.reports import Reporter
 from virtual_rig import VirtualRig
 
 
@@ -134,10 +137,45 @@ def test_overruns_in_a_burst_are_told_of_together(rig: VirtualRig) -> None:
     for _ in range(30):
         rig.clock.advance(50_000_000)
         rig.tick()
+    late = [state for state in rig.states if state.missed_steps]
+    # A second later the last of them are told of too, though no other follows.
+    rig.tick(110)
     told = [event for event in rig.events if event.kind == Event.OVERRUN]
     assert 2 <= len(told) <= 3
     # The first tick has no deadline to miss.
     assert rig.service.counters.overruns == 29
+    assert sum(event.overrun_data.missed_steps for event in told) == sum(state.missed_steps for state in late)
+    assert told[-1].step == late[-1].step
+    # What was told of is over: the next event says of a smaller one how late that was.
+    rig.clock.advance(45_000_000)
+    state = rig.tick()
+    last = [event for event in rig.events if event.kind == Event.OVERRUN][-1]
+    assert last.step == state.step
+    assert last.overrun_data.lateness_ns == state.lateness_ns + state.missed_steps * 20_000_000 < 30_000_000
+
+
+def test_a_states_lateness_is_that_of_its_stamp_not_of_the_tick_s_begin(rig: VirtualRig) -> None:
+    rate = Rate(rig.lab.sim.step_ns, rig.clock)
+    tick = rate.wait()
+    rig.clock.advance(3_000_000)
+    rig.simulation.tick(tick)
+    assert rig.states[-1].lateness_ns == 3_000_000
+    assert rig.states[-1].sampled_ns == tick.deadline_ns + 3_000_000
+
+
+def test_a_joint_that_rattles_at_its_stop_is_told_of_once_and_again_when_it_had_been_quiet() -> None:
+    told: list[Event] = []
+    reporter = Reporter(told.append, ["rig1"], Plant([RigParameters()]))
+    hit = PlantEvent(Happening.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
+    for now_ms in (0, 100, 300, 520, 800):
+        reporter.tell_of_plant([hit], now_ms, now_ms * 1_000_000, ["session"])
+    # From 520 to 800 ms it was quiet; the lower stop and the other joints have quiets of their own.
+    assert [event.step for event in told] == [0, 800]
+    reporter.tell_of_plant([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
+    assert [event.text for event in told[2:]] == [
+        "joint 1 came to its lower stop at 29 °/s",
+        "joint 2 came to its upper stop at 29 °/s",
+    ]
 
 
 def test_what_the_step_cannot_follow_comes_back_at_the_start() -> None:

@@ -4,14 +4,16 @@ import errno
 import os
 import random
 import tracemalloc
+import zlib
 from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
 import pytest
+import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Message, Metadata
+from mcap.records import Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -77,6 +79,16 @@ def test_the_stock_reader_finds_everything(tmp_path: Path) -> None:
     with path.open("rb") as stream:
         records = list(StreamReader(stream, validate_crcs=True).records)
     assert type(records[-1]).__name__ == "Footer"
+    # A checksum of zero stands for none, and every reader would be content with it.
+    with path.open("rb") as stream:
+        whole = list(StreamReader(stream, emit_chunks=True).records)
+    chunks = [record for record in whole if isinstance(record, Chunk)]
+    assert [chunk.uncompressed_crc for chunk in chunks] == [
+        zlib.crc32(zstandard.decompress(chunk.data, chunk.uncompressed_size)) for chunk in chunks
+    ]
+    assert len(chunks) > 1
+    assert isinstance(whole[-1], Footer)
+    assert whole[-1].summary_crc
 
 
 def test_the_index_leads_to_the_messages_of_a_time(tmp_path: Path) -> None:

@@ -117,7 +117,9 @@ class Simulation:
         self._see()
         self._counters.count_tick(tick, self._step_ns)
         if overrun:
-            self._reporter.tell_of_overrun(tick, step, sampled_ns, self._step_ns)
+            self._reporter.note_overrun(tick, step, self._step_ns)
+        if self._reporter.overran:
+            self._reporter.tell_of_overruns(sampled_ns)
 
     def _after_sending(self, latencies_ns: Mapping[int, int]) -> None:
         """Hand the efforts to the plant, and tell of commands that were lost."""

@@ -26,6 +26,9 @@ class Reporter:
         self._plant = plant
         self._limit_told_ns: dict[tuple[int, int, bool], int] = {}
         self._overrun_told_ns = -OVERRUN_QUIET_NS
+        self.overran = False
+        """Overruns were noted that were not told of."""
+        self._overrun_step = 0
         self._missed = 0
         self._worst_ns = 0
 
@@ -70,19 +73,26 @@ class Reporter:
         )
         self._emit(event)
 
-    def tell_of_overrun(self, tick: Tick, step: int, now_ns: int, step_ns: int) -> None:
-        """A tick that came more than a step late, or gave up deadlines."""
+    def note_overrun(self, tick: Tick, step: int, step_ns: int) -> None:
+        """A tick that came more than a step late, or gave up deadlines; `tell_of_overruns` says so."""
+        self.overran = True
+        self._overrun_step = step
         self._missed += tick.missed_steps
         # Behind the deadline that it was meant for: its lateness is against the one that was taken up again.
         self._worst_ns = max(self._worst_ns, tick.lateness_ns + tick.missed_steps * step_ns)
+
+    def tell_of_overruns(self, now_ns: int) -> None:
+        """What was noted since they were last told of, all together and once in a while; `overran`: there is some."""
         if now_ns - self._overrun_told_ns < OVERRUN_QUIET_NS:
             return
         data = OverrunData(lateness_ns=self._worst_ns, missed_steps=self._missed)
         steps = f"{self._missed} step{'' if self._missed == 1 else 's'}"
         text = f"the simulation came {self._worst_ns / 1e6:.1f} ms late and gave up {steps}"
+        step = self._overrun_step
         self._emit(Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data))
         self._overrun_told_ns = now_ns
         self._missed = self._worst_ns = 0
+        self.overran = False
 
     def _limit(self, hit: PlantEvent, now_ns: int) -> Event | None:
         place = (hit.rig, hit.joint, hit.upper)
