@@ -302,6 +302,24 @@ NAMED: tuple[tuple[str, str, str], ...] = (
 )
 """Clause, rule, and the function in `tests/rig/test_modbus_conformance.py` that shows it."""
 
+SECURED: tuple[tuple[str, str], ...] = (
+    ("the whole message, MBAP header and PDU, is inside TLS", "test_an_operator_reads_and_writes"),
+    ("TLS 1.2 or newer", "test_old_versions_of_tls_are_refused"),
+    (
+        "both sides show certificates: the client's is of the lab's authority, for clients, and valid now",
+        "test_a_certificate_that_is_not_right_is_refused_and_the_operator_reads_why",
+    ),
+    (
+        "the role is a UTF-8 string in the extension 1.3.6.1.4.1.50316.802.1; two are none",
+        "test_a_role_that_cannot_be_told_is_none",
+    ),
+    ("what the role does not allow gets exception 01", "test_an_observer_and_who_has_no_role_read_only"),
+    ("a certificate without a role: as configured", "test_what_no_role_means_is_configured"),
+    ("a handshake ends within 5 s or is given up", "test_a_handshake_that_is_never_finished_is_given_up"),
+    ("a client cannot begin a handshake anew", "test_a_client_cannot_begin_a_handshake_anew"),
+)
+"""Rule of Modbus/TCP Security, and the function in `tests/rig/test_modbus_tls.py` that shows it."""
+
 HEADER = """# Conformance
 
 Each row is a rule, the clause that it comes from, and a test with raw bytes on a real socket
@@ -333,6 +351,11 @@ def as_markdown() -> str:
         lines.append(f"| {rule.clause} | {rule.text} | {before}`{_short(rule.request)}` | `{rule.answer}` |\n")
     lines.append("\n## Streams, connections, whole maps\n\n| clause | rule | test |\n|---|---|---|\n")
     lines += [f"| {clause} | {text} | `{name}` |\n" for clause, text, name in NAMED]
+    lines.append(
+        "\n## Modbus/TCP Security\n\nTests in `tests/rig/test_modbus_tls.py`; the last two rules are our own.\n\n"
+    )
+    lines.append("| rule | test |\n|---|---|\n")
+    lines += [f"| {text} | `{name}` |\n" for text, name in SECURED]
     return "".join(lines)
 
 

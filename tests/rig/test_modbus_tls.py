@@ -17,6 +17,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
+from conformance import SECURED
 from edge_rig import EdgeRig, free_ports, running_edge
 from hilrig_modbus_edge.certificates import (
     ROLE_OID,
@@ -304,6 +305,11 @@ def test_without_plain_only_tls_listens(lab: Lab) -> None:
         assert talk(rig, lab.client("operator"), READ)
         with pytest.raises(ConnectionRefusedError):
             rig.client()
+
+
+def test_every_rule_of_the_conformance_page_has_its_test() -> None:
+    for _, name in SECURED:
+        assert callable(globals()[name])
 
 
 def test_openssl_as_a_client(rig: EdgeRig, lab: Lab) -> None:

@@ -25,6 +25,7 @@ Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
 """Serve a controller: its transport, host and port, whether it may write, and what it has sent already."""
 
 HANDSHAKE_TIMEOUT_S: Final = 5.0
+"""How long a client may take to begin TLS, and to end it."""
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,12 @@ class TlsGate(asyncio.Protocol):
     async def _shake_hands(self) -> asyncio.Transport | None:
         loop, context = asyncio.get_running_loop(), self._policy.context
         return await loop.start_tls(
-            self._transport, self, context, server_side=True, ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S
+            self._transport,
+            self,
+            context,
+            server_side=True,
+            ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
+            ssl_shutdown_timeout=HANDSHAKE_TIMEOUT_S,
         )
 
 
