@@ -55,6 +55,10 @@ def test_flags_tell_of_magnet_part_and_stop() -> None:
     shown = pose_of(ArmParameters(), state(magnet=True, held_part="red", limit_flags=1))
     assert shown is not None
     assert shown[5] == MAGNET | HOLDS | AT_STOP
+    for said, flag in (({"magnet": True}, MAGNET), ({"held_part": "red"}, HOLDS), ({"limit_flags": 256}, AT_STOP)):
+        one = pose_of(ArmParameters(), state(**said))
+        assert one is not None
+        assert one[5] == flag
     assert pose_of(ArmParameters(), state((math.nan, 0.0, 0.0, 0.0))) is None
 
 

@@ -117,6 +117,21 @@ def test_under_jitter_and_loss_the_newest_wins_and_nothing_is_early(seed: int, j
     assert (line.samples_ns >= timing.step_ns).all()
 
 
+def test_what_comes_at_the_very_moment_is_in_time() -> None:
+    # A state is released when it is read, and a command arrives when its tick begins.
+    line = timeline(LoopTiming(20 * MS, 20 * MS, 5 * MS, MS, 0), 10, 5 * MS, 14 * MS)
+    assert line.basis.tolist() == list(range(10))
+    assert line.in_force.tolist() == [NO_POLL, *range(9)]
+    assert line.latency.tolist() == [0] + [1] * 9
+
+
+def test_a_state_tells_of_the_last_loop_latency_until_there_is_another() -> None:
+    line = timeline(LoopTiming(20 * MS, 40 * MS, 5 * MS, MS, 0), 10)
+    assert line.basis.tolist() == [0, 2, 4, 6, 8]
+    assert line.latency.tolist() == [0, 1, 0, 1, 0, 1, 0, 1, 0, 1]
+    assert line.shown_latency.tolist() == [0, 1, 1, 1, 1]
+
+
 def test_a_negative_delay_is_refused() -> None:
     with pytest.raises(InputError, match="negative"):
         timeline(LoopTiming(), 10, command_delay_ns=-1)
