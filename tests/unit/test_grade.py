@@ -129,6 +129,18 @@ def test_a_path_that_is_left_or_cut_short_is_not_followed() -> None:
     assert (never.began_s, never.rms_mm) == (None, None)
 
 
+def test_where_a_path_comes_back_to_itself_nothing_is_passed_by_standing_there() -> None:
+    corner = np.array(SQUARE[0]) / 1000
+    # A little off its beginning the tool is nearest to the first side, or to the last one.
+    sides = [(np.array(SQUARE[1]) / 1000 - corner) * 0.01, (np.array(SQUARE[-2]) / 1000 - corner) * 0.01]
+    standing = np.array([corner + sides[state % 2] for state in range(40)])
+    path = graded({"path": {"points_mm": SQUARE}}, standing).path
+    assert path is not None
+    assert path.began_s is not None
+    assert path.covered < 0.1
+    assert path.done_s is None
+
+
 def test_the_tracking_error_ends_where_the_tool_leaves_the_path_for_good() -> None:
     away = np.linspace([0.3, 0.1, 0.002], [0.3, 0.5, 0.3], 40)
     way = np.concatenate((along(SQUARE[:3], 0.1, aside_mm=2.0), away))

@@ -41,6 +41,12 @@ def test_a_replay_with_something_of_its_own_around_it_is_found() -> None:
     assert torques(stolen).shared(torques(drawn(500, 2), stolen)) == 1.0
 
 
+def test_a_piece_of_a_long_run_is_found_in_it() -> None:
+    long = drawn(20_000, 1)
+    # Of the long run only the smallest hashes are kept: the piece's larger ones say nothing.
+    assert torques(long).shared(torques(long[5000:8000])) == 1.0
+
+
 def test_few_torques_say_nothing_and_neither_does_none() -> None:
     few = drawn(LEAST - 1, 1)
     assert torques(few).shared(torques(few)) == 0.0
