@@ -21,13 +21,13 @@ from waiting import eventually
 
 
 @contextmanager
-def tmpfs(folder: Path, size_kib: int) -> Iterator[Path]:
-    """A file system of so many KiB."""
+def tmpfs(folder: Path, size_kib: int, *, files: int = 0) -> Iterator[Path]:
+    """A file system of so many KiB, and so many files and folders; 0: any number."""
     if os.name != "posix" or os.geteuid() != 0 or shutil.which("mount") is None:
         pytest.skip("needs root, to mount a small file system")
     folder.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size_kib}k", "tmpfs", str(folder)],
+        ["mount", "-t", "tmpfs", "-o", f"size={size_kib}k,nr_inodes={files}", "tmpfs", str(folder)],
         check=False,
         capture_output=True,
         text=True,
@@ -157,6 +157,32 @@ def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path:
         assert metadata(path)["hilrig.summary"]["ended"] == "disk full"
         assert "nearly full" in metadata(path)["hilrig.summary"]["reason"]
     assert "only" in recorder.log.read_text()
+
+
+@pytest.mark.rig
+def test_a_disk_that_takes_no_more_files_is_told_apart_from_a_full_one(tmp_path: Path) -> None:
+    config, lab = make_lab(tmp_path, rigs=8, extra="recorder.min_free_mib = 0")
+    rigs = [rig.name for rig in lab.rigs]
+    # The folders of all rigs, and files of some.
+    with tmpfs(tmp_path / "recordings", 64 << 10, files=16) as folder, sending(lab, rigs, step_ms=100.0) as senders:
+        for rig in rigs:
+            (folder / lab.name / rig).mkdir(parents=True)
+        with RecorderProcess(config) as recorder:
+            wait_ready(lab, recorder)
+            troubles = Troubles(lab)
+            try:
+                for rig in rigs:
+                    senders.begin(rig)
+                text = eventually(lambda: next((text for text in troubles.heard if " more" in text), ""))
+                for rig in rigs:
+                    senders.end(rig)
+                whole = eventually(lambda: [path for rig in rigs for path in files_of(lab, rig)])
+            finally:
+                troubles.close()
+        assert "can't be recorded: the disk takes no more files (it has no inodes left)" in text
+        assert len(text.split("; ")) == 4, text
+        for path in whole:
+            assert metadata(path)["hilrig.summary"]["ended"] == "ended"
 
 
 @pytest.mark.rig

@@ -21,6 +21,8 @@ from hilrig_runtime.clock import Clock
 from hilrig_runtime.config import RecorderConfig
 from hilrig_schemas import Event, RigConfig
 
+NAMED: Final = 3
+"""Troubles that a health report names; events and the log name each."""
 _SPACE_PERIOD_NS: Final = SECOND_NS
 _NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
 
@@ -66,7 +68,9 @@ class Files:
     @property
     def trouble(self) -> str:
         """What the operator should know now; empty: nothing."""
-        return "; ".join(self._trouble.values())
+        told = list(self._trouble.values())
+        more = len(told) - NAMED
+        return "; ".join(told[:NAMED]) + (f"; and {more} more" if more > 0 else "")
 
     @property
     def bytes_written(self) -> int:
@@ -166,7 +170,7 @@ class Files:
             part.path.parent.mkdir(parents=True, exist_ok=True)
             writer = RunWriter(part.path, metadata=(about,), compress=self._compress)
         except OSError as error:
-            self._report(recording, f"{part.path}: can't be recorded: {error.strerror}")
+            self._report(recording, f"{part.path}: can't be recorded: {self._space.why(error)}")
             return None
         file = self._files[recording] = RunFile(recording, writer, self._clock, self._on_failure)
         self._disk.follow(writer)

@@ -5,7 +5,10 @@ nothing is recorded.
 """
 
 import contextlib
+import errno
+import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -44,6 +47,15 @@ class Space:
         if self.full and not was_full:
             return f"{self._folder}: only {free // MIB} MiB are free, {self._min_free_mib} are kept: no recording"
         return ""
+
+    def why(self, error: OSError) -> str:
+        """What the disk said, for people: a disk may be full of files while it has space."""
+        if error.errno == errno.ENOSPC and sys.platform != "win32":
+            with contextlib.suppress(OSError):
+                disk = os.statvfs(self._folder)
+                if disk.f_files and not disk.f_favail:
+                    return "the disk takes no more files (it has no inodes left)"
+        return error.strerror or str(error)
 
     def release(self) -> None:
         """Give back what was set aside."""
