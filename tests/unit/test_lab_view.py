@@ -147,6 +147,16 @@ def test_metrics_are_in_prometheus_text_format() -> None:
     assert len(families) == len(set(families))
 
 
+def test_of_a_silent_service_counters_stay_and_what_it_was_like_is_not_told() -> None:
+    labels = '{lab="lab",service="sim",instance="1"}'
+    heard, later = (exposition(view(), "lab", now_s) for now_s in (11.0, 60.0))
+    for name in ("up", "overruns_total", "lateness_p99_seconds"):
+        assert f"hilrig_{name}{labels} " in heard
+    assert f"hilrig_up{labels} 0\n" in later
+    assert f"hilrig_overruns_total{labels} 3\n" in later
+    assert f"hilrig_lateness_p99_seconds{labels}" not in later
+
+
 def test_metrics_are_served_at_their_path_alone() -> None:
     with metrics_server(("127.0.0.1", 0), lambda: "a 1\n") as server:
         thread = threading.Thread(target=server.serve_forever)

@@ -45,9 +45,9 @@ def _lines(view: LabView, lab: str, now_s: float) -> Iterator[str]:
     services = view.services()
 
     def of_services(name: str, kind: str, text: str, value: Callable[[ServiceView], float]) -> Iterator[str]:
-        labelled = (
-            (_labels(lab=lab, service=s.health.service, instance=s.health.instance), value(s)) for s in services
-        )
+        # How a service that is silent was is over; what it counted stays.
+        told = (s for s in services if kind == "counter" or name == "up" or not view.is_silent(s, now_s))
+        labelled = ((_labels(lab=lab, service=s.health.service, instance=s.health.instance), value(s)) for s in told)
         yield from _family(name, kind, text, labelled)
 
     yield from of_services("up", "gauge", "Whether it was heard lately.", lambda s: not view.is_silent(s, now_s))
