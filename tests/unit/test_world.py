@@ -193,6 +193,22 @@ def test_a_dropped_part_rests_on_what_is_below_it(x: float, y: float, rests_on: 
     assert plant.world.at_rest(0)
 
 
+@pytest.mark.parametrize("order", ["abc", "cba", "bca"])
+def test_a_stack_comes_down_whole_when_its_lowest_part_is_taken_away(order: str) -> None:
+    places = {"a": 0.06, "b": 0.03, "c": 0.0}
+    stack = [part(name, 0.3, 0.1, below=TABLE + places[name], iron=name == "c") for name in order]
+    plant = plant_over(0.3, 0.112, TABLE + 0.03, *stack)
+    steps(plant, 1, hold(plant), ON)
+    assert plant.world.held[0] == order.index("c")
+    plant.position[0, 0] += 0.5
+    plant._begin_anew()
+    steps(plant, 60, hold(plant), ON)
+    bottoms = {name: plant.world.z[row, 0] - 0.015 - TABLE for row, name in enumerate(order)}
+    assert (bottoms["b"], bottoms["a"]) == pytest.approx((0.0, 0.03), abs=1e-9)
+    assert plant.world.at_rest(0)
+    assert not plant.world.falling
+
+
 def test_what_stood_on_a_part_that_is_taken_away_falls() -> None:
     lower, upper = part("lower", 0.30, 0.1), part("upper", 0.33, 0.1, below=TABLE + 0.03, iron=False)
     # The tool stands where only the lower one is, for the upper one leaves its middle free.

@@ -198,19 +198,29 @@ class World:
 
     def fall(self, duration: float) -> None:
         """Let what is falling fall for `duration`, s, and come to rest on what is below it."""
-        for row, rig in np.argwhere(self._falling).tolist():
-            bottom = self._bottom(row, rig)
-            support = self._support_of(row, rig)
-            speed = self._fall_speed[row, rig]
-            lower = bottom - (speed * duration + 0.5 * GRAVITY * duration * duration)
-            if lower <= support:
-                lower = support
-                self._falling[row, rig] = False
-            self._fall_speed[row, rig] = speed + GRAVITY * duration if lower > support else 0.0
-            self.z[row, rig] = lower + self.half_height[row, rig]
-            self._moved(rig)
+        for rig in np.flatnonzero(self._falling.any(axis=0)).tolist():
+            something_falls = False
+            # The lowest first: what is above it comes down on where it is then.
+            rows = np.flatnonzero(self._falling[:, rig]).tolist()
+            for row in sorted(rows, key=lambda row: self._bottom(row, rig)):
+                self._fall(row, rig, duration)
+                if something_falls:
+                    # What it came down on may be on its way down itself.
+                    self._falling[row, rig] = True
+                something_falls |= bool(self._falling[row, rig])
             self._refresh_highest(np.array([rig]))
         self.falling = bool(self._falling.any())
+
+    def _fall(self, row: int, rig: int, duration: float) -> None:
+        bottom, support = self._bottom(row, rig), self._support_of(row, rig)
+        speed = self._fall_speed[row, rig]
+        lower = bottom - (speed * duration + 0.5 * GRAVITY * duration * duration)
+        if lower <= support:
+            lower = support
+            self._falling[row, rig] = False
+        self._fall_speed[row, rig] = speed + GRAVITY * duration if lower > support else 0.0
+        self.z[row, rig] = lower + self.half_height[row, rig]
+        self._moved(rig)
 
     def _take(self, rigs: Ints, rows: Ints, tip: Floats) -> None:
         x, y, z, yaw = tip
