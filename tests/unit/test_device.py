@@ -517,6 +517,23 @@ def test_a_state_that_grows_old_is_said_not_to_be_alive(bench: Bench) -> None:
     assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 1
     bench.clock.advance(1000 * MS)
     assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 0
+    # Its age says how old, up to what the register holds.
+    age = len(struct.pack(">HHIIHHHHH", *[0] * 9)) // 2
+    assert bench.read(client, age, 1, Table.INPUT_REGISTER) == [1000]
+    bench.clock.advance(100_000 * MS)
+    assert bench.read(client, age, 1, Table.INPUT_REGISTER) == [0xFFFF]
+
+
+def test_the_last_loop_latency_stands_until_there_is_another(bench: Bench) -> None:
+    client = bench.connect()
+
+    def shown_us() -> int:
+        high, low = bench.read(client, 4, 2, Table.INPUT_REGISTER)
+        return high << 16 | low
+
+    for step, loop_ms, expected_us in ((1, 0, 0), (2, 40, 40_000), (3, 0, 40_000), (4, 20, 20_000), (5, 0, 20_000)):
+        bench.state(step, loop_latency_ns=loop_ms * MS)
+        assert shown_us() == expected_us
 
 
 def test_a_message_that_is_no_state_is_left_out(bench: Bench) -> None:

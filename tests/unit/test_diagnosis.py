@@ -49,6 +49,10 @@ def test_a_controller_that_computes_for_long(tmp_path: Path) -> None:
     assert found.evidence["controller_ms"] == pytest.approx(60.8, abs=1)
 
 
+def test_a_controller_that_takes_less_of_the_loop_than_the_rest_does_is_not_slow(tmp_path: Path) -> None:
+    assert "slow_controller" not in findings(tmp_path, Script(seconds=8.0, delay_ms=6.0))
+
+
 def test_a_controller_that_reads_after_writing_and_then_waits(tmp_path: Path) -> None:
     found = findings(tmp_path, Script(seconds=12.0, poll_ms=100.0, order="write-read"))["slow_controller"]
     assert "waits before the next write" in found.text

@@ -39,7 +39,7 @@ def edge() -> Health:
 def view() -> LabView:
     made = LabView(("rig1", "rig2", "rig3"))
     made.hear(sim(1.0, 0.2), 10.0)
-    made.hear(sim(2.0, 0.7), 11.0)
+    made.hear(sim(3.0, 1.2), 11.0)
     made.hear(edge(), 11.0)
     made.hear(Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 11.0)
     return made

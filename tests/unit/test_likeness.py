@@ -47,6 +47,13 @@ def test_a_piece_of_a_long_run_is_found_in_it() -> None:
     assert torques(long).shared(torques(long[5000:8000])) == 1.0
 
 
+def test_torques_that_differ_by_a_count_are_different() -> None:
+    effort = drawn(1000, 1)
+    assert torques(effort).shared(torques(effort + 0.001)) == 0.0
+    # What a register can't tell apart is the same.
+    assert torques(effort).shared(torques(effort + 0.0001)) == 1.0
+
+
 def test_few_torques_say_nothing_and_neither_does_none() -> None:
     few = drawn(LEAST - 1, 1)
     assert torques(few).shared(torques(few)) == 0.0

@@ -127,6 +127,7 @@ def test_a_part_on_the_magnet_beside_its_place_or_on_the_table_is_not_placed() -
     poses = [standing(0, 0, dx=0.001), standing(1, 1, dx=0.030), standing(2, 2, dz=0.01), standing(3, 3)]
     result = placed_parts(scene, poses, held=scene.parts[3].name)
     assert [part.place for part in result.parts] == [0, None, None, None]
+    assert placed_parts(scene, [standing(2, 2, dz=-0.008)]).placed == 0
     assert result.placed == 1
     assert result.parts[0].error_mm == pytest.approx(1.0)
     assert placed_parts(RigParameters().scene, []).largest_error_mm is None

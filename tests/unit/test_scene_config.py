@@ -70,6 +70,20 @@ def test_a_part_stands_on_the_tray_where_there_is_one() -> None:
     assert on_table.position[2] == pytest.approx(-0.060 + 0.015)
 
 
+def test_a_turned_tray_carries_what_is_over_any_of_it_and_its_places_are_on_its_top() -> None:
+    tray = (
+        '[[scene.trays]]\nname = "t"\nposition_mm = [300, 200]\nsize_mm = [200, 100, 12]\nyaw_deg = 45\n'
+        "rows = 1\ncolumns = 1\n"
+    )
+    # Along the tray's length, which points to x and y alike, a part is over it; as far across it is not.
+    parts = PART.format(name="along", x=360, y=260) + PART.format(name="across", x=240, y=260)
+    lab = parse_lab(tray + parts)
+    scene = rig_parameters(lab, lab.rigs[0]).scene
+    along, across = (part.position[2] - part.size[2] / 2 for part in scene.parts)
+    assert (along, across) == pytest.approx((-0.048, -0.060))
+    assert [place[2] for tray in scene.trays for place in tray.places] == pytest.approx([-0.048])
+
+
 def test_a_rigs_own_scene_replaces_the_labs(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     text = '[[rigs]]\nname = "a"\n[[rigs]]\nname = "b"\n[rigs.scene]\nparts = []\n[rigs.scene.table]\nheight_mm = -80'

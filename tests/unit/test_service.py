@@ -1,5 +1,7 @@
 """A service's typed ends: what is sent is recorded byte for byte, and only the newest value is kept."""
 
+import pytest
+
 from hilrig_runtime.clock import ManualClock
 from hilrig_runtime.config import LabConfig
 from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
@@ -90,6 +92,7 @@ def test_health_comes_once_a_second_with_what_was_counted() -> None:
     MemoryBus(hub).subscribe(HEALTH.key("lab", "*", "*"), lambda _, payload: seen.append(HEALTH.decode(payload)))
     with make_service(hub, clock) as service:
         service.counters.requests = 3
+        service.counters.published = 500
         service.counters.latenesses_ns += range(101)
         for _ in range(30):
             clock.advance(100_000_000)
@@ -97,4 +100,6 @@ def test_health_comes_once_a_second_with_what_was_counted() -> None:
         assert [health.requests for health in seen] == [3, 3, 3]
         assert (seen[0].lateness_p50_ns, seen[0].lateness_p99_ns, seen[0].lateness_max_ns) == (50, 99, 100)
         assert seen[1].lateness_max_ns == 0
+        # Rates are of the last second, counts since the start.
+        assert [health.published_hz for health in seen] == pytest.approx([500, 0, 0], rel=0.01)
         assert (seen[0].service, seen[0].instance, seen[0].incarnation) == ("sim", "1", service.incarnation)

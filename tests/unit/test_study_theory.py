@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from hilrig_runtime.errors import InputError
 from hilrig_sim.model import ArmParameters, RigParameters, StepParameters
 from hilrig_sim.plant import Plant
-from hilrig_study.controllers import ComputedTorque, LawController, Pid
+from hilrig_study.controllers import ComputedTorque, LawController, Measured, Pid
 from hilrig_study.linear import LinearPlant, linearise
 from hilrig_study.lqr import PredictiveLqr
 from hilrig_study.margins import LinearLaw, is_stable, linearise_law, loop_matrix, loop_of, margins, spectral_radius
@@ -85,6 +85,23 @@ def test_a_pds_law_is_found_as_it_is_written() -> None:
     by_hand = -KP[0] - KD[0] * take * (1 - 1 / z) / (1 - beta / z)
     np.testing.assert_allclose(law.response(omega)[:, 0, 0], by_hand, rtol=1e-7)
     np.testing.assert_allclose(law.response(omega)[:, 0, 1], 0, atol=1e-6)
+
+
+def test_an_integral_is_held_within_its_limit_and_comes_back_at_once() -> None:
+    gain = 3.0
+    controller = Pid(ARM, STEP_S, (0.0,) * 4, (0.0,) * 4, (gain,) * 4)
+    controller.begin(1)
+
+    def efforts(off: float, polls: int) -> np.ndarray:
+        for _ in range(polls):
+            measured = Measured(np.zeros(1), np.zeros((4, 1)), np.full((4, 1), off), np.zeros(1))
+            effort = controller.update(measured)
+        return effort[:, 0] - np.array([0, 0, -ARM.masses[2] * 9.81, 0])
+
+    assert efforts(0.5, 10) == pytest.approx([gain * 0.1, gain * 0.1, gain * 0.02, gain * 0.1])
+    wound_up = [gain * 0.2, gain * 0.2, gain * 0.02, gain * 0.2]
+    assert efforts(0.5, 1000) == pytest.approx(wound_up)
+    assert efforts(-0.5, 1) == pytest.approx([effort - gain * 0.5 * STEP_S for effort in wound_up])
 
 
 def test_an_integral_without_gain_is_no_mode_of_the_loop() -> None:

@@ -96,6 +96,26 @@ def test_missing_states_are_gaps_not_divergence(run: list[Made], tmp_path: Path)
     assert "2 gaps" in found.sentence()
 
 
+def test_a_simulation_that_was_started_anew_is_a_gap_though_its_steps_go_on(run: list[Made], tmp_path: Path) -> None:
+    restarted = copied(run)
+    for state in states(restarted)[200:]:
+        state.incarnation += 1
+        # Whatever was before, it stands somewhere else now.
+        state.position[3] += 0.5
+    found = verify(write(tmp_path / "run.mcap", restarted), tolerance=0.0)
+    assert found.gaps == 1
+    assert found.first_diverging_step != states(restarted)[199].step
+
+
+def test_another_part_on_the_magnet_is_found(run: list[Made], tmp_path: Path) -> None:
+    changed = copied(run)
+    state = next(state for state in states(changed) if state.held_part == "blue")
+    state.held_part = "red"
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert found.first_diverging_step == state.step - 1
+    assert found.largest_part_deviation == np.inf
+
+
 def test_without_a_tolerance_it_depends_on_the_machine(run: list[Made], tmp_path: Path) -> None:
     found = verify(write(tmp_path / "run.mcap", run))
     assert found.machine != machine_name()
