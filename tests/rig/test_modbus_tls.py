@@ -1,5 +1,6 @@
 """Modbus/TCP Security: right, wrong, expired and missing certificates, and what a role lets its bearer do."""
 
+import gc
 import json
 import shutil
 import socket
@@ -12,6 +13,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from random import Random, SystemRandom
 
 import pytest
 from cryptography import x509
@@ -201,16 +203,81 @@ def test_a_handshake_that_is_never_finished_is_given_up(
     rig: EdgeRig, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hilrig_modbus_edge.tls.HANDSHAKE_TIMEOUT_S", 0.2)
-    incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
-    hello = lab.client("operator").wrap_bio(incoming, outgoing, server_hostname="localhost")
-    with pytest.raises(ssl.SSLWantReadError):
-        hello.do_handshake()
     with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as slow:
-        slow.sendall(outgoing.read())
+        slow.sendall(Handshake(lab.client("operator")).go_on(b""))
         while slow.recv(4096):
             pass
     assert "longer than 0.2 seconds" in rig.event(Event.CONNECTION_REFUSED).text
     assert talk(rig, lab.client("operator"), READ)
+
+
+@pytest.mark.parametrize("says_hello", [False, True])
+def test_who_hangs_up_before_the_connection_is_secured_is_told_of(
+    rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, says_hello: bool
+) -> None:
+    with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as leaving:
+        if says_hello:
+            leaving.sendall(Handshake(lab.client("operator")).go_on(b""))
+            assert leaving.recv(1)
+    assert "closed the connection before it was secured" in rig.event(Event.CONNECTION_REFUSED).text
+    assert talk(rig, lab.client("operator"), READ)
+    gc.collect()
+    assert not caplog.records
+
+
+class Handshake:
+    """A client's side of a handshake, by hand."""
+
+    def __init__(self, context: ssl.SSLContext) -> None:
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._client = context.wrap_bio(self._incoming, self._outgoing, server_hostname="localhost")
+        self.done = False
+
+    def go_on(self, received: bytes) -> bytes:
+        """What the client says to what it received."""
+        self._incoming.write(received)
+        with suppress(ssl.SSLWantReadError):
+            self._client.do_handshake()
+            self.done = True
+        return self._outgoing.read()
+
+
+def mutated(random: Random, data: bytes) -> bytes:
+    """Data with a byte changed, cut off, or with something in between."""
+    place = random.randrange(len(data) + 1)
+    how = random.randrange(4)
+    if how == 0 and place < len(data):
+        return data[:place] + random.randbytes(1) + data[place + 1 :]
+    if how == 1:
+        return data[:place]
+    return data[:place] + random.randbytes(random.randint(1, 40)) + data[place:]
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_mutated_handshakes_hurt_nobody(
+    rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, version: ssl.TLSVersion
+) -> None:
+    seed = SystemRandom().randrange(2**32)
+    print(f"seed {seed}")
+    random = Random(seed)
+    context = lab.client("operator")
+    context.minimum_version = context.maximum_version = version
+    for number in range(100):
+        handshake = Handshake(context)
+        address = "127.0.0.1", rig.lab.tls_ports["rig1"]
+        with suppress(OSError), socket.create_connection(address, timeout=0.05) as client:
+            received = b""
+            for flight in range(4):
+                said = handshake.go_on(received)
+                client.sendall(mutated(random, said) if flight >= number % 3 else said)
+                if handshake.done:
+                    break
+                received = client.recv(20_000)
+    assert talk(rig, context, READ)
+    eventually(lambda: rig.service.counters.connections == 0)
+    assert rig.service.counters.refused
+    gc.collect()
+    assert {record.name for record in caplog.records} <= {"hilrig_modbus_edge.server"}
 
 
 @pytest.mark.parametrize("size", [300, 5_000, 300_000])

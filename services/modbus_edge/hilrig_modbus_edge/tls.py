@@ -27,6 +27,8 @@ Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
 HANDSHAKE_TIMEOUT_S: Final = 5.0
 """How long a client may take to begin TLS, and to end it."""
 
+_HUNG_UP: Final = "it closed the connection before it was secured"
+
 logger = logging.getLogger(__name__)
 
 
@@ -112,10 +114,15 @@ class TlsGate(asyncio.Protocol):
             return
         finally:
             self._admission.gates.discard(self)
-        if secured is None or secured.is_closing():
+        secret: ssl.SSLObject | None = None if secured is None else secured.get_extra_info("ssl_object")
+        if secured is None or secret is None or secret.version() is None:
+            # asyncio raises nothing where a peer hangs up in the middle.
+            self._admission.refuse(host, port, f"no TLS: {_HUNG_UP}")
+            self._transport.abort()
             return
-        certificate = secured.get_extra_info("ssl_object").getpeercert(binary_form=True)
-        right = self._policy.right_of(certificate)
+        if secured.is_closing():
+            return
+        right = self._policy.right_of(secret.getpeercert(binary_form=True) or b"")
         if right == "refuse":
             self._admission.refuse(host, port, "its certificate names no role that this lab knows")
             secured.abort()
@@ -140,6 +147,8 @@ def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLError):
         # Where the library has no reason, its text has a code in front and a line of its own source behind.
         return re.sub(r"^\[.*?] |\(_ssl.*$", "", error.reason or str(error)).strip().lower().replace("_", " ")
+    if isinstance(error, ConnectionResetError | BrokenPipeError):
+        return _HUNG_UP
     return str(error) or "the handshake took too long"
 
 
