@@ -129,6 +129,17 @@ def test_a_slow_disk_syncs_and_ends_files_in_turns() -> None:
         assert not all(writer.synced for writer in writers)
 
 
+def test_how_long_it_takes_until_all_is_safe_is_known() -> None:
+    writers = [FakeWriter(size=1, sync_s=0.1) for _ in range(3)]
+    with disk() as (thread, _):
+        for writer in writers:
+            thread.follow(writer)
+        eventually(lambda: thread.behind_s > 0.1, every_s=0.01)
+        eventually(lambda: all(writer.synced for writer in writers))
+        # Nothing is written any more.
+        eventually(lambda: thread.behind_s < 0.1)
+
+
 def test_at_the_end_every_file_gets_its_name_if_need_be_without_syncing() -> None:
     slow = FakeWriter()
     quick = FakeWriter()

@@ -54,6 +54,10 @@ class Disk:
         self._closing = threading.Event()
         self._hurry = threading.Event()
         self._ended = False
+        self._round_from_ns: int | None = None
+        """When all open files began to be synced, monotonic clock; None: they are."""
+        self._round_ns = 0
+        """How long that took the last time."""
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
@@ -67,6 +71,13 @@ class Disk:
         Nobody else may use the writer from now on.
         """
         self._jobs.put(_Job(writer, finish))
+
+    @property
+    def behind_s(self) -> float:
+        """How long it takes until what was written is safe, s."""
+        begun_ns = self._round_from_ns
+        going_on_ns = 0 if begun_ns is None else self._clock.monotonic_ns() - begun_ns
+        return max(self._round_ns, going_on_ns) * 1e-9
 
     def close(self, timeout_s: float) -> bool:
         """End what is waiting; after `timeout_s` without syncing, so that every file gets its name.
@@ -88,11 +99,14 @@ class Disk:
             if wait_ns > 0:
                 self._next_job(wait_ns * 1e-9)
                 continue
+            self._round_from_ns = self._clock.monotonic_ns()
             for item in list(self._open.values()):
                 if self._sync(item):
                     # In turns: many files that end, and many that are open, do not wait for all of the others.
                     self._next_job(0)
-            due_ns = self._clock.monotonic_ns() + LOOK_PERIOD_NS
+            now_ns = self._clock.monotonic_ns()
+            self._round_ns, self._round_from_ns = now_ns - self._round_from_ns, None
+            due_ns = now_ns + LOOK_PERIOD_NS
 
     def _next_job(self, timeout_s: float) -> None:
         try:

@@ -23,6 +23,10 @@ from hilrig_schemas import Event, RigConfig
 
 NAMED: Final = 3
 """Troubles that a health report names; events and the log name each."""
+SLOW_S: Final = 5.0
+"""A disk that takes longer to make safe what was written is told of."""
+_SPEED: Final = " speed"
+"""Among the troubles, where no rig is called so."""
 _SPACE_PERIOD_NS: Final = SECOND_NS
 _NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
 
@@ -150,6 +154,7 @@ class Files:
         if now_ns >= self._space_due_ns and not failed and not (self._space.full and self._ending):
             self._space_due_ns = now_ns + _SPACE_PERIOD_NS
             self._look_at_space()
+        self._look_at_speed()
         for file in list(self._files.values()):
             if file.failure is not None:
                 self._end_failed(file, file.failure)
@@ -249,6 +254,14 @@ class Files:
                     text=text,
                 )
             )
+
+    def _look_at_speed(self) -> None:
+        if self._disk.behind_s < SLOW_S:
+            self._trouble.pop(_SPEED, None)
+        elif _SPEED not in self._trouble:
+            text = f"{self.folder}: the disk is slow: what comes is safe from a power cut after {SLOW_S:g} s and more"
+            self._trouble[_SPEED] = text
+            self._tell(Event(kind=Event.RECORDING, severity=Event.WARNING, text=text))
 
     def _look_at_space(self) -> None:
         text = self._space.look()
