@@ -4,7 +4,7 @@ import contextlib
 import logging
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from hilrig_runtime.bus import Bus
@@ -47,8 +47,27 @@ def run_service(
         return
     with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
         logger.debug("running as %s", service.source)
-        run(service)
+        with _no_thread_missing(service):
+            run(service)
         service.check()
+
+
+@contextlib.contextmanager
+def _no_thread_missing(service: Service) -> Iterator[None]:
+    """Where a mistake ends a thread the service would run on with half of its work: it ends, to be started anew."""
+    before = threading.excepthook
+
+    def on_mistake(ended: threading.ExceptHookArgs) -> None:
+        before(ended)
+        if not service.stopping.is_set():
+            name = ended.thread.name if ended.thread is not None else "unknown"
+            service.fail(f"{service.source}: its thread {name!r} was ended by a mistake in the program (see above)")
+
+    threading.excepthook = on_mistake
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def _ask_for_time(name: str, lab: LabConfig) -> None:

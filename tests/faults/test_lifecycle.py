@@ -33,6 +33,11 @@ def stubborn(service):
 def failing(service):
     raise InputError("lab.toml: sim.step: unknown key")
 
+def crippled(service):
+    service.ready()
+    threading.Thread(target=lambda: 1 / 0, name="worker").start()
+    service.stopping.wait()
+
 def main():
     lab = LabConfig(bus=BusConfig(first_port={port}))
     run_service("sim", {run}, lab, stop_with_parent={parent}, close_timeout_s={timeout})
@@ -107,6 +112,16 @@ def test_a_service_ends_with_its_parent(tmp_path: Path) -> None:
     output, _ = process.communicate(timeout=10)
     assert output == "closing\nended\n"
     assert process.returncode == 0
+
+
+def test_a_service_does_not_run_on_without_one_of_its_threads(tmp_path: Path) -> None:
+    process = start(tmp_path, "crippled", ready=False)
+    output, errors = process.communicate(timeout=20)
+    assert output == ""
+    assert "ZeroDivisionError" in errors
+    last = errors.splitlines()[-1]
+    assert last == "hilrig: error: sim/1: its thread 'worker' was ended by a mistake in the program (see above)"
+    assert process.returncode == 3
 
 
 def test_an_error_is_one_line_and_its_exit_code(tmp_path: Path) -> None:

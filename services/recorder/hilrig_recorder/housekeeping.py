@@ -1,5 +1,6 @@
 """What a recorder does beside recording, in no hurry: recovering what was left unfinished, keeping the disk tidy."""
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -50,7 +51,8 @@ class Housekeeping:
 
     def _run(self) -> None:
         for draft in self._folder.glob(f"*/*{RECOVERING_SUFFIX}"):
-            draft.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                draft.unlink()
         # First the sessions that go on get their next files.
         if self._parts:
             self._ended.wait(HEAD_START_S)
