@@ -5,6 +5,8 @@
  * usage: modbus_client churn PORT COUNT
  *   connect, read once, disconnect, COUNT times
  * Prints one JSON object: cycles a second of all connections, and the time of a read and of a cycle in microseconds.
+ * At a rate, a cycle that is due while the one before is not answered begins after it, and its time counts from when it
+ * was due: a server that falls behind is not asked less often for that.
  * One thread and raw frames: the client costs little beside the server that it measures.
  */
 #include <arpa/inet.h>
@@ -28,7 +30,7 @@ static const uint8_t WRITE[] = {0, 2, 0, 0, 0, 15, 1, 16, 0, 0, 0, 4, 8, 0, 1, 0
 
 struct connection {
     int fd;
-    int writing;
+    int writing, busy;
     size_t have;
     uint8_t answer[300];
     int64_t began, asked, due;
@@ -68,10 +70,12 @@ static void ask(struct connection *c, const uint8_t *request, size_t size)
     }
 }
 
-static void begin(struct connection *c)
+static void begin(struct connection *c, int64_t due)
 {
     c->writing = 0;
+    c->busy = 1;
     ask(c, READ, sizeof READ);
+    if (due) c->asked = due;
     c->began = c->asked;
 }
 
@@ -129,18 +133,18 @@ int main(int argc, char **argv)
     for (int i = 0; i < connections; i++) {
         /* At a rate, the connections are spread over the period. */
         all[i].due = start + (period ? period * i / connections : 0);
-        if (!period) begin(&all[i]);
+        if (!period) begin(&all[i], 0);
     }
     while (now() < end) {
         int timeout = 100;
         if (period) {
             int64_t t = now(), next = end;
             for (int i = 0; i < connections; i++) {
-                if (all[i].due <= t) {
+                if (all[i].due <= t && !all[i].busy) {
+                    begin(&all[i], 0);
                     all[i].due += period;
-                    begin(&all[i]);
                 }
-                if (all[i].due < next) next = all[i].due;
+                if (!all[i].busy && all[i].due < next) next = all[i].due;
             }
             timeout = (int)((next - t) / 1000000);
         }
@@ -168,7 +172,13 @@ int main(int argc, char **argv)
             reads[count] = c->read_us;
             cycles[count] = (float)((double)(t - c->began) * 1e-3);
             if (++count == SAMPLES) end = t;
-            if (!period) begin(c);
+            c->busy = 0;
+            if (!period) {
+                begin(c, 0);
+            } else if (c->due <= t) {
+                begin(c, c->due);
+                c->due += period;
+            }
         }
     }
     double lasted = (double)(now() - start) * 1e-9;
