@@ -5,6 +5,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Final
@@ -119,6 +120,7 @@ def _percentile(ordered: list[int], share: float) -> int:
 def resident_bytes() -> int:
     """Memory of this process that is resident, bytes; 0 where the system does not tell."""
     if sys.platform == "linux":
-        with open("/proc/self/statm", "rb") as statm:  # noqa: PTH123  # once a second on a real-time loop
+        # A process that may open no more files, for all of them are connections, works on.
+        with suppress(OSError), open("/proc/self/statm", "rb") as statm:  # noqa: PTH123  # once a second on a real-time loop
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
