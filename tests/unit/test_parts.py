@@ -60,3 +60,9 @@ def test_a_file_that_was_moved_away_keeps_its_number(tmp_path: Path) -> None:
     assert (part.number, part.path.name) == (3, f"{SESSION}.3.mcap")
     assert part.previous is not None
     assert part.previous.name == f"{SESSION}.2.mcap"
+
+
+def test_a_folder_that_can_not_be_looked_into_is_not_taken_for_empty(tmp_path: Path) -> None:
+    (tmp_path / "rig1").touch()
+    with pytest.raises(NotADirectoryError):
+        next_part(tmp_path / "rig1", SESSION)

@@ -293,3 +293,14 @@ def test_a_file_that_somebody_cut_meanwhile_is_not_finished(tmp_path: Path) -> N
     with pytest.raises(OSError, match="can't be read back"):
         writer.finish()
     writer.discard()
+
+
+def test_a_recording_never_takes_the_place_of_another(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path)
+    writer.finish()
+    path.write_bytes(b"another")
+    with pytest.raises(FileExistsError):
+        writer.publish()
+    assert path.read_bytes() == b"another"
+    assert writer.part.exists()

@@ -87,7 +87,9 @@ class Files:
     def open(self, recording: Recording) -> Sink | None:
         """See `Shelf.open`."""
         folder = self.folder / recording.rig
-        part = next_part(folder, recording.session)
+        part = self._next_part(recording)
+        if part is None:
+            return None
         if part.previous is not None:
             tail = tail_of_session(folder, recording.session, part.number - 1, self._repeated_ns)
             if tail.end == "ended":
@@ -169,6 +171,14 @@ class Files:
 
     # -- files ------------------------------------------------------------------------------------------------------
 
+    def _next_part(self, recording: Recording, after: str = "") -> NextPart | None:
+        folder = self.folder / recording.rig
+        try:
+            return next_part(folder, recording.session, after)
+        except OSError as error:
+            self._report(recording, f"{folder}: can't be recorded: {self._space.why(error)}")
+            return None
+
     def _open(self, recording: Recording, part: NextPart) -> RunFile | None:
         about = Metadata("hilrig.session", self._session_values(recording, part))
         try:
@@ -210,7 +220,8 @@ class Files:
     def _rotate(self, file: RunFile) -> None:
         recording = file.recording
         before = file.writer.path.name
-        following = self._open(recording, next_part(self.folder / recording.rig, recording.session, before))
+        part = self._next_part(recording, before)
+        following = None if part is None else self._open(recording, part)
         if following is None:
             # The old file goes on; the trouble was told.
             file.opened_ns = self._clock.monotonic_ns()

@@ -30,11 +30,14 @@ def next_part(folder: Path, session: str, after: str = "") -> NextPart:
     """The file after the last of a session, whole or unfinished, and behind the file of the name `after`.
 
     Those before may be deleted or moved away already.
+
+    Raises:
+        OSError: the folder can't be looked into.
     """
     try:
         names = [path.name for path in folder.iterdir()]
-    except OSError:
-        # Not there yet; what else may be wrong with it shows when the file is opened.
+    except FileNotFoundError:
+        # Not there yet.
         names = []
     number = max(_number(name, session) for name in (*names, after))
     previous = folder / file_name(session, number) if number else None

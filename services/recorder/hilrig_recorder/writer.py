@@ -214,6 +214,8 @@ class RunWriter:
         """Give the finished file its name, so that it survives a power cut; the path it has now."""
         try:
             self._find()
+            if self.path.exists():
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
             if durably:
                 self.sync()
         finally:
