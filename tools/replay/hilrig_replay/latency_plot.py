@@ -10,6 +10,7 @@ from matplotlib.ticker import NullLocator
 
 from hilrig_replay.distribution import tail
 from hilrig_replay.latency import LatencyReport
+from hilrig_replay.motion_plot import label
 from hilrig_replay.palette import INK, STAGE_COLORS, STAGE_NAMES
 from hilrig_replay.run import Run
 from hilrig_replay.samples import STAGES
@@ -115,7 +116,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     axes.set_xlim(0, limit)
     axes.set_ylim(bottom=0.7)
     more = f"; {beyond} beyond {limit:g} ms" if beyond else ""
-    _label(axes, f"Histogram (grid: steps of {step:g} ms{more})", "loop latency, ms", "samples")
+    label(axes, f"Histogram (grid: steps of {step:g} ms{more})", "loop latency, ms", "samples")
 
 
 def _stages(axes: Axes, report: LatencyReport) -> None:
@@ -136,7 +137,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
     axes.set_yticks(range(len(STAGES)), [STAGE_NAMES[stage] for stage in STAGES])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max(1e-3, *(report.stages_ms[stage].p99 for stage in STAGES)))
-    _label(axes, "Stages: bar to p50 (figure), line to p99", "ms", "")
+    label(axes, "Stages: bar to p50 (figure), line to p99", "ms", "")
 
 
 def _tail(axes: Axes, report: LatencyReport) -> None:
@@ -157,7 +158,7 @@ def _tail(axes: Axes, report: LatencyReport) -> None:
                 color=_MARK,
             )
     axes.set_xlim(left=max(0.0, float(loop_ns[0]) / 1e6 - 0.1 * report.step_ms))
-    _label(axes, "Tail (share of samples that took longer)", "loop latency, ms", "share")
+    label(axes, "Tail (share of samples that took longer)", "loop latency, ms", "share")
 
 
 def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
@@ -183,7 +184,7 @@ def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
     )
     axes.set_ylim(0, 1.1 * float(slowest.max()))
     axes.axhline(report.step_ms, color="#bbbbbb", linewidth=0.8, zorder=0)
-    _label(axes, "Over time", "time in the run, s", "loop latency, ms")
+    label(axes, "Over time", "time in the run, s", "loop latency, ms")
 
 
 def _log_scale(axes: Axes) -> None:
@@ -191,11 +192,3 @@ def _log_scale(axes: Axes) -> None:
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_locator(NullLocator())
-
-
-def _label(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=9, loc="left", color=INK)
-    axes.set_xlabel(x, fontsize=8, color=INK)
-    axes.set_ylabel(y, fontsize=8, color=INK)
-    axes.tick_params(labelsize=8, colors=INK)
-    axes.spines[["top", "right"]].set_visible(False)

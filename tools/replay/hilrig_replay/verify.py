@@ -20,7 +20,7 @@ from hilrig_replay.columns import Names, Rows
 from hilrig_replay.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_sim.machine import machine_name
-from hilrig_sim.model import RigParameters
+from hilrig_sim.model import JOINT_SCALE, RigParameters
 from hilrig_sim.plant import Plant
 from hilrig_sim.world import NONE
 
@@ -89,12 +89,7 @@ class Verification:
         return f"{head}, as recorded within {self.tolerance:g}; largest deviations {self._deviations()}"
 
     def _deviations(self) -> str:
-        theta1, theta2, d3, theta4 = np.array(self.largest_deviation) * [
-            57.29577951308232,
-            57.29577951308232,
-            1e3,
-            57.29577951308232,
-        ]
+        theta1, theta2, d3, theta4 = np.array(self.largest_deviation) * JOINT_SCALE
         return f"θ1 {theta1:.3g}°, θ2 {theta2:.3g}°, d3 {d3:.3g} mm, θ4 {theta4:.3g}°"
 
 
