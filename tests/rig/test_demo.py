@@ -37,7 +37,7 @@ def test_its_latency_is_what_the_latency_command_says(demo: tuple[Path, dict[str
     latency = json.loads(again.stdout)
     assert latency == said["latency"]
     assert {"samples", "loop_ms", "stages_ms", "step_ms", "lost", "fit", "reasons"} <= set(latency)
-    assert set(latency["lost"]) == {"transport", "recorder"}
+    assert set(latency["lost"]) == {"transport", "recorder", "file"}
     assert set(latency["stages_ms"]) == set(STAGES)
     statistics = {"p50", "p95", "p99", "p999", "max", "mean", "std"}
     assert all(statistics <= set(figures) for figures in (latency["loop_ms"], *latency["stages_ms"].values()))
@@ -55,7 +55,7 @@ def test_the_stages_of_each_sample_add_up_exactly_and_none_is_negative(demo: tup
 
 def test_nothing_is_lost(demo: tuple[Path, dict[str, Any]]) -> None:
     _, said = demo
-    assert said["latency"]["lost"] == {"transport": 0, "recorder": 0}
+    assert said["latency"]["lost"] == {"transport": 0, "recorder": 0, "file": 0}
 
 
 def test_the_recording_is_verified_and_every_part_stands_in_the_tray(demo: tuple[Path, dict[str, Any]]) -> None:
