@@ -14,6 +14,7 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import harness
+import numpy as np
 from harness import Report, build_c, progress
 from modbus_servers import (
     NowhereBus,
@@ -32,6 +34,8 @@ from modbus_servers import (
     serving_c,
     serving_c_beside_the_bus,
 )
+from numpy.typing import NDArray
+from stolen import StolenTime
 
 from hilrig_modbus_edge.admission import Limits
 from hilrig_modbus_edge.device import Device
@@ -97,20 +101,36 @@ def measure(report: Report, quick: bool) -> None:
 
 
 def measure_at_equal_rates(report: Report, client: Path, servers: dict[str, Callable[[int], Any]], quick: bool) -> None:
-    """What a controller sees that asks at a rate of its own, the same of both servers."""
-    runs, seconds = (1, 2.0) if quick else (5, 4.0)
-    measured: dict[tuple[str, int], list[Figures]] = {}
-    for number in range(runs):
-        for rate in RATES:
-            for name in (C_SERVER, WHOLE):
-                progress(f"{name}, 2 connections at {rate} Hz, run {number + 1} of {runs}")
-                with servers[name](2) as (port, step, _):
-                    measured.setdefault((name, rate), []).append(ask(client, port, step, 2, seconds, rate))
-    for (name, rate), figures in measured.items():
-        for share in ("p50", "p99"):
-            report.add(f"{name}, 2 connections at {rate} Hz", f"read {share}", middle(figures, "read_us", share), "µs")
+    """What a controller sees that asks at a rate of its own, the same of both servers.
+
+    Of so few reads one that the host held up is soon the slowest hundredth: those with stolen time near do not count.
+    """
+    runs, seconds = (1, 2.0) if quick else (6, 4.0)
+    reads: dict[tuple[str, int], list[NDArray[np.float64]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        samples = Path(folder) / "samples"
+        for number in range(runs):
+            for rate in RATES:
+                for name in (C_SERVER, WHOLE):
+                    progress(f"{name}, 2 connections at {rate} Hz, run {number + 1} of {runs}")
+                    with servers[name](2) as (port, step, _), StolenTime() as stolen:
+                        ask(client, port, step, 2, seconds, rate, samples)
+                    over_wall_ns, read_ns = np.fromfile(samples, np.int64).reshape(-1, 2).T
+                    counting = read_ns[stolen.undisturbed(over_wall_ns)] * 1e-3
+                    reads.setdefault((name, rate), []).append(counting)
+    p99: dict[tuple[str, int], float] = {}
+    for (name, rate), parts in reads.items():
+        case = f"{name}, 2 connections at {rate} Hz"
+        counting = np.concatenate(parts)
+        report.add(case, "reads with no stolen time near", len(counting), "count")
+        if len(counting):
+            p50_us, p99_us = np.quantile(counting, (0.5, 0.99))
+            report.add(case, "read p50", float(p50_us), "µs")
+            report.add(case, "read p99", float(p99_us), "µs")
+            p99[name, rate] = float(p99_us)
     for rate in RATES:
-        slow = middle(measured[WHOLE, rate], "read_us", "p99") / middle(measured[C_SERVER, rate], "read_us", "p99")
+        nan = float("nan")
+        slow = p99.get((WHOLE, rate), nan) / p99.get((C_SERVER, rate), nan)
         report.bar(f"p99 of a read, whole edge against libmodbus, 2 connections at {rate} Hz", slow, "<=", 2.0)
 
 
@@ -178,8 +198,17 @@ def measure_resources(report: Report, client: Path, quick: bool) -> None:
         report.bar(f"handles more after {connections:,} connections", more_handles, "<=", 0, "count")
 
 
-def ask(client: Path, port: int, step: int, connections: int, seconds: float, rate: float = 0.0) -> Figures:
-    command = [client, *map(str, (port, step, connections, seconds, rate))]
+def ask(
+    client: Path,
+    port: int,
+    step: int,
+    connections: int,
+    seconds: float,
+    rate: float = 0.0,
+    samples: Path | None = None,
+) -> Figures:
+    """What the client in C found; into `samples` goes each read, as it says."""
+    command = [client, *map(str, (port, step, connections, seconds, rate)), *([samples] if samples else [])]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=seconds + 30)
     figures: Figures = json.loads(done.stdout)
     return figures

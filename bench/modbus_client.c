@@ -1,7 +1,8 @@
 /* Controllers that ask as fast as they can, or at a rate: read 4 positions, write 4 torques, on each connection.
  *
- * usage: modbus_client PORT STEP CONNECTIONS SECONDS RATE
+ * usage: modbus_client PORT STEP CONNECTIONS SECONDS RATE [FILE]
  *   connection i goes to port PORT + i * STEP; RATE is cycles a second on each connection, 0 as fast as possible
+ *   into FILE go two 64-bit numbers a read: when its cycle was over, ns of the wall clock, and the time it took, ns
  * usage: modbus_client churn PORT COUNT
  *   connect, read once, disconnect, COUNT times
  * Prints one JSON object: cycles a second of all connections, and the time of a read and of a cycle in microseconds.
@@ -38,13 +39,19 @@ struct connection {
 };
 
 static float *reads, *cycles;
+static int64_t *over;
 static size_t count;
+
+static int64_t clock_ns(clockid_t clock)
+{
+    struct timespec t;
+    clock_gettime(clock, &t);
+    return t.tv_sec * 1000000000LL + t.tv_nsec;
+}
 
 static int64_t now(void)
 {
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return t.tv_sec * 1000000000LL + t.tv_nsec;
+    return clock_ns(CLOCK_MONOTONIC);
 }
 
 static int dial(int port)
@@ -92,6 +99,24 @@ static void print_times(const char *name, float *times)
            times[count * 99 / 100], times[count * 999 / 1000], times[count - 1]);
 }
 
+static void write_samples(const char *path)
+{
+    int64_t to_wall = clock_ns(CLOCK_REALTIME) - now();
+    FILE *file = fopen(path, "wb");
+    if (!file) {
+        perror(path);
+        exit(3);
+    }
+    for (size_t i = 0; i < count; i++) {
+        int64_t sample[] = {over[i] + to_wall, (int64_t)((double)reads[i] * 1e3)};
+        fwrite(sample, sizeof sample, 1, file);
+    }
+    if (fclose(file)) {
+        perror(path);
+        exit(3);
+    }
+}
+
 static int churn(int port, int times)
 {
     for (int i = 0; i < times; i++) {
@@ -110,8 +135,8 @@ static int churn(int port, int times)
 int main(int argc, char **argv)
 {
     if (argc == 4 && !strcmp(argv[1], "churn")) return churn(atoi(argv[2]), atoi(argv[3]));
-    if (argc != 6) {
-        fprintf(stderr, "usage: %s PORT STEP CONNECTIONS SECONDS RATE\n", argv[0]);
+    if (argc != 6 && argc != 7) {
+        fprintf(stderr, "usage: %s PORT STEP CONNECTIONS SECONDS RATE [FILE]\n", argv[0]);
         return 2;
     }
     int port = atoi(argv[1]), step = atoi(argv[2]), connections = atoi(argv[3]);
@@ -123,6 +148,7 @@ int main(int argc, char **argv)
     if (connections > MOST) return 2;
     reads = malloc(SAMPLES * sizeof *reads);
     cycles = malloc(SAMPLES * sizeof *cycles);
+    over = malloc(SAMPLES * sizeof *over);
 
     for (int i = 0; i < connections; i++) {
         struct epoll_event event = {.events = EPOLLIN, .data.ptr = &all[i]};
@@ -169,6 +195,7 @@ int main(int argc, char **argv)
                 ask(c, WRITE, sizeof WRITE);
                 continue;
             }
+            over[count] = t;
             reads[count] = c->read_us;
             cycles[count] = (float)((double)(t - c->began) * 1e-3);
             if (++count == SAMPLES) end = t;
@@ -186,6 +213,7 @@ int main(int argc, char **argv)
         fprintf(stderr, "no cycle was completed\n");
         return 3;
     }
+    if (argc == 7) write_samples(argv[6]);
     printf("{\"cycles_per_s\": %.1f, ", (double)count / lasted);
     print_times("read_us", reads);
     printf(", ");
