@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -50,6 +51,9 @@ QUESTION = "How fast does the edge answer, next to pymodbus's own server and to 
 CONNECTIONS = (1, 2, 16)
 RATES = (50, 100, 200)
 """Cycles a second of a controller: PLCs poll every 10 to 20 ms where they are tuned, every 5 where they are fast."""
+MOST_TRIES = 4
+NEXT_TO_NOTHING = 0.01
+"""Taken away by the host, processors: a hundredth of the time of one is the slowest hundredth of the requests."""
 STOCK, C_SERVER, ALONE, WHOLE = "pymodbus's server", "libmodbus server in C", "ours, protocol alone", "ours, whole"
 C_BESIDE = "libmodbus server in C, the bus beside it"
 
@@ -74,11 +78,7 @@ def measure(report: Report, quick: bool) -> None:
                 if name == C_BESIDE and connections != 2:
                     continue
                 progress(f"{name}, {connections} connections, run {number + 1} of {runs}")
-                with start(connections) as (port, step, pid):
-                    before = cpu_seconds(pid)
-                    figures = ask(client, port, step, connections, seconds)
-                    used = cpu_seconds(pid) - before
-                figures["cpu_us"] = 1e6 * used / (figures["cycles_per_s"] * seconds)
+                figures = least_disturbed(partial(one_run, start, client, connections, seconds))
                 measured.setdefault((name, connections), []).append(figures)
     for (name, connections), figures in measured.items():
         case = f"{name}, {connections} connection{'s' if connections > 1 else ''}"
@@ -86,6 +86,7 @@ def measure(report: Report, quick: bool) -> None:
         report.add(case, "read p50", middle(figures, "read_us", "p50"), "µs")
         report.add(case, "read p99", middle(figures, "read_us", "p99"), "µs")
         report.add(case, "processor time a cycle", middle(figures, "cpu_us"), "µs")
+        report.add(case, "taken away by the host", middle(figures, "stolen"), "processors")
     at_two = {name: middle(measured[name, 2], "cycles_per_s") for name in servers}
     report.bar("protocol alone against pymodbus's server, 2 connections", at_two[ALONE] / at_two[STOCK], ">=", 3.5)
     report.bar("protocol alone against libmodbus, 2 connections", at_two[ALONE] / at_two[C_SERVER], ">=", 0.45)
@@ -98,6 +99,26 @@ def measure(report: Report, quick: bool) -> None:
     measure_at_equal_rates(report, client, servers, quick)
     measure_own_code(report, middle(measured[ALONE, 2], "cpu_us"), middle(measured[WHOLE, 2], "cpu_us"))
     measure_resources(report, client, quick)
+
+
+def one_run(start: Callable[[int], Any], client: Path, connections: int, seconds: float) -> Figures:
+    with start(connections) as (port, step, pid), StolenTime() as stolen:
+        before = cpu_seconds(pid)
+        figures = ask(client, port, step, connections, seconds)
+        used = cpu_seconds(pid) - before
+    figures["cpu_us"] = 1e6 * used / (figures["cycles_per_s"] * seconds)
+    figures["stolen"] = stolen.share
+    return figures
+
+
+def least_disturbed(run: Callable[[], Figures]) -> Figures:
+    """Of some runs the one in which the host took least; the first in which it took next to nothing is enough."""
+    tries = []
+    for _ in range(MOST_TRIES):
+        tries.append(run())
+        if tries[-1]["stolen"] <= NEXT_TO_NOTHING:
+            break
+    return min(tries, key=lambda figures: float(figures["stolen"]))
 
 
 def measure_at_equal_rates(report: Report, client: Path, servers: dict[str, Callable[[int], Any]], quick: bool) -> None:
