@@ -51,7 +51,7 @@ QUESTION = "How fast does the edge answer, next to pymodbus's own server and to 
 CONNECTIONS = (1, 2, 16)
 RATES = (50, 100, 200)
 """Cycles a second of a controller: PLCs poll every 10 to 20 ms where they are tuned, every 5 where they are fast."""
-MOST_TRIES = 4
+MOST_TRIES = 2
 NEXT_TO_NOTHING = 0.01
 """Taken away by the host, processors: a hundredth of the time of one is the slowest hundredth of the requests."""
 STOCK, C_SERVER, ALONE, WHOLE = "pymodbus's server", "libmodbus server in C", "ours, protocol alone", "ours, whole"
