@@ -7,7 +7,7 @@ import pytest
 from hilrig_replay.diagnosis import Finding
 from hilrig_replay.latency import measure
 from hilrig_replay.run import open_run
-from recordings import Script, record
+from recordings import Script, make, record, write
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:
@@ -88,3 +88,16 @@ def test_torques_of_the_previous_poll(tmp_path: Path, poll_ms: float) -> None:
 @pytest.mark.parametrize("poll_ms", [5.0, 20.0, 40.0, 100.0])
 def test_torques_of_the_poll_just_made(tmp_path: Path, poll_ms: float) -> None:
     assert "previous_poll" not in findings(tmp_path, Script(seconds=20.0, poll_ms=poll_ms, law="feedback"))
+
+
+@pytest.mark.parametrize("basis_step", [0, 1, 5], ids=["never reads", "unknown step", "reads once"])
+def test_commands_without_a_basis_in_the_window(tmp_path: Path, basis_step: int) -> None:
+    script = Script(seconds=30.0, poll_ms=20.0, law="feedback")
+    made = make(script)
+    for item in made:
+        if item.topic == "command":
+            item.message.basis_step = basis_step
+        elif item.topic == "state" and item.message.basis_step:
+            item.message.basis_step = basis_step
+    report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
+    assert "previous_poll" not in {finding.kind for finding in report.findings}

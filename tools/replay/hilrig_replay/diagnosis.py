@@ -284,6 +284,8 @@ def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[flo
     at = np.minimum(np.searchsorted(states["step"], commands["basis_step"]), len(states) - 1)
     known = states["step"][at] == commands["basis_step"]
     commands, at = commands[known], at[known]
+    if len(commands) < length:
+        return []
     # Polls that saw the same state say nothing about which one was used.
     fresh = np.concatenate(([True], np.diff(commands["basis_step"].astype(np.int64)) > 0))
     commands, at = commands[fresh], at[fresh]
