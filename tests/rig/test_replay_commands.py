@@ -124,6 +124,22 @@ def test_compare_prints_differences_and_writes_pictures(run: Path, tmp_path: Pat
     assert "tools apart, rms, mm" in table.stdout
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("report", "-o"), ("replay", "--save"), ("compare", "--save"), ("compare", "--plot"), ("latency", "--plot")],
+)
+@pytest.mark.parametrize("name", ["other.mcap", "other.mcap.part", "other.png"])
+def test_output_never_replaces_a_recording(run: Path, tmp_path: Path, command: str, option: str, name: str) -> None:
+    other = tmp_path / name
+    other.write_bytes(run.read_bytes())
+    inputs = [run, run] if command == "compare" else [run]
+    result = hilrig(command, option, other, *inputs)
+    assert result.returncode == 2
+    if option != "--plot" or name.endswith(".png"):
+        assert f"{other} is a recording: choose another output name" in result.stderr
+    assert other.read_bytes() == run.read_bytes()
+
+
 def test_where_a_report_can_not_be_written_is_said(run: Path, tmp_path: Path) -> None:
     result = hilrig("report", run, "--out", tmp_path / "nowhere" / "report.html")
     assert result.returncode == 2

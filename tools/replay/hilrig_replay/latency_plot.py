@@ -12,6 +12,7 @@ from hilrig_replay.distribution import tail
 from hilrig_replay.latency import LatencyReport
 from hilrig_replay.motion_plot import label
 from hilrig_replay.palette import INK, STAGE_COLORS, STAGE_NAMES
+from hilrig_replay.recording_file import refuse_recording
 from hilrig_replay.run import Run
 from hilrig_replay.samples import STAGES
 from hilrig_runtime.errors import InputError, OperationError
@@ -27,12 +28,13 @@ def check_plot_path(path: Path) -> None:
     """Refuse a picture that can't be written, before the work is done.
 
     Raises:
-        InputError: its ending names no format, or its folder is not there.
+        InputError: its ending names no format, its folder is not there, or it is a recording.
     """
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: a picture ends in {', '.join(FORMATS)}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+    refuse_recording(path)
 
 
 def save_plot(report: LatencyReport, run: Run, path: Path) -> None:

@@ -149,6 +149,22 @@ class _Contents:
     chunks: Table = field(default_factory=lambda: Table(CHUNK))
 
 
+def refuse_recording(output: Path) -> None:
+    """Refuse to write over a recording: a file with a recording's suffix or with MCAP's first bytes.
+
+    Raises:
+        InputError: `output` is a recording.
+    """
+    try:
+        with output.open("rb") as file:
+            begins_like_one = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+    except OSError:
+        # Missing, or not readable: the error of writing it is the one to report.
+        return
+    if begins_like_one or output.name.removesuffix(PART_SUFFIX).endswith(".mcap"):
+        raise InputError(f"{output} is a recording: choose another output name")
+
+
 def open_recording(path: Path) -> RecordingFile:
     """Read what a file says of itself; its messages stay on the disk.
 

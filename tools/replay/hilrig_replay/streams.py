@@ -6,6 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilrig_replay.fence import LOOPBACK
+from hilrig_replay.recording_file import refuse_recording
 from hilrig_runtime.errors import InputError, OperationError
 
 APPLICATION = "hilrig"
@@ -15,11 +16,12 @@ def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStre
     """A recording that is written to a file.
 
     Raises:
-        InputError: its folder is not there.
+        InputError: its folder is not there, or the path names a recording.
         OperationError: the file can't be written.
     """
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+    refuse_recording(path)
     try:
         # Asked of the system first: its answer is one clear word.
         path.open("wb").close()

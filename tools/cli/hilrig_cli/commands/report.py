@@ -38,12 +38,14 @@ def report(
     from rich.progress import Progress
 
     from hilrig_replay.assignment import read_task
+    from hilrig_replay.recording_file import refuse_recording
     from hilrig_replay.report import report as make_report
     from hilrig_replay.selection import recordings
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}")
+    refuse_recording(out)
     graded_by = None if task is None else read_task(task)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
