@@ -55,6 +55,42 @@ def test_the_basis_is_the_state_that_was_last_served_to_this_connection(bench: B
     assert [stamp - arrived_ns for stamp in stamps] == [0, 3, 12, 12]
 
 
+@pytest.mark.parametrize("reconnects", [True, False])
+def test_basis_never_comes_from_an_earlier_session(reconnects: bool) -> None:
+    bench = Bench(lease_ns=1_000 * MS, grace_ns=2_000 * MS)
+    bench.state(5)
+    client = bench.connect()
+    bench.read(client, 4, 4)
+    bench.write(client, 0, 1)
+    assert bench.commands[-1].basis_step == 5
+    if reconnects:
+        bench.device.disconnect(client, "closed")
+    bench.clock.advance(4_000 * MS)
+    bench.device.check(bench.clock.monotonic_ns())
+    bench.clock.advance(4_000 * MS)
+    bench.device.check(bench.clock.monotonic_ns())
+    assert bench.device.session is None
+    if reconnects:
+        client = bench.connect(port=1001)
+    bench.write(client, 0, 2)
+    assert bench.commands[-1].basis_step == 0
+    bench.state(6)
+    bench.read(client, 4, 4)
+    bench.write(client, 0, 3)
+    assert bench.commands[-1].basis_step == 6
+
+
+def test_read_of_the_next_controller_is_its_basis(bench: Bench) -> None:
+    holder, next_one = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.read(holder, 4, 4)
+    bench.write(holder, 0, 1)
+    bench.read(next_one, 4, 4)
+    bench.device.disconnect(holder, "closed")
+    bench.write(next_one, 0, 2)
+    assert bench.commands[-1].basis_step == 1
+    assert bench.commands[-1].controller == next_one.address
+
+
 def test_a_connection_that_reads_nothing_is_based_on_what_its_host_was_served(bench: Bench) -> None:
     reader, writer, stranger = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
     bench.state(9)

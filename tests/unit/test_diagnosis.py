@@ -95,9 +95,7 @@ def test_commands_without_a_basis_in_the_window(tmp_path: Path, basis_step: int)
     script = Script(seconds=30.0, poll_ms=20.0, law="feedback")
     made = make(script)
     for item in made:
-        if item.topic == "command":
-            item.message.basis_step = basis_step
-        elif item.topic == "state" and item.message.basis_step:
+        if item.topic == "command" or (item.topic == "state" and item.message.basis_step):
             item.message.basis_step = basis_step
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
     assert "previous_poll" not in {finding.kind for finding in report.findings}

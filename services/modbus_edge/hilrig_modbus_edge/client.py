@@ -1,6 +1,6 @@
 """A connected controller as a device sees it: who it is, what it may do, and what it was last shown."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 Basis = tuple[int, int, int, int]
@@ -24,9 +24,16 @@ class Host:
     """The machine that connections come from: one may read and another write."""
 
     address: str
-    connections: int = 0
+    clients: "set[Client]" = field(default_factory=set)
+    """Its connections."""
     served: Served | None = None
-    """What any of its connections was last shown."""
+    """The state that any of its connections was last served."""
+
+    def forget_served(self) -> None:
+        """Drop the states that its connections were served: no later write is based on them."""
+        self.served = None
+        for client in self.clients:
+            client.served = client.basis = None
 
 
 @dataclass(slots=True, eq=False)

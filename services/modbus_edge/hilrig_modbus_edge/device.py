@@ -70,8 +70,8 @@ class Device:
     def connect(self, host: str, port: int, *, may_write: bool = True) -> Client:
         """A controller connected."""
         known = self._hosts.setdefault(host, Host(host))
-        known.connections += 1
         client = Client(address_of(host, port), known, may_write, last_request_ns=self._monotonic_ns())
+        known.clients.add(client)
         self.clients.add(client)
         return client
 
@@ -80,11 +80,12 @@ class Device:
         if client not in self.clients:
             return
         self.clients.remove(client)
-        client.host.connections -= 1
+        client.host.clients.remove(client)
         self._tenure.disconnected(client, reason)
-        # What a host was shown stays the basis of its next connection: a chain of one-shot commands is one loop.
+        # Within a session, what a host was served stays the basis of its next connection: a chain of one-shot commands
+        # is one loop.
         if len(self._hosts) > HOSTS_KEPT:
-            self._hosts = {address: host for address, host in self._hosts.items() if host.connections}
+            self._hosts = {address: host for address, host in self._hosts.items() if host.clients}
 
     def connection_refused(self, address: str, reason: str, count: int) -> None:
         """A controller was not let in, `count` times since this was last said."""
@@ -93,7 +94,7 @@ class Device:
 
     def connections_of(self, host: str) -> int:
         """How many connections a host has."""
-        return self._hosts[host].connections if host in self._hosts else 0
+        return len(self._hosts[host].clients) if host in self._hosts else 0
 
     # -- reads
 

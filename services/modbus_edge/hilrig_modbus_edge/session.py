@@ -6,6 +6,7 @@ that reconnects, or a chain of one-shot commands, is one recording. Pure: time i
 
 from dataclasses import dataclass
 
+from hilrig_modbus_edge.client import Host
 from hilrig_schemas import OpenSession
 
 
@@ -19,7 +20,8 @@ class Session:
     """Of the rig's sessions since the edge started, from 1."""
     controller: str
     """Address of the controller that began it, "host:port"."""
-    host: str
+    host: Host
+    """The machine that it came from."""
     start_wall_ns: int
     gone_ns: int | None = None
     """Since when no controller holds the rig, ns, monotonic clock; None: one does."""

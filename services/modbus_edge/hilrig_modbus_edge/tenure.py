@@ -168,9 +168,10 @@ class Tenure:
             self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
         if self.lease.holder is not None:
             self._refuse(client, now_ns, f"{self._holder} holds it", ExcCodes.DEVICE_BUSY)
-        if session is not None and session.host != client.host.address:
+        if session is not None and session.host.address != client.host.address:
             if now_ns < self._handover_due_ns:
-                self._refuse(client, now_ns, f"{session.host} took it less than a second ago", ExcCodes.DEVICE_BUSY)
+                reason = f"{session.host.address} took it less than a second ago"
+                self._refuse(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
             self._handover_due_ns = now_ns + HANDOVER_PERIOD_NS
             self._end_session(f"{client.address} took the rig")
         self.lease.take(client)
@@ -200,7 +201,7 @@ class Tenure:
         self._session_count += 1
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._letters)
-        self.session = Session(self._rig, identity, self._session_count, client.address, client.host.address, wall_ns)
+        self.session = Session(self._rig, identity, self._session_count, client.address, client.host, wall_ns)
         self._commander.session = self._journal.session = identity
         # A time-out that the one before set by register was his, and so was his echo word.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
@@ -216,6 +217,8 @@ class Tenure:
         session, self.session = self.session, None
         if session is None:
             return
+        # The next session's first command is not based on what this one read, however long ago.
+        session.host.forget_served()
         event = self._journal.event(Event.SESSION_END, Event.INFO, f"session {session.id} is over: {reason}")
         event.session_data.controller = session.controller
         event.session_data.reason = reason
