@@ -71,6 +71,8 @@ class Found:
     """Taken away by the host, processors."""
     ways_ms: dict[str, NDArray[np.float64]]
     """Parts of the way from a tick round to the simulation again, one value a sample each."""
+    longest_hold: int
+    """Steps for which one command acted at most, before a newer one replaced it."""
     lost: int
     recordings: int
     wall_s: float
@@ -103,6 +105,7 @@ def add(report: Report, found: Found, edges: int) -> None:
     report.add(case, "loop p50", float(np.percentile(found.loop_ms, 50)), "ms")
     report.add(case, "loop p99", float(np.percentile(found.loop_ms, 99)), "ms")
     report.add(case, "within one step", 100 * within, "%")
+    report.add(case, "longest hold of a command", found.longest_hold, "steps")
     if not is_judged.all():
         report.add(case, "within one step, with no stolen time near", 100 * float((judged <= 1).mean()), "%")
     report.add(case, "samples with no stolen time near", int(found.undisturbed.sum()), "count")
@@ -171,7 +174,7 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
 
 
 def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: int, stolen: StolenTime) -> Found:
-    steps, loops, undisturbed, lost, recordings = [], [], [], 0, set()
+    steps, loops, undisturbed, lost, recordings, longest_hold = [], [], [], 0, set(), 0
     ways: dict[str, list[NDArray[np.float64]]] = {}
     for path in folder.rglob("*.mcap"):
         run = open_run(path)
@@ -180,6 +183,7 @@ def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: i
         table = one.table[one.table["wall_ns"] >= begin_ns]
         steps.append(table["step"].astype(np.int64) - table["basis_step"].astype(np.int64))
         loops.append(table["loop"] / 1e6)
+        longest_hold = max(longest_hold, int(np.diff(table["step"].astype(np.int64)).max(initial=0)))
         undisturbed.append(stolen.undisturbed(table["wall_ns"]))
         lost += one.lost.transport + one.lost.recorder
         for way, times_ms in ways_of(run, begin_ns).items():
@@ -192,6 +196,7 @@ def in_recordings(folder: Path, count: int, figures: dict[str, Any], begin_ns: i
         undisturbed=np.concatenate(undisturbed),
         stolen=stolen.share,
         ways_ms={way: np.concatenate(parts) for way, parts in ways.items()},
+        longest_hold=longest_hold,
         lost=lost,
         recordings=len(recordings),
         wall_s=figures["seconds"],
