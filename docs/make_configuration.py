@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from hilrig_runtime.template import lab_template
+from hilrig_runtime.config.template import lab_template
 
 PAGE = Path(__file__).with_name("configuration.md")
 TEXT = """# lab.toml

@@ -3,7 +3,7 @@
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from hilrig_modbus_edge.certificates import Identity, issue_client, issue_peer, make_authority
+from hilrig_runtime.security.x509 import Identity, issue_client, issue_peer, make_authority
 
 NOW = datetime.now(UTC)
 HOSTS = ["127.0.0.1", "localhost"]

@@ -13,10 +13,10 @@ from typing import Any
 
 IMPORTED = (
     "hilrig_cli.main",
-    "hilrig_cli.lab",
-    "hilrig_replay.report",
-    "hilrig_replay.verify",
-    "hilrig_runtime.lifecycle",
+    "hilrig_cli.local.local_lab",
+    "hilrig_replay.report.report",
+    "hilrig_replay.analysis.verify",
+    "hilrig_runtime.process.lifecycle",
 )
 """What starts no threads, which a fork would leave behind; so not rerun."""
 

@@ -5,12 +5,12 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-from hilrig_modbus_edge.client import Client
-from hilrig_modbus_edge.device import Device
-from hilrig_modbus_edge.registers import Table
-from hilrig_modbus_edge.settings import DeviceSettings
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.messaging import Arrival
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.device.settings import DeviceSettings
+from hilrig_modbus_edge.registers.map import Table
+from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
 
 MS = 1_000_000

@@ -9,12 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from hilrig_modbus_edge.bridge import run
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.logstream import entries_of
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.service import Service
+from hilrig_modbus_edge.service import run
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.messaging.recording_stream import entries_of
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, RigBatch, TorqueCommand, topics
 from waiting import eventually
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hilrig_modbus_edge.registers import Status
-from hilrig_replay.run import open_run
-from hilrig_runtime.config import LabConfig
+from hilrig_modbus_edge.registers.map import Status
+from hilrig_replay.io.run import open_run
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError
 from namespaces import Network
 from waiting import PATIENT_S, eventually

@@ -95,7 +95,7 @@ class RunningLab:
     """`hilrig up` on a lab's file; a context manager that leaves no process behind."""
 
     def __init__(self, config: Path, *options: str) -> None:
-        from hilrig_runtime.config import load_lab
+        from hilrig_runtime.config.lab import load_lab
 
         self.config = config
         self.options = options

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from google.protobuf.message import Message
 
-from hilrig_runtime.logstream import put_entries
+from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, JointState, LogBatch, OpenSession, TorqueCommand
 from hilrig_schemas.topics import COMMAND, EVENT, STATE, RigTopic
 

@@ -16,11 +16,11 @@ from typing import Self
 
 from mcap.reader import make_reader
 
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import LabConfig, load_lab
-from hilrig_runtime.rate import Rate
-from hilrig_runtime.service import Service
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig, load_lab
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
+from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
 from labs import HILRIG, free_ports, write_lab

@@ -16,11 +16,11 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from hilrig_runtime.config import LabConfig, RigSettings
+from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_schemas import Event, JointState, ModbusKind, ModbusTraffic, PartState, TorqueCommand
 from hilrig_schemas.topics import RECORDED
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.urdf import urdf
+from hilrig_sim.arm.urdf import urdf
+from hilrig_sim.parameters import rig_parameters
 
 START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS

@@ -10,15 +10,15 @@ from typing import Self
 
 import numpy as np
 
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.rate import Rate
-from hilrig_runtime.service import Service
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import ManualClock
+from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event, JointState, RigBatch, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, EVENT, STATE
-from hilrig_sim.configured import rig_parameters
 from hilrig_sim.loop import Simulation
+from hilrig_sim.parameters import rig_parameters
 from recordings import Made
 
 REGISTERS = np.array([18000 / np.pi, 18000 / np.pi, 100_000.0, 18000 / np.pi])

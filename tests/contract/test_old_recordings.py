@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.recover import recover
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from hilrig_replay.verify import verify
+from hilrig_recorder.mcap_format.recover import recover
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.verify import verify
+from hilrig_replay.io.run import open_run
 from labs import hilrig
 
 OLD = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import load_lab
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import load_lab
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
 from labs import HILRIG, write_lab

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import STATE
 from labs import RunningLab, write_lab

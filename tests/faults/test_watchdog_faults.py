@@ -145,7 +145,7 @@ def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
         eventually(lambda: "running" in (tmp_path / "up.log").read_text())
-        from hilrig_runtime.config import load_lab
+        from hilrig_runtime.config.lab import load_lab
 
         port = load_lab(lab).ports["rig1"]
         command = controller(port, host=network.address("rig"))

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from bus_certificates import bad_identities, folder_of_one, make_bus_folder, write
-from hilrig_modbus_edge.certificates import Identity, issue_peer
-from hilrig_runtime.config import load_lab
+from hilrig_runtime.config.lab import load_lab
+from hilrig_runtime.security.x509 import Identity, issue_peer
 from lab_of_hosts import HILRIG, SLACK_NS, TIMEOUT_NS, LabOfHosts, Rig, Session, zero_after
 from namespaces import Network, require_namespaces
 from waiting import PATIENT_S, eventually

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from hilrig_runtime.config import load_lab
+from hilrig_runtime.config.lab import load_lab
 from labs import hilrig
 from namespaces import Network, require_namespaces
 from waiting import PATIENT_S, eventually

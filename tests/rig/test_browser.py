@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from browser import CHROMIUM, Browser, share_of
-from hilrig_replay.palette import JOINT_COLORS, rgb
+from hilrig_replay.plots.palette import JOINT_COLORS, rgb
 from labs import HILRIG, hilrig
 from recordings import Script, make, record, write
 from waiting import PATIENT_S

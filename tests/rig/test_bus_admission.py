@@ -11,11 +11,11 @@ import zenoh
 from pymodbus.client import ModbusTcpClient
 
 from bus_certificates import HOSTS, NOW, bad_identities, folder_of_one, make_bus_folder
-from hilrig_modbus_edge.certificates import Identity, issue_peer, make_authority
-from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_config import router_config
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_runtime.zenoh_config import router_config
+from hilrig_runtime.security.x509 import Identity, issue_peer, make_authority
 from labs import RunningLab, free_ports, hilrig, write_lab
 from waiting import eventually
 

@@ -15,7 +15,7 @@ import pytest
 
 from conformance import NAMED, RULES, Rule, as_markdown
 from edge_rig import EdgeRig, RawClient, counts, running_edge
-from hilrig_modbus_edge.server import Connection
+from hilrig_modbus_edge.server.listener import Connection
 from waiting import eventually
 
 pytestmark = pytest.mark.rig

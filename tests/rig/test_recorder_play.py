@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import recordings
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, STATE
 from labs import HILRIG, hilrig

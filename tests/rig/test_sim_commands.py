@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.index import read_verdict
+from hilrig_replay.io.index import read_verdict
 from hilrig_schemas import JointState
 from labs import hilrig
 from recordings import Made, write

@@ -1,6 +1,6 @@
 """Who is gone is told once it lasts, and once that he is back."""
 
-from hilrig_runtime.absence import LASTS_NS, Absences
+from hilrig_runtime.process.liveliness import LASTS_NS, Absences
 
 
 def test_who_is_gone_for_long_is_told_once() -> None:

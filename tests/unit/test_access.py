@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from hilrig_runtime.access import RULES, access_control
-from hilrig_runtime.bus_config import BusTlsConfig
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import parse_lab
+from hilrig_runtime.bus.acl import RULES, access_control
+from hilrig_runtime.config.bus import BusTlsConfig
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.health import Counters
-from hilrig_runtime.messaging import LatestOfBatches
+from hilrig_runtime.messaging.endpoints import LatestOfBatches
+from hilrig_runtime.process.health import Counters
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import RigBatch
 from hilrig_schemas.topics import COMMANDS, all_topics
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from hilrig_cli import asking
-from hilrig_cli.asking import check_rig
-from hilrig_runtime.bus import Answer
-from hilrig_runtime.config import parse_lab
+from hilrig_cli import client as asking
+from hilrig_cli.client import check_rig
+from hilrig_runtime.bus.api import Answer
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
 from hilrig_schemas import Roster
 from hilrig_schemas.topics import ROSTER
 

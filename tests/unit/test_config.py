@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import LabConfig, load_lab, parse_lab
+from hilrig_runtime.config.lab import LabConfig, load_lab, parse_lab
 from hilrig_runtime.errors import InputError
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hilrig_cli.commands.console import console
-from hilrig_console.guard import Guard, is_loopback, own_names
+from hilrig_console.auth import Guard, is_loopback, own_names
 from hilrig_console.serving import Address
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 

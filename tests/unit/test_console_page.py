@@ -9,14 +9,14 @@ import pytest
 
 from hilrig_console.arm_picture import AT_STOP, HOLDS, MAGNET, pose_of, scene_of
 from hilrig_console.events import KEPT, EventLog
-from hilrig_console.lab_view import FORGOTTEN_S, SILENT_S, LabView
-from hilrig_console.page import Frame, Page, Seen
 from hilrig_console.poses import Poses
-from hilrig_runtime.config import LabConfig
+from hilrig_console.view_model import Frame, Page, Seen
+from hilrig_monitoring.lab_view import FORGOTTEN_S, SILENT_S, LabView
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.kinematics import forward
-from hilrig_sim.model import ArmParameters, RigParameters
+from hilrig_sim.arm.kinematics import forward
+from hilrig_sim.arm.model import ArmParameters, RigParameters
+from hilrig_sim.parameters import rig_parameters
 
 LAB = LabConfig()
 RIG = rig_parameters(LAB, LAB.rigs[0])

@@ -8,9 +8,9 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message
 
-from hilrig_console.guard import Guard, Guarded
-from hilrig_console.patience import ADDRESSES, AT_ONCE, PERIOD_NS, Patience
-from hilrig_runtime.clock import ManualClock
+from hilrig_console.auth import Guard, Guarded
+from hilrig_console.login_throttle import ADDRESSES, AT_ONCE, PERIOD_NS, Patience
+from hilrig_runtime.timing.clock import ManualClock
 
 HOST = "192.0.2.7"
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 import recordings
-from hilrig_recorder.recover import recover
-from hilrig_recorder.scan import Chunk, Message, open_chunk, scan
-from hilrig_replay.index import RunIndex
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
+from hilrig_recorder.mcap_format.recover import recover
+from hilrig_recorder.mcap_format.scan import Chunk, Message, open_chunk, scan
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.index import RunIndex
+from hilrig_replay.io.run import open_run
 from labs import hilrig
 
 RECORDED = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"

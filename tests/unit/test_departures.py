@@ -4,11 +4,20 @@ import itertools
 
 import pytest
 
-from hilrig_modbus_edge import departures
-from hilrig_modbus_edge.departures import FEW, GATHER_NS, JUST_AFTER_NS, LAST_NS, MANY, NEAR_NS, PARTS, Departures
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.health import Counters
-from hilrig_runtime.messaging import LatestOfBatches
+from hilrig_modbus_edge import command_scheduler as departures
+from hilrig_modbus_edge.command_scheduler import (
+    FEW,
+    GATHER_NS,
+    JUST_AFTER_NS,
+    LAST_NS,
+    MANY,
+    NEAR_NS,
+    PARTS,
+    Departures,
+)
+from hilrig_runtime.messaging.endpoints import LatestOfBatches
+from hilrig_runtime.process.health import Counters
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import RigBatch
 
 STEP_NS = 20_000_000

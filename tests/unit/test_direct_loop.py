@@ -9,7 +9,7 @@ from selectors import EVENT_READ
 
 import pytest
 
-from hilrig_modbus_edge.transport import DirectLoop
+from hilrig_modbus_edge.server.event_loop import DirectLoop
 
 
 class Flood:

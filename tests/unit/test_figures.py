@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.figures import compute, draw
 from hilrig_runtime.errors import InputError, OperationError
+from hilrig_sim.validation.paper_figures import compute, draw
 
 
 def test_experiment_44_gives_what_is_known_of_it() -> None:

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU
 
-from hilrig_modbus_edge.framing import MAX_FRAME, Request, frame, split
+from hilrig_modbus_edge.protocol.mbap import MAX_FRAME, Request, frame, split
 
 REQUEST = st.builds(Request, st.integers(0, 65535), st.integers(0, 255), st.binary(min_size=1, max_size=253))
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from hilrig_modbus_edge.impairment import Impairment, way_seed
-from hilrig_runtime.impairment_config import WayImpairment
+from hilrig_modbus_edge.impairment.model import Impairment, way_seed
+from hilrig_runtime.config.impairment import WayImpairment
 
 COUNT = 20_000
 DISTRIBUTIONS = {

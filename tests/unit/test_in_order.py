@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_runtime.in_order import InOrder
+from hilrig_runtime.bus.reorder_buffer import InOrder
 
 REACH = 10
 

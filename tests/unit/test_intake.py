@@ -4,8 +4,8 @@ import threading
 
 from test_sessions import Desk
 
-from hilrig_recorder.intake import Arrival, Intake
-from hilrig_runtime.clock import ManualClock
+from hilrig_recorder.ingest.queue import Arrival, Intake
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import OpenSession
 from hilrig_schemas.topics import STATE
 from log_streams import LAB, SECOND, FakeSource

@@ -3,10 +3,10 @@
 import os
 from pathlib import Path
 
-from hilrig_recorder.housekeeping import Housekeeping
-from hilrig_recorder.keep import DAY_S, Stored, finished_recordings, to_delete
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import RecorderConfig
+from hilrig_recorder.storage.maintenance import Housekeeping
+from hilrig_recorder.storage.retention import DAY_S, Stored, finished_recordings, to_delete
+from hilrig_runtime.config.lab import RecorderConfig
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from waiting import eventually
 
 NOW_S = 2_000_000_000.0

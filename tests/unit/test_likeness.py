@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.likeness import KEPT, LEAST, Torques, alike
+from hilrig_replay.analysis.similarity import KEPT, LEAST, Torques, alike
 
 
 def drawn(count: int, seed: int) -> np.ndarray:

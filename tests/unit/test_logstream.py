@@ -2,8 +2,14 @@
 
 import random
 
-from hilrig_runtime.bus import Publisher
-from hilrig_runtime.logstream import FLUSH_PERIOD_NS, SESSIONS_PERIOD_NS, LogStream, batches_kept, entries_of
+from hilrig_runtime.bus.api import Publisher
+from hilrig_runtime.messaging.recording_stream import (
+    FLUSH_PERIOD_NS,
+    SESSIONS_PERIOD_NS,
+    LogStream,
+    batches_kept,
+    entries_of,
+)
 from hilrig_schemas import LogBatch, OpenSession
 
 

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from hilrig_replay.page_pictures import picture
-from hilrig_replay.report import report
+from hilrig_replay.report.html_figures import picture
+from hilrig_replay.report.report import report
 from hilrig_runtime.errors import InputError
 from recordings import Script, record
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.channels import CHANNEL_OF_TOPIC
-from hilrig_recorder.parts import horizon_of, next_part
-from hilrig_recorder.recording import EVENT_CHANNEL
-from hilrig_recorder.recover import Tail
+from hilrig_recorder.ingest.recording import EVENT_CHANNEL
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.mcap_format.recover import Tail
+from hilrig_recorder.storage.segments import horizon_of, next_part
 
 SESSION = "20260101T000000Z-rig1-abcd"
 

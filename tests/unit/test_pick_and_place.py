@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.task import placed_parts
+from hilrig_replay.grading.placement import placed_parts
 from hilrig_schemas import JointState, PartState
-from hilrig_sim.dynamics import forward_dynamics
-from hilrig_sim.model import ArmParameters, RigParameters
+from hilrig_sim.arm.dynamics import forward_dynamics
+from hilrig_sim.arm.model import ArmParameters, RigParameters
 from recordings import PARAMETERS
 from virtual_rig import FarRig, VirtualRig, pick_and_place, work
 

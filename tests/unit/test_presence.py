@@ -4,12 +4,12 @@ import threading
 
 import pytest
 
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import parse_lab
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.presence import ClockOffset, conflict, rosters, worst_offset
-from hilrig_runtime.service import Service
+from hilrig_runtime.process.discovery import ClockOffset, conflict, rosters, worst_offset
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Health, Roster
 from hilrig_schemas.topics import HEALTH, alive_key
 from waiting import eventually
@@ -115,7 +115,7 @@ def test_health_says_how_far_clocks_are_apart() -> None:
 
 
 def test_who_goes_and_comes_back_stands_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", "hilrig_runtime.presence")
+    caplog.set_level("INFO", "hilrig_runtime.process.discovery")
     hub = MemoryHub()
     with Service("recorder", LAB, MemoryBus(hub)) as recorder:
         recorder.ready()

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilrig_recorder.disk import Disk
-from hilrig_runtime.clock import SYSTEM_CLOCK
+from hilrig_recorder.storage.sync_worker import Disk
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from waiting import PATIENT_S, eventually
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hilrig_recorder.files import SLOW_S, Files
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import RecorderConfig
+from hilrig_recorder.storage.store import SLOW_S, Files
+from hilrig_runtime.config.lab import RecorderConfig
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.by_hand import HandSessions
-from hilrig_recorder.guard import FolderLock
-from hilrig_recorder.share import Share
+from hilrig_recorder.ingest.manual_sessions import HandSessions
+from hilrig_recorder.ingest.rig_partition import Share
+from hilrig_recorder.storage.folder_lock import FolderLock
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import Event, OpenSession
 

@@ -3,8 +3,8 @@ import io
 import json
 from pathlib import Path
 
-from hilrig_modbus_edge import register_tables
-from hilrig_modbus_edge.registers import MAP
+from hilrig_modbus_edge.registers import export as register_tables
+from hilrig_modbus_edge.registers.map import MAP
 from labs import hilrig
 
 PAGE = Path(__file__).parents[2] / "docs/registers.md"

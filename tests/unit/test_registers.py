@@ -1,7 +1,7 @@
 from itertools import pairwise
 
-from hilrig_modbus_edge import registers
-from hilrig_modbus_edge.registers import MAP, Kind, Status, Table
+from hilrig_modbus_edge.registers import map as registers
+from hilrig_modbus_edge.registers.map import MAP, Kind, Status, Table
 
 
 def _rows(table: Table) -> list[registers.Register]:

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.latency import measure
-from hilrig_replay.rerun_view import root_names, save_rrd
-from hilrig_replay.run import open_run
-from hilrig_replay.scene import tips
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.run import open_run
+from hilrig_replay.rerun_view.scene import tips
+from hilrig_replay.rerun_view.view import root_names, save_rrd
 from hilrig_runtime.errors import InputError, OperationError
 from recordings import PARAMETERS, Script, make, record, write
 from rrd_files import RrdFile

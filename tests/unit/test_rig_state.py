@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hilrig_runtime.config import parse_lab
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_schemas import Event, JointState
 from hilrig_sim.loop import MANY
-from hilrig_sim.plant import Plant
-from hilrig_sim.rig_state import loop_bytes, motion_bytes
+from hilrig_sim.plant.plant import Plant
+from hilrig_sim.state_encoder import loop_bytes, motion_bytes
 from virtual_rig import VirtualRig
 
 LAB = parse_lab(f"[rigs]\ncount = {MANY}\n")

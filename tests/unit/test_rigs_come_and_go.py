@@ -6,13 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilrig_runtime.config import LabConfig, RigSettings, parse_lab
+from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.turns import Turns
+from hilrig_runtime.process.mailbox import Turns
 from hilrig_schemas import Event, RigConfig, topics
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.membership import Membership
-from hilrig_sim.plant import Plant
+from hilrig_sim.parameters import rig_parameters
+from hilrig_sim.plant.plant import Plant
+from hilrig_sim.rig_registry import Membership
 from virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
@@ -150,7 +150,7 @@ def test_what_can_not_be_done_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_service_that_does_not_come_to_it_says_so_and_does_not_do_it_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilrig_runtime.turns.TIMEOUT_S", 0.01)
+    monkeypatch.setattr("hilrig_runtime.process.mailbox.TIMEOUT_S", 0.01)
     turns, done = Turns(), []
     with pytest.raises(OperationError, match="too busy"):
         turns.call(lambda: done.append(1))

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from hilrig_recorder.channels import message_head
-from hilrig_recorder.intake import Arrival
-from hilrig_recorder.recording import Recording
-from hilrig_recorder.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
-from hilrig_runtime.logstream import put_entries
+from hilrig_recorder.ingest.queue import Arrival
+from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.ingest.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
+from hilrig_recorder.mcap_format.channels import message_head
+from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
 from log_streams import LAB, MS, SECOND, FakeSource, Sent

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilrig_recorder.space import MIB, Space
+from hilrig_recorder.storage.disk_reserve import MIB, Space
 
 
 class Disk:

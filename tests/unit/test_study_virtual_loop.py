@@ -7,20 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge import codec
-from hilrig_modbus_edge.impairment import Impairment
+from hilrig_modbus_edge.impairment.model import Impairment
+from hilrig_modbus_edge.registers import codec
+from hilrig_runtime.config.impairment import WayImpairment
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.impairment_config import WayImpairment
-from hilrig_sim.model import ArmParameters, RigParameters
-from hilrig_study import quantised
-from hilrig_study.controllers import ComputedTorque, LawController, Measured, Pid
-from hilrig_study.expected_cost import age_chain, ages_of, expected_cost, mean_square_radius, turns
-from hilrig_study.linear import linearise
-from hilrig_study.lqr import PredictiveLqr
-from hilrig_study.margins import is_stable, linearise_law
-from hilrig_study.plants import ArmPlant, LinearArms
-from hilrig_study.timing import NO_POLL, LoopTiming, Timeline, poll_count, timeline
-from hilrig_study.virtual_loop import Outcome, Scenario, simulate
+from hilrig_sim.arm.model import ArmParameters, RigParameters
+from hilrig_study.controllers.controllers import ComputedTorque, LawController, Measured, Pid
+from hilrig_study.controllers.lqr import PredictiveLqr
+from hilrig_study.simulation import quantization as quantised
+from hilrig_study.simulation.plants import ArmPlant, LinearArms
+from hilrig_study.simulation.simulated_loop import Outcome, Scenario, simulate
+from hilrig_study.simulation.timing import NO_POLL, LoopTiming, Timeline, poll_count, timeline
+from hilrig_study.theory.expected_cost import age_chain, ages_of, expected_cost, mean_square_radius, turns
+from hilrig_study.theory.linear import linearise
+from hilrig_study.theory.margins import is_stable, linearise_law
 
 ARM = ArmParameters()
 MS = 1_000_000

@@ -4,9 +4,9 @@ import runpy
 import tomllib
 from pathlib import Path
 
-from hilrig_runtime.config import LabConfig, parse_lab
-from hilrig_runtime.sections import Section
-from hilrig_runtime.template import lab_template
+from hilrig_runtime.config.lab import LabConfig, parse_lab
+from hilrig_runtime.config.template import lab_template
+from hilrig_runtime.config.types import Section
 
 DOCS = Path(__file__).parents[2] / "docs"
 

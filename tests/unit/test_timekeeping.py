@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from hilrig_cli.timekeeping import Timekeeping
-from hilrig_replay.distribution import Statistics
+from hilrig_cli.bench.timing_benchmark import Timekeeping
+from hilrig_replay.analysis.distribution import Statistics
 
 
 def figures(p50: float, p99: float, p999: float, longest: float) -> Statistics:

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.course import Course
-from hilrig_modbus_edge.ways import Line, StateWay
-from hilrig_runtime.impairment_config import PRESETS, ImpairmentConfig
-from hilrig_runtime.messaging import Arrival
+from hilrig_modbus_edge.impairment.delay_line import Line, StateWay
+from hilrig_modbus_edge.impairment.schedule import Course
+from hilrig_runtime.config.impairment import PRESETS, ImpairmentConfig
+from hilrig_runtime.messaging.endpoints import Arrival
 
 MS = 1_000_000
 
@@ -155,7 +155,7 @@ def test_what_is_set_by_hand_holds_until_it_is_taken_back() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_quick_enough_for_a_watchdog(preset: str) -> None:
     """A mean delay of both ways far below its second, and losses that are not the rule."""
-    from hilrig_modbus_edge.impairment import Impairment
+    from hilrig_modbus_edge.impairment.model import Impairment
 
     total_ms = 0.0
     for way in (PRESETS[preset].state, PRESETS[preset].command):
