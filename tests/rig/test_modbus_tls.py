@@ -19,8 +19,8 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
-from conformance import SECURED
 from edge_rig import EdgeRig, free_ports, running_edge
+from generate_conformance import SECURED
 from hilrig_modbus_edge.server.tls import TlsPolicy
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hilrig_runtime.config.template import lab_template
 
-PAGE = Path(__file__).with_name("configuration.md")
+PAGE = Path(__file__).parents[1] / "docs/configuration.md"
 TEXT = """# lab.toml
 
 A lab is described by one file, which every service reads; with no file there is one rig with the defaults. A mistake
