@@ -13,7 +13,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import BusConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas.topics import Traffic
-from waiting import PATIENT_S, eventually
+from support.waiting import PATIENT_S, eventually
 
 OpenBus = Callable[[str], Bus]
 

@@ -12,7 +12,7 @@ from hilrig_recorder.mcap_format.recover import recover
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.analysis.verify import verify
 from hilrig_replay.io.run import open_run
-from labs import hilrig
+from support.labs import hilrig
 
 OLD = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from labs import free_ports
-from waiting import PATIENT_S, eventually
+from support.labs import free_ports
+from support.waiting import PATIENT_S, eventually
 
 SERVICE = """
 import sys, threading, time

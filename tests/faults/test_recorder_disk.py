@@ -16,8 +16,8 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Health, JointState
 from hilrig_schemas.topics import HEALTH
-from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
-from waiting import eventually
+from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
+from support.waiting import eventually
 
 
 @contextmanager

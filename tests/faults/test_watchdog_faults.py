@@ -15,9 +15,9 @@ import pytest
 from mcap.reader import make_reader
 
 from hilrig_schemas import Event, JointState, TorqueCommand
-from labs import HILRIG, RunningLab, hilrig, write_lab
-from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, Stalls, eventually
+from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.namespaces import Network, require_namespaces
+from support.waiting import PATIENT_S, Stalls, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
 LATE_MS = 15

@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import open_run
-from labs import hilrig
+from support.labs import hilrig
 
 pytestmark = pytest.mark.rig
 

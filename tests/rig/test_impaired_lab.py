@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from edge_rig import RawClient
 from hilrig_modbus_edge.impairment.model import Impairment, way_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.config.impairment import WayImpairment
-from labs import RunningLab, free_ports, hilrig, write_lab
-from waiting import eventually
+from support.edge_rig import RawClient
+from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 

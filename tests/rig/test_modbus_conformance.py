@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from edge_rig import EdgeRig, RawClient, counts, running_edge
 from generate_conformance import NAMED, RULES, Rule, as_markdown
 from hilrig_modbus_edge.server.listener import Connection
-from waiting import eventually
+from support.edge_rig import EdgeRig, RawClient, counts, running_edge
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

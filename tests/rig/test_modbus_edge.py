@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import pytest
 
-from edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
 from hilrig_modbus_edge.command_scheduler import MANY
 from hilrig_modbus_edge.service import run
 from hilrig_runtime.bus.memory_bus import MemoryBus
@@ -18,7 +17,8 @@ from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, TorqueCommand, topics
-from waiting import eventually
+from support.edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

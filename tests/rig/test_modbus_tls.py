@@ -19,7 +19,6 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
-from edge_rig import EdgeRig, free_ports, running_edge
 from generate_conformance import SECURED
 from hilrig_modbus_edge.server.tls import TlsPolicy
 from hilrig_runtime.config.lab import LabConfig
@@ -34,8 +33,9 @@ from hilrig_runtime.security.x509 import (
     role_of,
 )
 from hilrig_schemas import Event
-from labs import hilrig
-from waiting import eventually
+from support.edge_rig import EdgeRig, free_ports, running_edge
+from support.labs import hilrig
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

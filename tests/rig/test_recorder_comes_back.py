@@ -15,7 +15,7 @@ import pytest
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas.topics import Traffic
-from labs import free_ports
+from support.labs import free_ports
 
 pytestmark = [
     pytest.mark.rig,

@@ -19,8 +19,8 @@ from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, RigConfig
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
-from log_streams import FakeSource
-from waiting import PATIENT_S, eventually
+from support.log_streams import FakeSource
+from support.waiting import PATIENT_S, eventually
 
 SESSION = "20260101T000000Z-rig1-abcd"
 

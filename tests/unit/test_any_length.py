@@ -19,7 +19,7 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots import latency_plot
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.rerun_view import view as rerun_view
-from recordings import Script, record
+from support.recordings import Script, record
 
 SHORT_S, TIMES = 16.0, 3
 ROWS = 160

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from bus_certificates import HOSTS, NOW, make_bus_folder, write
 from hilrig_cli.doctor import Finding, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
 from hilrig_runtime.config.lab import LabConfig, parse_lab
 from hilrig_runtime.security.x509 import Identity, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health
+from support.bus_certificates import HOSTS, NOW, make_bus_folder, write
 
 NAMES = ["router", "sim", "edge", "recorder", "operator", "viewer"]
 

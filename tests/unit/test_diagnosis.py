@@ -7,7 +7,7 @@ import pytest
 from hilrig_replay.analysis.diagnosis import Finding
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
-from recordings import Script, record
+from support.recordings import Script, record
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:

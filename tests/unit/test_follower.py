@@ -16,8 +16,8 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, RIG_TOPICS, Traffic
 from hilrig_sim.arm.urdf import urdf
-from recordings import PARAMETERS, Made, Script, make
-from rrd_files import RrdFile
+from support.recordings import PARAMETERS, Made, Script, make
+from support.rrd_files import RrdFile
 
 KEYS = {topic.name: topic.key("lab", "rig1") for topic in RIG_TOPICS}
 

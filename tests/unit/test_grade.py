@@ -17,7 +17,7 @@ from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState
 from hilrig_sim.arm.kinematics import inverse
-from recordings import PARAMETERS, Script, make, write
+from support.recordings import PARAMETERS, Script, make, write
 
 STEP_S = 0.02
 STEP_RESPONSE = {"poses": [{"name": "a", "position_mm": [400, 0, 0], "tolerance_mm": 4, "hold_s": 0.3}]}

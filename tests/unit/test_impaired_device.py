@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from device_bench import MS, Bench
 from hilrig_modbus_edge.device.client import Client
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_schemas import Event, TorqueCommand
+from support.device_bench import MS, Bench
 
 KINDS = {
     "constant:12.5": None,

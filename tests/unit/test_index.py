@@ -9,11 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-import recordings
 from hilrig_recorder.mcap_format.writer import RunWriter
 from hilrig_replay.io.index import INDEX_NAME, RECORDING, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
-from labs import hilrig
+from support import recordings
+from support.labs import hilrig
 
 SCRIPT = recordings.Script(seconds=1.0)
 

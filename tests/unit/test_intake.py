@@ -8,7 +8,7 @@ from hilrig_recorder.ingest.queue import Arrival, Intake
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import OpenSession
 from hilrig_schemas.topics import STATE
-from log_streams import LAB, SECOND, FakeSource
+from support.log_streams import LAB, SECOND, FakeSource
 
 KEY = STATE.key(LAB, "rig1")
 

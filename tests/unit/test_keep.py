@@ -7,7 +7,7 @@ from hilrig_recorder.storage.maintenance import Housekeeping
 from hilrig_recorder.storage.retention import DAY_S, Stored, finished_recordings, to_delete
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from waiting import eventually
+from support.waiting import eventually
 
 NOW_S = 2_000_000_000.0
 GIB = 2**30

@@ -13,7 +13,7 @@ from hilrig_runtime.bus.zenoh_config import unknown_host
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.shutdown import run_main
-from labs import free_ports
+from support.labs import free_ports
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_replay.report.report import report
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.errors import InputError
-from recordings import Script, make, record, write
+from support.recordings import Script, make, record, write
 
 ALL: dict[str, Callable[[Path], object]] = {
     "latency": lambda path: measure(open_run(path)),

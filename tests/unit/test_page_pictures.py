@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from hilrig_replay.report.html_figures import picture
 from hilrig_replay.report.report import report
 from hilrig_runtime.errors import InputError
-from recordings import Script, record
+from support.recordings import Script, record
 
 
 def images(html: str) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from hilrig_sim.arm.model import GRAVITY, ArmParameters, RigParameters, ScenePar
 from hilrig_sim.plant.hard_stops import stop_outward
 from hilrig_sim.plant.limits import Happening
 from hilrig_sim.plant.plant import Plant
-from recordings import PARAMETERS
+from support.recordings import PARAMETERS
 
 ARM = ArmParameters()
 # Nothing to come down on: the quill has its own stop alone.

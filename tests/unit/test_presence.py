@@ -12,7 +12,7 @@ from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Health, Roster
 from hilrig_schemas.topics import HEALTH, alive_key
-from waiting import eventually
+from support.waiting import eventually
 
 LAB = parse_lab("[rigs]\ncount = 6\n")
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from hilrig_recorder.storage.sync_worker import Disk
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from waiting import PATIENT_S, eventually
+from support.waiting import PATIENT_S, eventually
 
 
 @dataclass(eq=False)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hilrig_modbus_edge.registers import export as register_tables
 from hilrig_modbus_edge.registers.map import MAP
-from labs import hilrig
+from support.labs import hilrig
 
 PAGE = Path(__file__).parents[2] / "docs/registers.md"
 

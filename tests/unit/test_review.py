@@ -18,7 +18,7 @@ from hilrig_replay.rerun_view.scene import tips
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
-from recordings import PARAMETERS, Made, Script, make, position, record, write
+from support.recordings import PARAMETERS, Made, Script, make, position, record, write
 
 
 def named(folder: Path, name: str, script: Script, made: list[Made] | None = None) -> Run:

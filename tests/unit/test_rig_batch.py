@@ -7,7 +7,7 @@ from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import LogBatch, RigBatch
 from hilrig_schemas.topics import COMMANDS, LOG, STATE, STATES
-from virtual_rig import VirtualRig
+from support.virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 

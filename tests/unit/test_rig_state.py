@@ -11,7 +11,7 @@ from hilrig_schemas import Event, JointState
 from hilrig_sim.loop import MANY
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.state_encoder import loop_bytes, motion_bytes
-from virtual_rig import VirtualRig
+from support.virtual_rig import VirtualRig
 
 LAB = parse_lab(f"[rigs]\ncount = {MANY}\n")
 

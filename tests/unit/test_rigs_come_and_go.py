@@ -13,7 +13,7 @@ from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.rig_registry import Membership
-from virtual_rig import VirtualRig
+from support.virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 GUEST = RigSettings(name="guest")

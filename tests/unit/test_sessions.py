@@ -12,7 +12,7 @@ from hilrig_recorder.mcap_format.channels import message_head
 from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
-from log_streams import LAB, MS, SECOND, FakeSource, Sent
+from support.log_streams import LAB, MS, SECOND, FakeSource, Sent
 
 MESSAGE_HEAD_BYTES = 31
 """Of an MCAP message record: opcode, length, channel, sequence, two times."""

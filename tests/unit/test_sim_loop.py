@@ -15,7 +15,7 @@ from hilrig_sim.events import Reporter
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.limits import Happening, PlantEvent
 from hilrig_sim.plant.plant import Plant
-from virtual_rig import VirtualRig
+from support.virtual_rig import VirtualRig
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters
 from hilrig_sim.arm.urdf import JOINTS, LINKS, urdf
-from recordings import PARAMETERS
+from support.recordings import PARAMETERS
 
 ROBOT = ElementTree.fromstring(urdf(PARAMETERS, "rig1"))
 

@@ -10,8 +10,8 @@ from hilrig_replay.analysis.verify import OTHER_MACHINE_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState
 from hilrig_sim.platform_fingerprint import machine_name
-from recordings import Made, record, write
-from virtual_rig import VirtualRig, work
+from support.recordings import Made, record, write
+from support.virtual_rig import VirtualRig, work
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
 
-from waiting import eventually
+from support.waiting import eventually
 
 HILRIG = [sys.executable, "-m", "hilrig_cli"]
 

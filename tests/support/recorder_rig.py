@@ -23,8 +23,8 @@ from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
-from labs import HILRIG, free_ports, write_lab
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, free_ports, write_lab
+from support.waiting import PATIENT_S, eventually
 
 Key = tuple[str, int, bytes]
 """Channel, sequence of the sender, bytes."""

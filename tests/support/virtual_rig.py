@@ -19,7 +19,7 @@ from hilrig_schemas import Event, JointState, RigBatch, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, EVENT, STATE
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
-from recordings import Made
+from support.recordings import Made
 
 REGISTERS = np.array([18000 / np.pi, 18000 / np.pi, 100_000.0, 18000 / np.pi])
 """From rad and m to the paper's position registers."""
@@ -102,7 +102,7 @@ class VirtualRig:
 
 def pick_and_place() -> ModuleType:
     """The example controller as a module."""
-    path = Path(__file__).parents[1] / "examples" / "pick_and_place.py"
+    path = Path(__file__).parents[2] / "examples" / "pick_and_place.py"
     spec = importlib.util.spec_from_file_location("pick_and_place", path)
     assert spec is not None
     assert spec.loader is not None

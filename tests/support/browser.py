@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.image import imread
 from websockets.sync.client import connect
 
-from waiting import eventually
+from support.waiting import eventually
 
 CHROMIUM = shutil.which("chromium")
 GRAPHICS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

@@ -16,7 +16,7 @@ from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, RigBatch, TorqueCommand, topics
-from waiting import eventually
+from support.waiting import eventually
 
 HEADER = struct.Struct(">HHHB")
 START_POSITION = (0.1, -0.2, 0.05, 3.0)

@@ -16,8 +16,8 @@ from hilrig_modbus_edge.registers.map import Status
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError
-from namespaces import Network
-from waiting import PATIENT_S, eventually
+from support.namespaces import Network
+from support.waiting import PATIENT_S, eventually
 
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 TIMEOUT_NS = 600_000_000
