@@ -30,7 +30,7 @@ PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constrain
 	@touch .venv/ready $@
 
 system: ## the system parts that tests and benchmarks use (apt, as root)
-	@sh tests/system-packages.sh
+	@sh scripts/system_packages.sh
 
 demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
 	$(BIN)/hilrig demo
@@ -59,10 +59,10 @@ check: .venv/dev ## format, lint, types, floors
 
 gen: .venv/dev ## generated code and tables, from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
-	$(BIN)/python tests/wire_contract.py
-	$(BIN)/python docs/make_configuration.py
+	$(BIN)/python scripts/wire_contract.py
+	$(BIN)/python scripts/generate_configuration.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
-	$(BIN)/python tests/conformance.py > docs/modbus-conformance.md
+	$(BIN)/python scripts/generate_conformance.py > docs/modbus-conformance.md
 
 bench: .venv/dev system ## every benchmark (most of an hour); writes docs/performance.md
 	$(BIN)/python bench/run_all.py

@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import harness
 import numpy as np
 from harness import HERE, build_c, write_lab
 from loop import rig_run, say
@@ -30,7 +29,7 @@ from stolen import StolenTime
 sys.path.append(str(HERE / "variants"))
 from variants import VARIANTS
 
-from hilrig_cli.lab import running_lab
+from hilrig_cli.local.local_lab import running_lab
 
 COUNTS = (1, 16, 64, 128)
 RATES = (50, 100, 200)

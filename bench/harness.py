@@ -18,8 +18,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from hilrig_cli.demo import free_ports
-from hilrig_runtime.config import LabConfig, load_lab
+from hilrig_cli.local.demo import free_ports
+from hilrig_runtime.config.lab import LabConfig, load_lab
 
 HERE = Path(__file__).parent
 BUILD = HERE / "build"

@@ -29,13 +29,13 @@ from harness import Report, build_c, percentile, progress, write_lab
 from numpy.typing import NDArray
 from stolen import StolenTime
 
-from hilrig_cli.demo import free_ports
-from hilrig_cli.lab import running_lab
-from hilrig_cli.supervisor import WHOLE_LAB, Supervisor
-from hilrig_replay import latency
-from hilrig_replay.run import open_run
-from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.supervisor import WHOLE_LAB, Supervisor
+from hilrig_replay.analysis import latency
+from hilrig_replay.io.run import open_run
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import STATE, Traffic, alive_key
 

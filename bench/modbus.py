@@ -38,13 +38,13 @@ from modbus_servers import (
 from numpy.typing import NDArray
 from stolen import StolenTime
 
-from hilrig_modbus_edge.admission import Limits
-from hilrig_modbus_edge.device import Device
-from hilrig_modbus_edge.server import Connection as ModbusConnection
-from hilrig_modbus_edge.server import RigServer
-from hilrig_modbus_edge.settings import DeviceSettings
-from hilrig_runtime.messaging import Arrival
-from hilrig_runtime.service import Service
+from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.device.settings import DeviceSettings
+from hilrig_modbus_edge.server.admission import Limits
+from hilrig_modbus_edge.server.listener import Connection as ModbusConnection
+from hilrig_modbus_edge.server.listener import RigServer
+from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.process.service import Service
 from hilrig_schemas import JointState, topics
 
 QUESTION = "How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?"

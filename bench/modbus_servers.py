@@ -21,15 +21,15 @@ from typing import Any
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from hilrig_cli.demo import free_ports
-from hilrig_modbus_edge.bridge import run as run_edge
-from hilrig_modbus_edge.departures import GATHER_NS, LAST_NS
-from hilrig_runtime.bus import KEPT, Publisher
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.memory_bus import MemoryBus
-from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
-from hilrig_runtime.service import Service
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_cli.local.demo import free_ports
+from hilrig_modbus_edge.command_scheduler import GATHER_NS, LAST_NS
+from hilrig_modbus_edge.service import run as run_edge
+from hilrig_runtime.bus.api import KEPT, Publisher
+from hilrig_runtime.bus.memory_bus import MemoryBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
 from hilrig_schemas import JointState, RigBatch, TorqueCommand, topics
 
 Server = tuple[int, int, int]

@@ -16,11 +16,11 @@ import pinocchio
 from harness import Report, progress, run
 from mujoco import rollout
 
-from hilrig_runtime.config import LabConfig
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.model import GRAVITY, RigParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.urdf import urdf
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_sim.arm.model import GRAVITY, RigParameters
+from hilrig_sim.arm.urdf import urdf
+from hilrig_sim.parameters import rig_parameters
+from hilrig_sim.plant.plant import Plant
 
 COUNTS = (1, 16, 256, 1000)
 EVALUATIONS = 6

@@ -23,13 +23,13 @@ from harness import Report, progress, run
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from hilrig_cli.demo import free_ports
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import LabConfig, load_lab
-from hilrig_runtime.rate import Rate
-from hilrig_runtime.realtime import REALTIME_PRIORITIES, go_realtime
-from hilrig_runtime.service import Service
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_cli.local.demo import free_ports
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig, load_lab
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
+from hilrig_runtime.timing.rate import Rate
+from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Event, Health, JointState, OpenSession
 from hilrig_schemas.topics import HEALTH, STATE, alive_key
 

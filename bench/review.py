@@ -37,7 +37,7 @@ print(json.dumps({"peak_mb": peak / (1024 * 1024 if sys.platform == "darwin" els
 def make_hour(path: Path, seconds: float) -> int:
     """Write the recording; gives the number of its messages."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from recordings import Script, make, write
+    from support.recordings import Script, make, write
 
     script = Script(seconds=seconds, poll_ms=20.0, delay_ms=3.0)
     made = make(script)

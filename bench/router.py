@@ -28,10 +28,10 @@ import numpy as np
 import zenoh
 from harness import Report, build_c, progress, services_log, write_lab
 
-from hilrig_cli.demo import free_ports
-from hilrig_cli.lab import running_lab
-from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import running_lab
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas.topics import COMMANDS, HEALTH, LOG, STATES, ServiceTopic
 
 QUESTION = "How many hosts' worth of traffic does one router carry, and what does it add to a message's way?"

@@ -31,14 +31,14 @@ from harness import Report, build_c, progress, write_lab
 from numpy.typing import NDArray
 from stolen import StolenTime
 
-from hilrig_cli.lab import running_lab
-from hilrig_cli.supervisor import shared
-from hilrig_modbus_edge.departures import NEAR_NS
-from hilrig_replay.latency import measure as latency_of
-from hilrig_replay.run import Run, open_run
-from hilrig_replay.samples import join_commands
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.supervisor import shared
+from hilrig_modbus_edge.command_scheduler import NEAR_NS
+from hilrig_replay.analysis.latency import measure as latency_of
+from hilrig_replay.analysis.samples import join_commands
+from hilrig_replay.io.run import Run, open_run
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
 

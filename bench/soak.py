@@ -31,13 +31,13 @@ import harness
 import numpy as np
 from harness import Report, percentile, services_log, write_lab
 
-from hilrig_cli.lab import POLL_S, running_lab
-from hilrig_cli.supervisor import Supervisor
-from hilrig_replay.run import open_run
-from hilrig_replay.verify import verify
-from hilrig_runtime.config import LabConfig
+from hilrig_cli.local.local_lab import POLL_S, running_lab
+from hilrig_cli.local.supervisor import Supervisor
+from hilrig_replay.analysis.verify import verify
+from hilrig_replay.io.run import open_run
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigBatch
 from hilrig_schemas.topics import STATES
 

@@ -13,7 +13,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hilrig_cli.jitter import stolen_s
+from hilrig_cli.bench.jitter import stolen_s
 
 PERIOD_S: Final = 0.02
 NEAR_NS: Final = 100_000_000

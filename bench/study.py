@@ -14,12 +14,12 @@ import numpy as np
 from harness import Report, progress, run
 from scipy.integrate import solve_ivp
 
-from hilrig_sim.dynamics import forward_dynamics
-from hilrig_study import quantised
-from hilrig_study.controllers import LawController, Measured
+from hilrig_sim.arm.dynamics import forward_dynamics
+from hilrig_study.controllers.controllers import LawController, Measured
+from hilrig_study.simulation import quantization as quantised
+from hilrig_study.simulation.timing import NO_POLL, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.sweep import cells_of, run_cells, sweep
-from hilrig_study.timing import NO_POLL, timeline
 
 PEERS = ((20.0, 0.3), (60.0, 0.4), (120.0, 0.2))
 """Delays, ms, and gains of the runs that are timed with solve_ivp."""

@@ -7,7 +7,7 @@ from typing import Any
 
 def no_coalescing() -> None:
     """Every command is sent at once, in a message of its own."""
-    from hilrig_modbus_edge.departures import Departures
+    from hilrig_modbus_edge.command_scheduler import Departures
 
     def look(self: Any) -> None:
         self._count = 0
@@ -17,14 +17,14 @@ def no_coalescing() -> None:
 
 def fixed_window() -> None:
     """Commands that come within 2 ms are sent together; no rule about the tick."""
-    from hilrig_modbus_edge import departures
+    from hilrig_modbus_edge import command_scheduler as departures
 
     departures.Departures._waits_ns = lambda self, rig, now_ns: departures.GATHER_NS
 
 
 def two_rules() -> None:
     """First command on a state: 2 ms window, none within 3 ms of the tick. Later ones: 1.5 ms before the tick."""
-    from hilrig_modbus_edge import departures
+    from hilrig_modbus_edge import command_scheduler as departures
 
     def waits_ns(self: Any, rig: str, now_ns: int) -> int:
         state = self._newest_state(rig)
@@ -41,7 +41,7 @@ def two_rules() -> None:
 
 def _throttle(window_ns: int, margin_ns: int) -> Callable[[], None]:
     def disable() -> None:
-        from hilrig_modbus_edge.departures import Departures
+        from hilrig_modbus_edge.command_scheduler import Departures
 
         flush = Departures.flush
 
@@ -80,14 +80,14 @@ def throttle_1_ms() -> None:
 
 def edge_tick_unaligned() -> None:
     """The edge's own tick is not moved behind the last command before the simulation's tick."""
-    from hilrig_modbus_edge.departures import Departures
+    from hilrig_modbus_edge.command_scheduler import Departures
 
     Departures.after_last = lambda self, rig, when_ns: when_ns
 
 
 def edge_tick_whole() -> None:
     """All rigs are looked after at once in the edge's tick."""
-    from hilrig_modbus_edge import bridge
+    from hilrig_modbus_edge import service as bridge
 
     bridge.MOST_TURNS = 1
 
@@ -122,7 +122,7 @@ def asyncio_readers() -> None:
     """Sockets are served from asyncio's queue: `loop.add_reader` with the same receive call."""
     from selectors import EVENT_READ, EVENT_WRITE
 
-    from hilrig_modbus_edge.transport import DirectTransport
+    from hilrig_modbus_edge.server.event_loop import DirectTransport
 
     def want(self: Any) -> None:
         wanted = 0
@@ -150,7 +150,7 @@ def millisecond_timers() -> None:
     """The loop waits in whole milliseconds, as asyncio does; sockets are served from asyncio's queue too."""
     import selectors
 
-    from hilrig_modbus_edge.transport import DirectSelector
+    from hilrig_modbus_edge.server.event_loop import DirectSelector
 
     asyncio_readers()
     DirectSelector.select = selectors.EpollSelector.select
@@ -158,22 +158,22 @@ def millisecond_timers() -> None:
 
 def no_priorities() -> None:
     """No real-time policy, no short slices, no exact sleep, no background priority."""
-    from hilrig_runtime import lifecycle
+    from hilrig_runtime.process import lifecycle
 
     lifecycle._ask_for_time = lambda name, lab: None
 
 
 def receivers_not_ahead() -> None:
     """zenoh's receiving threads have the priority of the thread that opened the bus."""
-    from hilrig_runtime import zenoh_bus
+    from hilrig_runtime.bus import zenoh_bus
 
     zenoh_bus.one_ahead = contextlib.nullcontext
 
 
 def no_log_batch() -> None:
     """Every recorded message is sent to the recorder at once."""
-    from hilrig_runtime.clock import SYSTEM_CLOCK
-    from hilrig_runtime.logstream import LogStream
+    from hilrig_runtime.messaging.recording_stream import LogStream
+    from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
     append, extend = LogStream.append, LogStream.extend
 
@@ -191,7 +191,7 @@ def no_log_batch() -> None:
 
 def no_state_batch() -> None:
     """The states of a tick go to the edge in a message each."""
-    from hilrig_runtime.rig_batch import BatchSender
+    from hilrig_runtime.messaging.rig_batch import BatchSender
     from hilrig_schemas import RigBatch
 
     send = BatchSender.send
@@ -209,7 +209,7 @@ def no_state_batch() -> None:
 
 def plain_request_log() -> None:
     """The kind of each logged request is decoded anew."""
-    from hilrig_modbus_edge import traffic
+    from hilrig_modbus_edge import request_log as traffic
 
     def note(self: Any, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
         self._add_index(self._index(traffic._kind_of(pdu[:5]), exception, controller))

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hilrig_runtime.bus import Bus
-from hilrig_runtime.config import BusConfig
+from hilrig_runtime.bus.api import Bus
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import BusConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.zenoh_bus import ZenohBus
 from hilrig_schemas.topics import Traffic
-from waiting import PATIENT_S, eventually
+from support.waiting import PATIENT_S, eventually
 
 OpenBus = Callable[[str], Bus]
 

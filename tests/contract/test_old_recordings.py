@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.recover import recover
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from hilrig_replay.verify import verify
-from labs import hilrig
+from hilrig_recorder.mcap_format.recover import recover
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.verify import verify
+from hilrig_replay.io.run import open_run
+from support.labs import hilrig
 
 OLD = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-import recordings
-from hilrig_recorder.channels import CHANNEL_OF_TOPIC, encode_message
-from hilrig_recorder.recover import recover
-from hilrig_recorder.writer import RunWriter
-from hilrig_replay.export import export_foxglove
-from hilrig_replay.run import open_run
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, encode_message
+from hilrig_recorder.mcap_format.recover import recover
+from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_replay.export.export import export_foxglove
+from hilrig_replay.io.run import open_run
+from support import recordings
 
 NODE = """
 import {McapIndexedReader, McapStreamReader} from "@mcap/core";

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from labs import free_ports
-from waiting import PATIENT_S, eventually
+from support.labs import free_ports
+from support.waiting import PATIENT_S, eventually
 
 SERVICE = """
 import sys, threading, time
-from hilrig_runtime.config import BusConfig, LabConfig
+from hilrig_runtime.config.lab import BusConfig, LabConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.ending import run_main
-from hilrig_runtime.lifecycle import run_service
+from hilrig_runtime.process.shutdown import run_main
+from hilrig_runtime.process.lifecycle import run_service
 
 def orderly(service):
     service.ready()
@@ -80,7 +80,7 @@ def test_the_second_signal_forces(tmp_path: Path) -> None:
 
 LOCKED = """
 import os, signal, threading
-from hilrig_runtime.ending import stop_on_signals
+from hilrig_runtime.process.shutdown import stop_on_signals
 
 stopping = threading.Event()
 stop_on_signals(stopping)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import load_lab
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import load_lab
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
-from labs import HILRIG, write_lab
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, write_lab
+from support.waiting import PATIENT_S, eventually
 
 LIMIT = 64
 READ = bytes.fromhex("0001 0000 0006 01 03 0004 0004")

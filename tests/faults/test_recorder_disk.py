@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.channels import CHANNEL_OF_TOPIC
-from hilrig_recorder.scan import Chunk, Message, open_chunk, scan
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.mcap_format.scan import Chunk, Message, open_chunk, scan
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Health, JointState
 from hilrig_schemas.topics import HEALTH
-from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
-from waiting import eventually
+from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, wait_ready
+from support.waiting import eventually
 
 
 @contextmanager

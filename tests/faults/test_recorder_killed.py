@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.logstream import LONGEST_KEPT_S
-from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, times, wait_ready
-from waiting import Stalls, eventually
+from hilrig_runtime.messaging.recording_stream import LONGEST_KEPT_S
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
+from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, times, wait_ready
+from support.waiting import Stalls, eventually
 
 KILLS = times("HILRIG_RECORDER_KILLS", 4)
 CACHED_S = LONGEST_KEPT_S - 3

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import STATE
-from labs import RunningLab, write_lab
-from recorder_rig import metadata, recorded
-from waiting import eventually
+from support.labs import RunningLab, write_lab
+from support.recorder_rig import metadata, recorded
+from support.waiting import eventually
 
 BATCH_OF_A_SIM = 50
 """States that a killed simulation may have published and not yet put on its log stream; it sends one batch in 20 ms."""

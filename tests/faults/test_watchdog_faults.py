@@ -15,9 +15,9 @@ import pytest
 from mcap.reader import make_reader
 
 from hilrig_schemas import Event, JointState, TorqueCommand
-from labs import HILRIG, RunningLab, hilrig, write_lab
-from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, Stalls, eventually
+from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.namespaces import Network, require_namespaces
+from support.waiting import PATIENT_S, Stalls, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
 LATE_MS = 15
@@ -145,7 +145,7 @@ def test_torque_is_gone_when_the_cable_is(tmp_path: Path) -> None:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
         eventually(lambda: "running" in (tmp_path / "up.log").read_text())
-        from hilrig_runtime.config import load_lab
+        from hilrig_runtime.config.lab import load_lab
 
         port = load_lab(lab).ports["rig1"]
         command = controller(port, host=network.address("rig"))

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bus_certificates import bad_identities, folder_of_one, make_bus_folder, write
-from hilrig_modbus_edge.certificates import Identity, issue_peer
-from hilrig_runtime.config import load_lab
-from lab_of_hosts import HILRIG, SLACK_NS, TIMEOUT_NS, LabOfHosts, Rig, Session, zero_after
-from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, eventually
+from hilrig_runtime.config.lab import load_lab
+from hilrig_runtime.security.x509 import Identity, issue_peer
+from support.bus_certificates import bad_identities, folder_of_one, make_bus_folder, write
+from support.lab_of_hosts import HILRIG, SLACK_NS, TIMEOUT_NS, LabOfHosts, Rig, Session, zero_after
+from support.namespaces import Network, require_namespaces
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = [pytest.mark.hosts, pytest.mark.rig]
 

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
-from hilrig_runtime.config import load_lab
-from labs import hilrig
-from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, eventually
+from hilrig_runtime.config.lab import load_lab
+from support.labs import hilrig
+from support.namespaces import Network, require_namespaces
+from support.waiting import PATIENT_S, eventually
 
 ROOT = Path(__file__).parents[2]
 LAB_FILE = ROOT / "compose/lab.toml"

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_runtime.config import load_lab
-from hilrig_runtime.logstream import LONGEST_KEPT_S
-from lab_of_hosts import HILRIG, SLACK_NS, STEP_S, TIMEOUT_NS, LabOfHosts, Session, zero_after
-from namespaces import Network, require_namespaces
-from waiting import PATIENT_S, eventually
+from hilrig_runtime.config.lab import load_lab
+from hilrig_runtime.messaging.recording_stream import LONGEST_KEPT_S
+from support.lab_of_hosts import HILRIG, SLACK_NS, STEP_S, TIMEOUT_NS, LabOfHosts, Session, zero_after
+from support.namespaces import Network, require_namespaces
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = [pytest.mark.hosts, pytest.mark.rig]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from namespaces import Network, require_namespaces
-from recorder_rig import Key, files_of, make_lab, metadata, recorded
-from waiting import eventually
+from support.namespaces import Network, require_namespaces
+from support.recorder_rig import Key, files_of, make_lab, metadata, recorded
+from support.waiting import eventually
 
 TESTS = Path(__file__).parents[1]
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
@@ -24,11 +24,11 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
     config, lab = make_lab(folder, extra='bus.topology = "router"\nbus.router = "tcp/rig:7447"')
     sent_file = folder / "sent.pickle"
     with Network(["rig", "store"]) as network, (folder / "log").open("w") as log:
-        router = [sys.executable, str(TESTS / "zenoh_router.py"), "--listen", "tcp/0.0.0.0:7447"]
+        router = [sys.executable, str(TESTS / "support/zenoh_router.py"), "--listen", "tcp/0.0.0.0:7447"]
         network.popen("rig", [*router, "--no-multicast-scouting"], stdin=subprocess.PIPE)
         recorder = network.popen("store", [HILRIG, "recorder", "-c", str(config)], stderr=log, cwd=folder)
-        command = [sys.executable, str(TESTS / "recorder_rig.py"), str(config), str(sent_file)]
-        sender = network.popen("rig", command, stdin=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", "support.recorder_rig", str(config), str(sent_file)]
+        sender = network.popen("rig", command, stdin=subprocess.PIPE, text=True, cwd=TESTS)
         assert sender.stdin is not None
 
         def say(line: str) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from labs import hilrig, write_lab
-from recordings import record
+from support.labs import hilrig, write_lab
+from support.recordings import record
 
 READERS = (
     ("latency", "{file}"),

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from browser import CHROMIUM, Browser, share_of
-from hilrig_replay.palette import JOINT_COLORS, rgb
-from labs import HILRIG, hilrig
-from recordings import Script, make, record, write
-from waiting import PATIENT_S
+from hilrig_replay.plots.palette import JOINT_COLORS, rgb
+from support.browser import CHROMIUM, Browser, share_of
+from support.labs import HILRIG, hilrig
+from support.recordings import Script, make, record, write
+from support.waiting import PATIENT_S
 
 pytestmark = [pytest.mark.rig, pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")]
 

@@ -10,14 +10,14 @@ import pytest
 import zenoh
 from pymodbus.client import ModbusTcpClient
 
-from bus_certificates import HOSTS, NOW, bad_identities, folder_of_one, make_bus_folder
-from hilrig_modbus_edge.certificates import Identity, issue_peer, make_authority
-from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_config import router_config
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_runtime.zenoh_config import router_config
-from labs import RunningLab, free_ports, hilrig, write_lab
-from waiting import eventually
+from hilrig_runtime.security.x509 import Identity, issue_peer, make_authority
+from support.bus_certificates import HOSTS, NOW, bad_identities, folder_of_one, make_bus_folder
+from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

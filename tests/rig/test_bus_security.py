@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 import zenoh
 
-from bus_certificates import folder_of_one, make_bus_folder
-from hilrig_modbus_edge.certificates import load
-from hilrig_runtime.bus_config import BusConfig, BusTlsConfig
-from hilrig_runtime.zenoh_config import router_config, zenoh_config
-from labs import free_ports
-from waiting import eventually
+from hilrig_runtime.bus.zenoh_config import router_config, zenoh_config
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
+from hilrig_runtime.security.x509 import load
+from support.bus_certificates import folder_of_one, make_bus_folder
+from support.labs import free_ports
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

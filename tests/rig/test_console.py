@@ -19,16 +19,16 @@ from typing import Any
 
 import pytest
 
-from browser import CHROMIUM, Browser
-from bus_certificates import make_bus_folder
 from hilrig_console.app import BROWSERS
-from hilrig_console.guard import Guard
+from hilrig_console.auth import Guard
 from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
-from hilrig_runtime.config import load_lab
+from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.errors import OperationError
-from labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
-from recordings import Script, record
-from waiting import PATIENT_S, eventually
+from support.browser import CHROMIUM, Browser
+from support.bus_certificates import make_bus_folder
+from support.labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
+from support.recordings import Script, record
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

@@ -9,10 +9,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from hilrig_replay.samples import STAGES
-from labs import hilrig
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.io.run import open_run
+from support.labs import hilrig
 
 pytestmark = pytest.mark.rig
 
@@ -85,7 +85,7 @@ def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_de
 
 def test_a_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # A controller that writes without ever having read: what it writes answers no state, so there is no sample.
-    from hilrig_cli import demo as module
+    from hilrig_cli.local import demo as module
 
     controller = tmp_path / "never_reads.py"
     controller.write_text(

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_cli.demo import judge
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from labs import RunningLab, write_lab
-from waiting import eventually
+from hilrig_cli.local.demo import judge
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.run import open_run
+from support.labs import RunningLab, write_lab
+from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
-from waiting import PATIENT_S
+from support.labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
+from support.waiting import PATIENT_S
 
 pytestmark = pytest.mark.rig
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from labs import HILRIG, RunningLab, hilrig, write_lab
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from edge_rig import RawClient
-from hilrig_modbus_edge.impairment import Impairment, way_seed
-from hilrig_replay.latency import LatencyReport, measure
-from hilrig_replay.run import Run, open_run
-from hilrig_replay.samples import STAGES
-from hilrig_runtime.impairment_config import WayImpairment
-from labs import RunningLab, free_ports, hilrig, write_lab
-from waiting import eventually
+from hilrig_modbus_edge.impairment.model import Impairment, way_seed
+from hilrig_replay.analysis.latency import LatencyReport, measure
+from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.io.run import Run, open_run
+from hilrig_runtime.config.impairment import WayImpairment
+from support.edge_rig import RawClient
+from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
@@ -247,7 +247,7 @@ def test_an_impaired_run_is_simulated_again_to_the_last_bit(sessions: dict[str, 
 
 
 def test_a_recording_can_be_the_trace_of_another_loop(sessions: dict[str, Session], lab_folder: Path) -> None:
-    from hilrig_replay.delay_trace import delay_trace
+    from hilrig_replay.export.delay_trace import delay_trace
 
     session = sessions["normal-way"]
     trace = delay_trace(session.run)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from labs import HILRIG, RunningLab, hilrig, write_lab
-from rrd_files import RrdFile
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, RunningLab, hilrig, write_lab
+from support.rrd_files import RrdFile
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from conformance import NAMED, RULES, Rule, as_markdown
-from edge_rig import EdgeRig, RawClient, counts, running_edge
-from hilrig_modbus_edge.server import Connection
-from waiting import eventually
+from generate_conformance import NAMED, RULES, Rule, as_markdown
+from hilrig_modbus_edge.server.listener import Connection
+from support.edge_rig import EdgeRig, RawClient, counts, running_edge
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 
@@ -203,7 +203,7 @@ def _sockets() -> list[socket.socket]:
 
 def test_the_page_is_generated_from_these_rules() -> None:
     page = Path(__file__).parents[2] / "docs/modbus-conformance.md"
-    assert page.read_text() == as_markdown(), "run: python tests/conformance.py > docs/modbus-conformance.md"
+    assert page.read_text() == as_markdown(), "run: python scripts/generate_conformance.py > docs/modbus-conformance.md"
 
 
 def test_every_rule_of_the_page_has_its_test() -> None:

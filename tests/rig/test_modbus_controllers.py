@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from clients import mbpoll_read, mbpoll_write, require_mbpoll
-from edge_rig import EdgeRig, RawClient, running_edge
-from labs import RunningLab, hilrig, write_lab
-from waiting import eventually
+from support.clients import mbpoll_read, mbpoll_write, require_mbpoll
+from support.edge_rig import EdgeRig, RawClient, running_edge
+from support.labs import RunningLab, hilrig, write_lab
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

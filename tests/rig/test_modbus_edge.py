@@ -10,15 +10,15 @@ from itertools import pairwise
 
 import pytest
 
-from edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
-from hilrig_modbus_edge.bridge import run
-from hilrig_modbus_edge.departures import MANY
-from hilrig_runtime.config import LabConfig
+from hilrig_modbus_edge.command_scheduler import MANY
+from hilrig_modbus_edge.service import run
+from hilrig_runtime.bus.memory_bus import MemoryBus
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.memory_bus import MemoryBus
-from hilrig_runtime.service import Service
+from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, TorqueCommand, topics
-from waiting import eventually
+from support.edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from clients import build_c_client
-from edge_rig import HEADER
-from labs import RunningLab, write_lab
-from waiting import eventually
+from support.clients import build_c_client
+from support.edge_rig import HEADER
+from support.labs import RunningLab, write_lab
+from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 

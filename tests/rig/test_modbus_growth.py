@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from labs import RunningLab, write_lab
-from waiting import eventually
+from support.labs import RunningLab, write_lab
+from support.waiting import eventually
 
 pytestmark = [
     pytest.mark.rig,

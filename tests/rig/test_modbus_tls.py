@@ -19,9 +19,11 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
-from conformance import SECURED
-from edge_rig import EdgeRig, free_ports, running_edge
-from hilrig_modbus_edge.certificates import (
+from generate_conformance import SECURED
+from hilrig_modbus_edge.server.tls import TlsPolicy
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.security.x509 import (
     ROLE_OID,
     Identity,
     issue_client,
@@ -30,12 +32,10 @@ from hilrig_modbus_edge.certificates import (
     names_in,
     role_of,
 )
-from hilrig_modbus_edge.tls import TlsPolicy
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
-from labs import hilrig
-from waiting import eventually
+from support.edge_rig import EdgeRig, free_ports, running_edge
+from support.labs import hilrig
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 
@@ -202,7 +202,7 @@ def test_a_role_that_cannot_be_told_is_none(rig: EdgeRig, lab: Lab, roles: list[
 def test_a_handshake_that_is_never_finished_is_given_up(
     rig: EdgeRig, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hilrig_modbus_edge.tls.HANDSHAKE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("hilrig_modbus_edge.server.tls.HANDSHAKE_TIMEOUT_S", 0.2)
     with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as slow:
         slow.sendall(Handshake(lab.client("operator")).go_on(b""))
         while slow.recv(4096):
@@ -277,7 +277,7 @@ def test_mutated_handshakes_hurt_nobody(
     eventually(lambda: rig.service.counters.connections == 0)
     assert rig.service.counters.refused
     gc.collect()
-    assert {record.name for record in caplog.records} <= {"hilrig_modbus_edge.server"}
+    assert {record.name for record in caplog.records} <= {"hilrig_modbus_edge.server.listener"}
 
 
 @pytest.mark.parametrize("size", [300, 5_000, 300_000])
@@ -296,7 +296,7 @@ def test_what_is_no_modbus_right_behind_the_handshake_closes_the_connection(
     eventually(lambda: rig.service.counters.connections == 0)
     assert rig.service.counters.malformed == 1
     assert talk(rig, lab.client("operator"), READ)
-    assert [record.name for record in caplog.records] == ["hilrig_modbus_edge.server"]
+    assert [record.name for record in caplog.records] == ["hilrig_modbus_edge.server.listener"]
 
 
 def test_a_client_cannot_begin_a_handshake_anew(rig: EdgeRig, lab: Lab) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from labs import HILRIG
-from recordings import record
+from support.labs import HILRIG
+from support.recordings import record
 
 pytestmark = pytest.mark.rig
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas.topics import Traffic
-from labs import free_ports
+from support.labs import free_ports
 
 pytestmark = [
     pytest.mark.rig,
@@ -32,8 +32,8 @@ KEPT = 1_000
 HELD_UP_S = 1.5
 READER = f"""
 import os, signal, sys, threading
-from hilrig_runtime.bus_config import BusConfig
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.config.bus import BusConfig
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
 
 numbers, lost, done = [], [], threading.Event()
 

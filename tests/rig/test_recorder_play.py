@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-import recordings
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, STATE
-from labs import HILRIG, hilrig
-from recorder_rig import make_lab, sending
-from waiting import eventually
+from support import recordings
+from support.labs import HILRIG, hilrig
+from support.recorder_rig import make_lab, sending
+from support.waiting import eventually
 
 
 @pytest.mark.rig

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from labs import HILRIG, free_ports, hilrig
-from recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, router, sending, wait_ready
-from waiting import PATIENT_S, eventually
+from support.labs import HILRIG, free_ports, hilrig
+from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, router, sending, wait_ready
+from support.waiting import PATIENT_S, eventually
 
 
 @pytest.mark.rig

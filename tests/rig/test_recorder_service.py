@@ -10,17 +10,17 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from hilrig_recorder.mcap_format.writer import RunWriter
 from hilrig_recorder.service import run
-from hilrig_recorder.writer import RunWriter
-from hilrig_runtime.clock import SYSTEM_CLOCK
-from hilrig_runtime.config import LabConfig, RecorderConfig
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import LabConfig, RecorderConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.service import Service
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, RigConfig
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
-from log_streams import FakeSource
-from waiting import PATIENT_S, eventually
+from support.log_streams import FakeSource
+from support.waiting import PATIENT_S, eventually
 
 SESSION = "20260101T000000Z-rig1-abcd"
 
@@ -243,7 +243,7 @@ def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
 def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hilrig_recorder.files.MIB", 12 * 1024)
+    monkeypatch.setattr("hilrig_recorder.storage.store.MIB", 12 * 1024)
     lab = Lab(tmp_path, rotate_mib=1, min_free_mib=0)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
     with lab.recorder():

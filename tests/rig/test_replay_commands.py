@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from labs import hilrig
-from recordings import Script, make, record, write
-from rrd_files import RrdFile
+from support.labs import hilrig
+from support.recordings import Script, make, record, write
+from support.rrd_files import RrdFile
 
 pytestmark = pytest.mark.rig
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.index import read_verdict
+from hilrig_replay.io.index import read_verdict
 from hilrig_schemas import JointState
-from labs import hilrig
-from recordings import Made, write
-from virtual_rig import VirtualRig
+from support.labs import hilrig
+from support.recordings import Made, write
+from support.virtual_rig import VirtualRig
 
 pytestmark = pytest.mark.rig
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import LabConfig, load_lab
-from hilrig_runtime.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_schemas import Event, JointState, RigBatch, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, CONFIG, EVENT, STATE
-from hilrig_sim.model import RigParameters
-from labs import HILRIG, hilrig, write_lab
-from waiting import PATIENT_S, eventually
+from hilrig_sim.arm.model import RigParameters
+from support.labs import HILRIG, hilrig, write_lab
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

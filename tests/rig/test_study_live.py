@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from labs import hilrig
+from support.labs import hilrig
 
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 

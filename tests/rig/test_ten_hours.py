@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from hilrig_schemas import Event, JointState, ModbusTraffic, TorqueCommand
-from labs import HILRIG
-from recordings import MS, Made, Script, make, write
+from support.labs import HILRIG
+from support.recordings import MS, Made, Script, make, write
 
 pytestmark = [
     pytest.mark.alone,

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from clients import build_c_client, mbpoll_read, mbpoll_write, require_mbpoll
-from hilrig_replay.run import open_run
-from labs import RunningLab, free_ports, hilrig, write_lab
-from waiting import eventually
+from hilrig_replay.io.run import open_run
+from support.clients import build_c_client, mbpoll_read, mbpoll_write, require_mbpoll
+from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 

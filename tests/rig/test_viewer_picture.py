@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from browser import share_of
-from hilrig_replay.rerun_view import save_rrd, send_runs
-from hilrig_replay.run import open_run
-from hilrig_replay.viewer import environment, executable, free_port, running_viewer
-from labs import HILRIG
-from recordings import Script, record
-from waiting import PATIENT_S, eventually
+from hilrig_replay.io.run import open_run
+from hilrig_replay.rerun_view.view import save_rrd, send_runs
+from hilrig_replay.rerun_view.viewer import environment, executable, free_port, running_viewer
+from support.browser import share_of
+from support.labs import HILRIG
+from support.recordings import Script, record
+from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 

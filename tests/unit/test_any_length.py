@@ -10,23 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay import (
-    compare,
-    diagnosis,
-    distribution,
-    export,
-    latency_plot,
-    rerun_view,
-    samples,
-    spool,
-    summary,
-    verify,
-)
-from hilrig_replay.index import RunIndex
-from hilrig_replay.latency import measure
-from hilrig_replay.latency_plot import latency_figure
-from hilrig_replay.run import Run, open_run
-from recordings import Script, record
+from hilrig_replay.analysis import compare, diagnosis, distribution, samples, summary, verify
+from hilrig_replay.analysis import disk_table as spool
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.export import export
+from hilrig_replay.io.index import RunIndex
+from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.plots import latency_plot
+from hilrig_replay.plots.latency_plot import latency_figure
+from hilrig_replay.rerun_view import view as rerun_view
+from support.recordings import Script, record
 
 SHORT_S, TIMES = 16.0, 3
 ROWS = 160

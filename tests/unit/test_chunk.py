@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Metadata
 
-from hilrig_recorder.channels import encode_message
-from hilrig_recorder.chunk import CHUNK_BYTES, ChunkNote, chunks_of, compressor, cut, encode_chunk
-from hilrig_recorder.summary import encoded
+from hilrig_recorder.mcap_format.channels import encode_message
+from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES, ChunkNote, chunks_of, compressor, cut, encode_chunk
+from hilrig_recorder.mcap_format.summary_section import encoded
 
 MESSAGES = st.lists(st.tuples(st.integers(1, 4), st.integers(0, 2**62), st.binary(max_size=300)), min_size=1)
 

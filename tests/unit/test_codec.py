@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
-from hilrig_modbus_edge import codec
+from hilrig_modbus_edge.registers import codec
 
 COUNT = st.integers(-32767, 32767)
 NUMBER = st.floats(allow_nan=True, allow_infinity=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import pytest
 
 from hilrig_schemas import TorqueCommand
+from hilrig_sim.arm.model import LARGEST_EFFORT
 from hilrig_sim.commands import ZERO_EFFORT, CommandFollower, StepTimes
-from hilrig_sim.model import LARGEST_EFFORT
 
 MS = 1_000_000
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from hilrig_console import worker as worker_module
-from hilrig_console.shelf import Librarian, Shelf
+from hilrig_console.catalog import Librarian, Shelf
 from hilrig_console.worker import Worker
 from hilrig_runtime.errors import InputError, OperationError
-from recordings import Script, record
-from waiting import eventually
+from support.recordings import Script, record
+from support.waiting import eventually
 
 
 class Clerk:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hilrig_runtime.config import LabConfig, RigSettings
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.kinematics import forward
+from hilrig_runtime.config.lab import LabConfig, RigSettings
+from hilrig_sim.arm.kinematics import forward
+from hilrig_sim.parameters import rig_parameters
 
 PAGE = (Path(__file__).parents[2] / "docs/controllers.md").read_text(encoding="utf-8")
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())

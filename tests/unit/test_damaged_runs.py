@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-import recordings
-from hilrig_recorder.recover import recover
-from hilrig_recorder.scan import Chunk, Message, open_chunk, scan
-from hilrig_replay.index import RunIndex
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from labs import hilrig
+from hilrig_recorder.mcap_format.recover import recover
+from hilrig_recorder.mcap_format.scan import Chunk, Message, open_chunk, scan
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.index import RunIndex
+from hilrig_replay.io.run import open_run
+from support import recordings
+from support.labs import hilrig
 
 RECORDED = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.delay_trace import delay_trace
-from hilrig_replay.run import open_run
+from hilrig_replay.export.delay_trace import delay_trace
+from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
-from recordings import Made, Script, make, record, write
+from support.recordings import Made, Script, make, record, write
 
 
 def trace_ms(folder: Path, script: Script) -> tuple[float, ...]:

@@ -6,10 +6,10 @@ from typing import Any, cast
 
 import pytest
 
-from hilrig_cli.demo import DemoRun, Review
-from hilrig_replay.latency import LatencyReport
-from hilrig_replay.task import PlacedPart, TaskResult
-from hilrig_replay.verify import Verification
+from hilrig_cli.local.demo import DemoRun, Review
+from hilrig_replay.analysis.latency import LatencyReport
+from hilrig_replay.analysis.verify import Verification
+from hilrig_replay.grading.placement import PlacedPart, TaskResult
 
 DONE = {"done_s": 12.1, "duration_s": 20.0, "doing": "", "missing": []}
 LATE = {"done_s": None, "duration_s": 12.0, "doing": "take blue", "missing": ["blue", "green"]}

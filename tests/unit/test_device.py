@@ -4,12 +4,12 @@ import struct
 
 import pytest
 
-from device_bench import MS, Bench
-from hilrig_modbus_edge import registers
-from hilrig_modbus_edge.errors import ModbusError
-from hilrig_modbus_edge.registers import Status, Table
-from hilrig_runtime.messaging import Arrival
+from hilrig_modbus_edge.protocol.exceptions import ModbusError
+from hilrig_modbus_edge.registers import map as registers
+from hilrig_modbus_edge.registers.map import Status, Table
+from hilrig_runtime.messaging.endpoints import Arrival
 from hilrig_schemas import Event, JointState
+from support.device_bench import MS, Bench
 
 
 @pytest.fixture

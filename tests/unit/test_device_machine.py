@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from device_bench import MS, Bench
-from hilrig_modbus_edge.client import Client
-from hilrig_modbus_edge.pdu import answer
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.protocol.pdu import answer
+from support.device_bench import MS, Bench
 
 WATCHDOG_MS, LEASE_MS, GRACE_MS, HANDOVER_MS = 1000, 5000, 5000, 1000
 WORD = st.integers(0, 0xFFFF)

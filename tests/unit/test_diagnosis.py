@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.diagnosis import Finding
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from recordings import Script, make, record, write
+from hilrig_replay.analysis.diagnosis import Finding
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.run import open_run
+from support.recordings import Script, make, record, write
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:

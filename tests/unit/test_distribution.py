@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hilrig_replay.distribution import Statistics, differences, median, percentiles, tail
-from hilrig_replay.spool import Blocks
+from hilrig_replay.analysis.disk_table import Blocks
+from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles, tail
 
 SHARES = (0, 1, 5, 25, 50, 75, 95, 99, 99.9, 100)
 

@@ -9,11 +9,11 @@ import pinocchio
 import pytest
 from numpy.typing import NDArray
 
-from hilrig_sim import kinematics, newton_euler
-from hilrig_sim.dynamics import forward_dynamics
-from hilrig_sim.model import ArmParameters, RigParameters, SceneParameters, StepParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.urdf import POINT_INERTIA, POINT_MASS, urdf
+from hilrig_sim.arm import kinematics, newton_euler
+from hilrig_sim.arm.dynamics import forward_dynamics
+from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, StepParameters
+from hilrig_sim.arm.urdf import POINT_INERTIA, POINT_MASS, urdf
+from hilrig_sim.plant.plant import Plant
 
 Floats = NDArray[np.float64]
 CASES = 300

@@ -12,17 +12,17 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-import recordings
-from hilrig_recorder.writer import RunWriter
-from hilrig_replay.export import DRAFT_SUFFIX, TABLES, export_foxglove, export_tables, table
-from hilrig_replay.latency import measure
-from hilrig_replay.run import open_run
-from hilrig_replay.scene import rotate
-from hilrig_replay.shapes import Solid, solids_of
+from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.export.export import DRAFT_SUFFIX, TABLES, export_foxglove, export_tables, table
+from hilrig_replay.export.urdf_geometry import Solid, solids_of
+from hilrig_replay.io.run import open_run
+from hilrig_replay.rerun_view.scene import rotate
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_sim.kinematics import forward
-from hilrig_sim.model import ArmParameters
-from labs import hilrig
+from hilrig_sim.arm.kinematics import forward
+from hilrig_sim.arm.model import ArmParameters
+from support import recordings
+from support.labs import hilrig
 
 PAGE = Path(__file__).parents[2] / "docs/recordings.md"
 

@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 import rerun as rr
 
-from hilrig_replay.live import SILENCE_NS, Follower
-from hilrig_replay.rerun_layout import layout
-from hilrig_replay.streams import to_file
-from hilrig_runtime.clock import ManualClock
+from hilrig_replay.rerun_view.layout import layout
+from hilrig_replay.rerun_view.live import SILENCE_NS, Follower
+from hilrig_replay.rerun_view.sinks import to_file
+from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.memory_bus import MemoryBus
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, RIG_TOPICS, Traffic
-from hilrig_sim.urdf import urdf
-from recordings import PARAMETERS, Made, Script, make
-from rrd_files import RrdFile
+from hilrig_sim.arm.urdf import urdf
+from support.recordings import PARAMETERS, Made, Script, make
+from support.rrd_files import RrdFile
 
 KEYS = {topic.name: topic.key("lab", "rig1") for topic in RIG_TOPICS}
 

@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.assignment import check_task, read_task, task_of
-from hilrig_replay.grade import Grade, Grader
-from hilrig_replay.report import report
-from hilrig_replay.run import open_run
-from hilrig_replay.summary import summarise
-from hilrig_replay.task import PlacedPart, TaskResult
-from hilrig_runtime.config import parse_lab
+from hilrig_replay.analysis.summary import summarise
+from hilrig_replay.grading.grade import Grade, Grader
+from hilrig_replay.grading.placement import PlacedPart, TaskResult
+from hilrig_replay.grading.task_loading import check_task, read_task, task_of
+from hilrig_replay.io.run import open_run
+from hilrig_replay.report.report import report
+from hilrig_runtime.config.lab import parse_lab
+from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.task_config import TaskConfig
 from hilrig_schemas import JointState
-from hilrig_sim.kinematics import inverse
-from recordings import PARAMETERS, Script, make, write
+from hilrig_sim.arm.kinematics import inverse
+from support.recordings import PARAMETERS, Script, make, write
 
 STEP_S = 0.02
 STEP_RESPONSE = {"poses": [{"name": "a", "position_mm": [400, 0, 0], "tolerance_mm": 4, "hold_s": 0.3}]}

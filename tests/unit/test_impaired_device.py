@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from device_bench import MS, Bench
-from hilrig_modbus_edge.client import Client
-from hilrig_runtime.impairment_config import ImpairmentConfig
+from hilrig_modbus_edge.device.client import Client
+from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_schemas import Event, TorqueCommand
+from support.device_bench import MS, Bench
 
 KINDS = {
     "constant:12.5": None,
@@ -229,7 +229,7 @@ def test_what_is_repeated_is_what_the_simulation_was_told() -> None:
 
 
 def test_a_trip_leaves_the_magnet_as_the_simulation_has_it() -> None:
-    from hilrig_modbus_edge import registers
+    from hilrig_modbus_edge.registers import map as registers
 
     bench = impaired(command="constant:1500")
     client = bench.connect()
@@ -335,7 +335,7 @@ def test_states_that_nobody_reads_do_not_pile_up() -> None:
 
 def test_words_without_a_torque_are_not_held_up() -> None:
     """The echo word and the time-out are the edge's own registers: they hold at once."""
-    from hilrig_modbus_edge import registers
+    from hilrig_modbus_edge.registers import map as registers
 
     bench = impaired(command="constant:100")
     client = bench.connect()

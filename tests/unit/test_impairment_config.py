@@ -4,9 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import parse_lab
-from hilrig_runtime.errors import InputError
-from hilrig_runtime.impairment_config import (
+from hilrig_runtime.config.impairment import (
     PRESETS,
     BernoulliLoss,
     ConstantDelay,
@@ -18,6 +16,8 @@ from hilrig_runtime.impairment_config import (
     UniformDelay,
     WayImpairment,
 )
+from hilrig_runtime.config.lab import parse_lab
+from hilrig_runtime.errors import InputError
 
 
 def test_without_it_the_loop_is_as_it_is() -> None:

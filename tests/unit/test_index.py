@@ -9,11 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-import recordings
-from hilrig_recorder.writer import RunWriter
-from hilrig_replay.index import INDEX_NAME, RECORDING, RunIndex, read_entry, read_verdict, write_verdict
+from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_replay.io.index import INDEX_NAME, RECORDING, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
-from labs import hilrig
+from support import recordings
+from support.labs import hilrig
 
 SCRIPT = recordings.Script(seconds=1.0)
 
@@ -44,8 +44,8 @@ def test_loop_latency_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert entry.loop_p99_ms is not None
     assert entry.loop_p99_ms >= entry.loop_p50_ms
     index.save()
-    monkeypatch.setattr("hilrig_replay.index.read_entry", lambda *_: pytest.fail("was read again"))
-    monkeypatch.setattr("hilrig_replay.index.measure_entry", lambda *_: pytest.fail("was measured again"))
+    monkeypatch.setattr("hilrig_replay.io.index.read_entry", lambda *_: pytest.fail("was read again"))
+    monkeypatch.setattr("hilrig_replay.io.index.measure_entry", lambda *_: pytest.fail("was measured again"))
     again = RunIndex(tmp_path)
     assert again.measure(again.load()) == [entry]
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim.dynamics import ReducedDynamics, stage_views
-from hilrig_sim.integrators import EULER, RK4, RKF45, TABLEAUS, Tableau, reference_solution
-from hilrig_sim.model import ArmParameters, RigParameters, StepParameters
-from hilrig_sim.stability import check_stable, fastest_mode, largest_safe_step
-from hilrig_sim.stepping import FixedStep
+from hilrig_sim.arm.dynamics import ReducedDynamics, stage_views
+from hilrig_sim.arm.integrators import EULER, RK4, RKF45, TABLEAUS, Tableau, reference_solution
+from hilrig_sim.arm.model import ArmParameters, RigParameters, StepParameters
+from hilrig_sim.arm.stability import check_stable, fastest_mode, largest_safe_step
+from hilrig_sim.arm.stepping import FixedStep
 
 PAPER = ArmParameters(masses=(1.0, 0.5, 0.5))
 """Of m2 and m3 only the sum counts in the plane: 1 kg as in experiment (44)."""

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim import kinematics
-from hilrig_sim.kinematics import UnreachableError
-from hilrig_sim.model import ArmParameters
+from hilrig_sim.arm import kinematics
+from hilrig_sim.arm.kinematics import UnreachableError
+from hilrig_sim.arm.model import ArmParameters
 
 ARM = ArmParameters()
 

@@ -9,8 +9,8 @@ from contextlib import closing
 import pytest
 
 from hilrig_cli.commands.top import picture
-from hilrig_cli.prometheus import exposition, metrics_server
-from hilrig_console.lab_view import SILENT_S, WINDOW_S, LabView
+from hilrig_monitoring.lab_view import SILENT_S, WINDOW_S, LabView
+from hilrig_monitoring.prometheus import exposition, metrics_server
 from hilrig_schemas import Health, RigReport
 
 

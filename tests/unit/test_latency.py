@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_replay.latency import LatencyReport, measure
-from hilrig_replay.latency_plot import save_plot
-from hilrig_replay.run import Run, open_run
-from hilrig_replay.samples import STAGES, Matcher, SampleTable
+from hilrig_replay.analysis.latency import LatencyReport, measure
+from hilrig_replay.analysis.samples import STAGES, Matcher, SampleTable
+from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, TorqueCommand
-from recordings import MS, Script, make, record, write
+from support.recordings import MS, Script, make, record, write
 
 
 def measured(folder: Path, script: Script) -> LatencyReport:

@@ -1,6 +1,6 @@
 from dataclasses import dataclass
 
-from hilrig_modbus_edge.lease import Lease
+from hilrig_modbus_edge.device.lease import Lease
 
 
 @dataclass(eq=False)

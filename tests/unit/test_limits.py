@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from hilrig_modbus_edge import server
-from hilrig_runtime.config import parse_lab
-from hilrig_runtime.ending import run_main
+from hilrig_modbus_edge.server import listener as server
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_config import unknown_host
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.zenoh_bus import ZenohBus
-from hilrig_runtime.zenoh_config import unknown_host
-from labs import free_ports
+from hilrig_runtime.process.shutdown import run_main
+from support.labs import free_ports
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_known_host_is_not_named(endpoint: str) -> None:
 
 LIMITS = """
 import resource
-from hilrig_runtime.lifecycle import allow_open_files
+from hilrig_runtime.process.lifecycle import allow_open_files
 _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
 most = min(most, 4096)
 resource.setrlimit(resource.RLIMIT_NOFILE, (64, most))

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from hilrig_runtime.errors import OperationError
-from hilrig_study.live_loop import listen_for_ticks
+from hilrig_study.live.live_loop import listen_for_ticks
 
 STEP_NS = 20_000_000
 

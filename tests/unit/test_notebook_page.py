@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from recordings import Script, make, write
+from support.recordings import Script, make, write
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
 

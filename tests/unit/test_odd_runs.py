@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.compare import compare
-from hilrig_replay.latency import measure
-from hilrig_replay.report import report
-from hilrig_replay.rerun_view import save_rrd
-from hilrig_replay.run import open_run
-from hilrig_replay.verify import verify
+from hilrig_replay.analysis.compare import compare
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.verify import verify
+from hilrig_replay.io.run import open_run
+from hilrig_replay.report.report import report
+from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.errors import InputError
-from recordings import Script, make, record, write
+from support.recordings import Script, make, record, write
 
 ALL: dict[str, Callable[[Path], object]] = {
     "latency": lambda path: measure(open_run(path)),

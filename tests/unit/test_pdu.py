@@ -21,8 +21,8 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from device_bench import Bench
-from hilrig_modbus_edge import pdu
+from hilrig_modbus_edge.protocol import pdu
+from support.device_bench import Bench
 
 WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=4)
 DECODER = DecodePDU(is_server=False)

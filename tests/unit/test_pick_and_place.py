@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.task import placed_parts
+from hilrig_replay.grading.placement import placed_parts
 from hilrig_schemas import JointState, PartState
-from hilrig_sim.dynamics import forward_dynamics
-from hilrig_sim.model import ArmParameters, RigParameters
-from recordings import PARAMETERS
-from virtual_rig import FarRig, VirtualRig, pick_and_place, work
+from hilrig_sim.arm.dynamics import forward_dynamics
+from hilrig_sim.arm.model import ArmParameters, RigParameters
+from support.recordings import PARAMETERS
+from support.virtual_rig import FarRig, VirtualRig, pick_and_place, work
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim.dynamics import ReducedDynamics, mass_matrix
-from hilrig_sim.limits import Happening
-from hilrig_sim.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.stops import stop_outward
-from recordings import PARAMETERS
+from hilrig_sim.arm.dynamics import ReducedDynamics, mass_matrix
+from hilrig_sim.arm.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
+from hilrig_sim.plant.hard_stops import stop_outward
+from hilrig_sim.plant.limits import Happening
+from hilrig_sim.plant.plant import Plant
+from support.recordings import PARAMETERS
 
 ARM = ArmParameters()
 # Nothing to come down on: the quill has its own stop alone.

@@ -6,15 +6,15 @@ from itertools import islice
 
 import pytest
 
-import recordings
-from hilrig_replay.player import Player, play_on, rig_config
-from hilrig_replay.run import Run, open_run
-from hilrig_runtime.clock import ManualClock
+from hilrig_replay.export.player import Player, play_on, rig_config
+from hilrig_replay.io.run import Run, open_run
+from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.memory_bus import MemoryBus
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import RECORDED, STATE, parse_rig_key
-from labs import hilrig
+from support import recordings
+from support.labs import hilrig
 
 MADE = recordings.make(recordings.Script(seconds=2))
 

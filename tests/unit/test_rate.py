@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.rate import Rate
+from hilrig_runtime.timing.clock import ManualClock
+from hilrig_runtime.timing.rate import Rate
 
 PERIOD = 20_000_000
 

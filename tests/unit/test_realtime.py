@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from hilrig_runtime import realtime
+from hilrig_runtime.timing import realtime
 
 
 def _granted(connection: Connection) -> None:

@@ -12,14 +12,14 @@ from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
 
-import recordings
-from hilrig_recorder.channels import encode_message
-from hilrig_recorder.durable import lock_file
-from hilrig_recorder.recover import recover, recovered_path, session_of
-from hilrig_recorder.scan import Chunk, Message, is_whole, open_chunk, scan
-from hilrig_recorder.writer import RunWriter
+from hilrig_recorder.mcap_format.channels import encode_message
+from hilrig_recorder.mcap_format.recover import recover, recovered_path, session_of
+from hilrig_recorder.mcap_format.scan import Chunk, Message, is_whole, open_chunk, scan
+from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.storage.fsutil import lock_file
 from hilrig_runtime.errors import InputError, OperationError
-from labs import hilrig
+from support import recordings
+from support.labs import hilrig
 
 START = 1_767_225_600_000_000_000
 HEADER_BYTES = 31

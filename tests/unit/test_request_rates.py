@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilrig_replay.columns import TRAFFIC, Names, Rows
-from hilrig_replay.request_rates import BIN_NS, MOST, OTHERS, RequestRates
+from hilrig_replay.analysis.request_rates import BIN_NS, MOST, OTHERS, RequestRates
+from hilrig_replay.io.columns import TRAFFIC, Names, Rows
 
 
 def requests(names: Names, at_ms: list[float], *, controller: str = "a:1", function: int = 3) -> Rows:

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.latency import measure
-from hilrig_replay.rerun_view import root_names, save_rrd
-from hilrig_replay.run import open_run
-from hilrig_replay.scene import tips
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.run import open_run
+from hilrig_replay.rerun_view.scene import tips
+from hilrig_replay.rerun_view.view import root_names, save_rrd
 from hilrig_runtime.errors import InputError, OperationError
-from recordings import PARAMETERS, Script, make, record, write
-from rrd_files import RrdFile
+from support.recordings import PARAMETERS, Script, make, record, write
+from support.rrd_files import RrdFile
 
 
 def test_curves_are_the_states_in_degrees_and_millimetres(tmp_path: Path) -> None:

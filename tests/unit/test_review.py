@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.compare import Origin, compare, origin_of, save_comparison_plot
-from hilrig_replay.report import report
-from hilrig_replay.run import Run, open_run
-from hilrig_replay.scene import tips
-from hilrig_replay.selection import names_of
-from hilrig_replay.summary import COURSE_POINTS, summarise
-from hilrig_runtime.config import parse_lab
+from hilrig_replay.analysis.compare import Origin, compare, origin_of, save_comparison_plot
+from hilrig_replay.analysis.summary import COURSE_POINTS, summarise
+from hilrig_replay.io.paths import names_of
+from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.report.report import report
+from hilrig_replay.rerun_view.scene import tips
+from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
-from recordings import PARAMETERS, Made, Script, make, position, record, write
+from support.recordings import PARAMETERS, Made, Script, make, position, record, write
 
 
 def named(folder: Path, name: str, script: Script, made: list[Made] | None = None) -> Run:

@@ -1,13 +1,13 @@
 """Messages of many rigs together: recorded each under its own key, the newest kept, nobody speaks for another's rig."""
 
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import parse_lab
-from hilrig_runtime.health import resident_bytes
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.service import Service
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import parse_lab
+from hilrig_runtime.process.health import resident_bytes
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import LogBatch, RigBatch
 from hilrig_schemas.topics import COMMANDS, LOG, STATE, STATES
-from virtual_rig import VirtualRig
+from support.virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from hilrig_replay.columns import COMMAND, STATE
-from hilrig_replay.run import open_run
+from hilrig_replay.io.columns import COMMAND, STATE
+from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
-from recordings import START_WALL_NS, Made, Script, make, record, write
+from support.recordings import START_WALL_NS, Made, Script, make, record, write
 
 
 @pytest.fixture(scope="module")

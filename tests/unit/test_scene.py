@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilrig_replay.scene import multiply, parameters_of, reach_outline, read_arm, rotate, tips
+from hilrig_replay.rerun_view.scene import multiply, parameters_of, reach_outline, read_arm, rotate, tips
 from hilrig_runtime.errors import InputError
-from hilrig_sim.kinematics import in_reach
-from hilrig_sim.model import ArmParameters, RigParameters
-from hilrig_sim.urdf import urdf
+from hilrig_sim.arm.kinematics import in_reach
+from hilrig_sim.arm.model import ArmParameters, RigParameters
+from hilrig_sim.arm.urdf import urdf
 
 SEED = 7
 

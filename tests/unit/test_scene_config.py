@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_runtime.config import LabConfig, load_lab, parse_lab
+from hilrig_runtime.config.lab import LabConfig, load_lab, parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.kinematics import inverse
+from hilrig_sim.arm.kinematics import inverse
+from hilrig_sim.parameters import rig_parameters
 
 PART = '[[scene.parts]]\nname = "{name}"\nposition_mm = [{x}, {y}]\n'
 

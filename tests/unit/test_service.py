@@ -2,10 +2,10 @@
 
 import pytest
 
-from hilrig_runtime.clock import ManualClock
-from hilrig_runtime.config import LabConfig
-from hilrig_runtime.memory_bus import MemoryBus, MemoryHub
-from hilrig_runtime.service import Service
+from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, Health, JointState, LogBatch, RigBatch
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, STATE, STATES, alive_key
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from hilrig_recorder.channels import message_head
-from hilrig_recorder.intake import Arrival
-from hilrig_recorder.recording import Recording
-from hilrig_recorder.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
-from hilrig_runtime.logstream import put_entries
+from hilrig_recorder.ingest.queue import Arrival
+from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.ingest.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
+from hilrig_recorder.mcap_format.channels import message_head
+from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
-from log_streams import LAB, MS, SECOND, FakeSource, Sent
+from support.log_streams import LAB, MS, SECOND, FakeSource, Sent
 
 MESSAGE_HEAD_BYTES = 31
 """Of an MCAP message record: opcode, length, channel, sequence, two times."""

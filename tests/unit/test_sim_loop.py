@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig, parse_lab
+from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig, parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.rate import Rate
+from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.limits import Happening, PlantEvent
-from hilrig_sim.model import RigParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.reports import Reporter
-from virtual_rig import VirtualRig
+from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.events import Reporter
+from hilrig_sim.parameters import rig_parameters
+from hilrig_sim.plant.limits import Happening, PlantEvent
+from hilrig_sim.plant.plant import Plant
+from support.virtual_rig import VirtualRig
 
 
 @pytest.fixture

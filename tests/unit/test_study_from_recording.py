@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import recordings
-from hilrig_replay.run import open_run
+from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
-from hilrig_study.from_recording import judge_gains, recorded_ages
+from hilrig_study.live.from_recording import judge_gains, recorded_ages
 from hilrig_study.study_config import AxisConfig, ControllerConfig, StudyConfig
+from support import recordings
 
 
 def recorded(folder: Path, **script: object) -> Path:

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from hilrig_cli.main import app
 from hilrig_runtime.errors import InputError
-from hilrig_study.pictures import Dot, plane_figure, traces
+from hilrig_study.plots import Dot, plane_figure, traces
 from hilrig_study.study_config import StudyConfig, load_study
 from hilrig_study.sweep import cell_at, cells_of, run_cells, sweep
-from rrd_files import RrdFile
+from support.rrd_files import RrdFile
 
 ROOT = Path(__file__).parents[2]
 SMALL = """

@@ -7,13 +7,21 @@ import pytest
 from scipy.linalg import expm
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim.model import ArmParameters, RigParameters, StepParameters
-from hilrig_sim.plant import Plant
-from hilrig_study.controllers import ComputedTorque, LawController, Measured, Pid
-from hilrig_study.linear import LinearPlant, linearise
-from hilrig_study.lqr import PredictiveLqr
-from hilrig_study.margins import LinearLaw, is_stable, linearise_law, loop_matrix, loop_of, margins, spectral_radius
-from hilrig_study.timing import LoopTiming
+from hilrig_sim.arm.model import ArmParameters, RigParameters, StepParameters
+from hilrig_sim.plant.plant import Plant
+from hilrig_study.controllers.controllers import ComputedTorque, LawController, Measured, Pid
+from hilrig_study.controllers.lqr import PredictiveLqr
+from hilrig_study.simulation.timing import LoopTiming
+from hilrig_study.theory.linear import LinearPlant, linearise
+from hilrig_study.theory.margins import (
+    LinearLaw,
+    is_stable,
+    linearise_law,
+    loop_matrix,
+    loop_of,
+    margins,
+    spectral_radius,
+)
 
 ARM = ArmParameters()
 POSES = ((0.3, 0.8, 0.08, 0.2), (-0.6, 1.6, 0.05, -0.4), (0.9, -0.4, 0.12, 1.0))

@@ -6,9 +6,9 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.traffic import TrafficRecord
-from hilrig_replay.columns import TRAFFIC, Names, Rows, Table
-from hilrig_replay.traffic import traffic_decoder
+from hilrig_modbus_edge.request_log import TrafficRecord
+from hilrig_replay.io.columns import TRAFFIC, Names, Rows, Table
+from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
 READ, WRITE = bytes.fromhex("03 0004 0004"), bytes.fromhex("10 0000 0004 08 0001 0002 0003 0004")

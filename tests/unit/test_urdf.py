@@ -5,9 +5,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hilrig_sim.model import ArmParameters, RigParameters, SceneParameters
-from hilrig_sim.urdf import JOINTS, LINKS, urdf
-from recordings import PARAMETERS
+from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters
+from hilrig_sim.arm.urdf import JOINTS, LINKS, urdf
+from support.recordings import PARAMETERS
 
 ROBOT = ElementTree.fromstring(urdf(PARAMETERS, "rig1"))
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.verify import OTHER_MACHINE_TOLERANCE, verify
+from hilrig_replay.analysis.verify import OTHER_MACHINE_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState
-from hilrig_sim.machine import machine_name
-from recordings import Made, record, write
-from virtual_rig import VirtualRig, work
+from hilrig_sim.platform_fingerprint import machine_name
+from support.recordings import Made, record, write
+from support.virtual_rig import VirtualRig, work
 
 
 @pytest.fixture(scope="module")

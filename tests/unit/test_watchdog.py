@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.watchdog import Watchdog, WatchdogState
+from hilrig_modbus_edge.device.watchdog import Watchdog, WatchdogState
 
 
 def test_it_waits_for_the_first_write() -> None:

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilrig_sim import kinematics
-from hilrig_sim.limits import TOOL_CONTACT_FLAG, Happening, PlantEvent
-from hilrig_sim.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.surfaces import GROUND_BELOW_TABLE
-from hilrig_sim.world import NONE
+from hilrig_sim.arm import kinematics
+from hilrig_sim.arm.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
+from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG, Happening, PlantEvent
+from hilrig_sim.plant.plant import Plant
+from hilrig_sim.plant.static_geometry import GROUND_BELOW_TABLE
+from hilrig_sim.plant.world import NONE
 
 ARM = ArmParameters()
 TABLE = -0.06

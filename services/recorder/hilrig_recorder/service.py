@@ -13,20 +13,20 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.by_hand import HandSessions
-from hilrig_recorder.disk import Disk
-from hilrig_recorder.files import Files
-from hilrig_recorder.guard import FolderLock
-from hilrig_recorder.housekeeping import Housekeeping, unfinished
-from hilrig_recorder.intake import Intake
-from hilrig_recorder.recording import SECOND_NS, Recording
-from hilrig_recorder.recover import session_of
-from hilrig_recorder.sessions import SessionBook
-from hilrig_recorder.share import Share
-from hilrig_recorder.writer import RunWriter
+from hilrig_recorder.ingest.manual_sessions import HandSessions
+from hilrig_recorder.ingest.queue import Intake
+from hilrig_recorder.ingest.recording import SECOND_NS, Recording
+from hilrig_recorder.ingest.rig_partition import Share
+from hilrig_recorder.ingest.sessions import SessionBook
+from hilrig_recorder.mcap_format.recover import session_of
+from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.storage.folder_lock import FolderLock
+from hilrig_recorder.storage.maintenance import Housekeeping, unfinished
+from hilrig_recorder.storage.store import Files
+from hilrig_recorder.storage.sync_worker import Disk
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.logstream import FLUSH_PERIOD_NS
-from hilrig_runtime.service import Service
+from hilrig_runtime.messaging.recording_stream import FLUSH_PERIOD_NS
+from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Protocol
 from google.protobuf.message import DecodeError
 
 from hilrig_schemas import TorqueCommand
-from hilrig_sim.model import LARGEST_EFFORT
+from hilrig_sim.arm.model import LARGEST_EFFORT
 
 ZERO_EFFORT: Final = (0.0, 0.0, 0.0, 0.0)
 Effort = tuple[float, float, float, float]

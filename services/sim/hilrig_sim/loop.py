@@ -11,14 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.rate import Tick
-from hilrig_runtime.service import Service
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import JointState, RigReport, topics
+from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import StepTimes
-from hilrig_sim.model import RigParameters
-from hilrig_sim.plant import Plant
-from hilrig_sim.reports import Reporter
-from hilrig_sim.rig_state import RigState, loop_bytes, motion_bytes
+from hilrig_sim.events import Reporter
+from hilrig_sim.plant.plant import Plant
+from hilrig_sim.state_encoder import RigState, loop_bytes, motion_bytes
 
 MANY: Final = 16
 """Rigs from which on it pays to wake up before the tick."""

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from hilrig_runtime.rate import Rate
-from hilrig_runtime.realtime import freeze_garbage
-from hilrig_runtime.service import Service
-from hilrig_runtime.turns import Turns
-from hilrig_sim.configured import rig_parameters
+from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.rate import Rate
+from hilrig_runtime.timing.realtime import freeze_garbage
 from hilrig_sim.loop import Simulation
-from hilrig_sim.membership import Membership
+from hilrig_sim.parameters import rig_parameters
+from hilrig_sim.rig_registry import Membership
 
 
 def run(service: Service) -> None:

@@ -3,8 +3,8 @@
 import sys
 from typing import Final
 
-from hilrig_runtime.ending import run_main
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.process.shutdown import run_main
 
 _OUR_OWN: Final = "hilrig"
 """What begins so is in every installation."""

@@ -10,17 +10,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from hilrig_cli.demo import free_ports
-from hilrig_cli.lab import POLL_S, running_lab
-from hilrig_cli.supervisor import Supervisor
-from hilrig_replay.run import Run, open_run
-from hilrig_runtime.config import LabConfig, load_lab
+from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import POLL_S, running_lab
+from hilrig_cli.local.supervisor import Supervisor
+from hilrig_replay.io.run import Run, open_run
+from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment, Ways
+from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment, Ways
-from hilrig_study.live_loop import RigClient, drive, listen_for_ticks
+from hilrig_study.live.live_loop import RigClient, drive, listen_for_ticks
+from hilrig_study.live.twin import compare_with_twins
 from hilrig_study.study_config import PointConfig, StudyConfig
 from hilrig_study.sweep import cell_at
-from hilrig_study.twin import compare_with_twins
 
 CLOCK: Final = "clock"
 """The rig that nothing is injected into."""

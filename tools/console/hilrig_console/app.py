@@ -19,10 +19,10 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from hilrig_console.feed import Feed
-from hilrig_console.guard import HEALTH_PATH, REPORT_POLICY, Guard, Guarded
-from hilrig_console.page import Frame, Seen
-from hilrig_console.shelf import Shelf
+from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, Guard, Guarded
+from hilrig_console.catalog import Shelf
+from hilrig_console.subscriber import Feed
+from hilrig_console.view_model import Frame, Seen
 from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 0.2

@@ -6,9 +6,9 @@ World frame as everywhere, x forwards, y to the left; here in whole millimetres,
 import math
 from typing import Any, Final
 
-from hilrig_replay.scene import Floats, reach_outline
+from hilrig_replay.rerun_view.scene import Floats, reach_outline
 from hilrig_schemas import JointState
-from hilrig_sim.model import ArmParameters, RigParameters
+from hilrig_sim.arm.model import ArmParameters, RigParameters
 
 MAGNET: Final = 1
 """Bits of a pose's flags: the magnet is on."""

@@ -10,10 +10,10 @@ from typing import Any, Final
 from google.protobuf.message import DecodeError
 
 from hilrig_console.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
-from hilrig_console.lab_view import SILENT_S
+from hilrig_monitoring.lab_view import SILENT_S
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, RigBatch, RigConfig
-from hilrig_sim.model import ArmParameters, RigParameters
+from hilrig_sim.arm.model import ArmParameters, RigParameters
 
 _STATE: Final = JointState.FromString
 _VARIES: Final = 32

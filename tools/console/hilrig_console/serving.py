@@ -12,10 +12,10 @@ from typing import Final
 import uvicorn
 
 from hilrig_console.app import Console
-from hilrig_console.feed import Feed
-from hilrig_console.guard import HEALTH_PATH, Guard, is_loopback
-from hilrig_console.shelf import Shelf
-from hilrig_runtime.config import LabConfig
+from hilrig_console.auth import HEALTH_PATH, Guard, is_loopback
+from hilrig_console.catalog import Shelf
+from hilrig_console.subscriber import Feed
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
 
 CLOSE_S: Final = 1

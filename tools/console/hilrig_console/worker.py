@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.realtime import yield_to_others
+from hilrig_runtime.timing.realtime import yield_to_others
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
 

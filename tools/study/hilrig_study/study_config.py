@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from hilrig_runtime.config import ArmConfig, LabConfig, RigSettings, SimConfig
+from hilrig_runtime.config.impairment import ImpairmentSetting, Ways
+from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
+from hilrig_runtime.config.scene import SceneConfig
+from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
+from hilrig_runtime.config.validation import mistakes_in
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.impairment_config import ImpairmentSetting, Ways
-from hilrig_runtime.mistakes import mistakes_in
-from hilrig_runtime.scene_config import SceneConfig
-from hilrig_runtime.sections import NotNegative, Number, Positive, Section, Vector4
-from hilrig_sim.configured import rig_parameters
-from hilrig_sim.model import JOINT_NAMES, RigParameters
-from hilrig_study.controllers import ComputedTorque, Controller, Pid
-from hilrig_study.linear import LinearPlant, linearise
-from hilrig_study.lqr import PredictiveLqr
-from hilrig_study.student import StudentController
-from hilrig_study.timing import LoopTiming
-from hilrig_study.virtual_loop import Scenario
+from hilrig_sim.arm.model import JOINT_NAMES, RigParameters
+from hilrig_sim.parameters import rig_parameters
+from hilrig_study.controllers.controllers import ComputedTorque, Controller, Pid
+from hilrig_study.controllers.lqr import PredictiveLqr
+from hilrig_study.controllers.user_controller import StudentController
+from hilrig_study.simulation.simulated_loop import Scenario
+from hilrig_study.simulation.timing import LoopTiming
+from hilrig_study.theory.linear import LinearPlant, linearise
 
 Floats = NDArray[np.float64]
 

@@ -16,15 +16,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_modbus_edge.impairment import Impairment
-from hilrig_replay.all_cores import all_cores
-from hilrig_runtime.impairment_config import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
-from hilrig_study.gain_theory import GainTheory, gain_theory
-from hilrig_study.mean_square import TICKS, stable_until
-from hilrig_study.plants import ArmPlant, LinearArms, StudyPlant
+from hilrig_modbus_edge.impairment.model import Impairment
+from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
+from hilrig_runtime.process.process_pool import all_cores
+from hilrig_study.simulation.plants import ArmPlant, LinearArms, StudyPlant
+from hilrig_study.simulation.simulated_loop import Outcome, simulate
+from hilrig_study.simulation.timing import LoopTiming, Timeline, poll_count, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
-from hilrig_study.timing import LoopTiming, Timeline, poll_count, timeline
-from hilrig_study.virtual_loop import Outcome, simulate
+from hilrig_study.theory.gain_theory import GainTheory, gain_theory
+from hilrig_study.theory.mean_square import TICKS, stable_until
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from hilrig_runtime.config import LabConfig
+    from hilrig_runtime.config.lab import LabConfig
 
 
 def certs(
@@ -41,11 +41,11 @@ def certs(
     """
     from datetime import UTC, datetime
 
-    from hilrig_cli.certificate_folder import CertificateFolder
-    from hilrig_modbus_edge.certificates import issue_client, issue_peer, issue_server
-    from hilrig_runtime.access import identities
-    from hilrig_runtime.bus_config import BusTlsConfig
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.cert_store import CertificateFolder
+    from hilrig_runtime.bus.acl import identities
+    from hilrig_runtime.config.bus import BusTlsConfig
+    from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.security.x509 import issue_client, issue_peer, issue_server
 
     lab = load_lab(config)
     now = datetime.now(UTC)

@@ -22,11 +22,11 @@ def check(
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_replay.assignment import check_task
-    from hilrig_runtime.config import load_lab
+    from hilrig_replay.grading.task_loading import check_task
+    from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.config.template import lab_template
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.template import lab_template
-    from hilrig_sim.configured import rig_parameters
+    from hilrig_sim.parameters import rig_parameters
 
     if template:
         print(lab_template(), end="")

@@ -11,7 +11,7 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
-    from hilrig_replay.compare import Comparison
+    from hilrig_replay.analysis.compare import Comparison
 
 
 OTHERWISE = {
@@ -38,10 +38,10 @@ def compare(
 
     Exit code 1: one of several could not be compared; it is said which, and why.
     """
-    from hilrig_replay.compare import compare as compare_runs
-    from hilrig_replay.compare import save_comparison_plot
-    from hilrig_replay.rerun_view import save_rrd
-    from hilrig_replay.run import open_run
+    from hilrig_replay.analysis.compare import compare as compare_runs
+    from hilrig_replay.analysis.compare import save_comparison_plot
+    from hilrig_replay.io.run import open_run
+    from hilrig_replay.rerun_view.view import save_rrd
     from hilrig_runtime.errors import InputError
 
     opened, unreadable = [], []

@@ -42,12 +42,12 @@ def console(
     import secrets
     import threading
 
-    from hilrig_console.guard import Guard, own_names
+    from hilrig_console.auth import Guard, own_names
     from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import end_when_closing_hangs, stop_on_signals, wait_for
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.realtime import yield_to_others
+    from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
+    from hilrig_runtime.timing.realtime import yield_to_others
 
     if (certificate is None) != (key is None):
         raise InputError("--certificate and --key belong together: give both")
@@ -77,7 +77,7 @@ def console(
 
 
 def _password(file: Path) -> str:
-    from hilrig_console.guard import SHORTEST_PASSWORD
+    from hilrig_console.auth import SHORTEST_PASSWORD
     from hilrig_runtime.errors import InputError
 
     try:

@@ -29,7 +29,7 @@ def demo(
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_cli.commands.latency import print_report
-    from hilrig_cli.demo import review, run_demo
+    from hilrig_cli.local.demo import review, run_demo
 
     console = Console(stderr=True, quiet=as_json)
 

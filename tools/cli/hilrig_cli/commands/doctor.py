@@ -10,8 +10,8 @@ from hilrig_cli.options import AsJson, Config
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from hilrig_cli.checkup import Finding
-    from hilrig_runtime.config import LabConfig
+    from hilrig_cli.doctor import Finding
+    from hilrig_runtime.config.lab import LabConfig
 
 
 def doctor(
@@ -34,7 +34,7 @@ def doctor(
 
     Run it on each host, before or while the lab runs. Exit code 1 if something is wrong.
     """
-    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
     findings = _one_service(lab, service, instance) if service else _everything(lab)
@@ -55,8 +55,8 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
     from datetime import UTC, datetime
     from importlib.metadata import version
 
-    from hilrig_cli.checkup import good, host
-    from hilrig_cli.checkup import services as on_bus
+    from hilrig_cli.doctor import good, host
+    from hilrig_cli.doctor import services as on_bus
 
     findings = [
         good("lab", f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms")
@@ -81,11 +81,11 @@ def _everything(lab: "LabConfig") -> "list[Finding]":
 
 
 def _certificates(lab: "LabConfig", now: "datetime") -> "list[Finding]":
-    from hilrig_cli.checkup import notice
+    from hilrig_cli.doctor import notice
 
     try:
         # Only the edge needs what reads certificates; zenoh reads its own.
-        from hilrig_cli.checkup.certificates import check_certificates
+        from hilrig_cli.doctor.certificates import check_certificates
     except ModuleNotFoundError as error:
         text = f"can't be looked at: {error.name!r} is not installed on this host"
         return [notice("certificates", text, "pip install 'hilrig[edge]', or look at copies of them elsewhere")]
@@ -93,8 +93,8 @@ def _certificates(lab: "LabConfig", now: "datetime") -> "list[Finding]":
 
 
 def _one_service(lab: "LabConfig", service: str, instance: str) -> "list[Finding]":
-    from hilrig_cli.checkup import good, wrong
-    from hilrig_cli.checkup.services import SERVICES, is_one, listen
+    from hilrig_cli.doctor import good, wrong
+    from hilrig_cli.doctor.services import SERVICES, is_one, listen
     from hilrig_runtime.errors import HilrigError, InputError
 
     if service not in (*SERVICES, "router"):

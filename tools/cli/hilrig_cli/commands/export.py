@@ -21,8 +21,8 @@ def export(
     ] = None,
 ) -> None:
     """Write a recording for other tools; what was written is printed, a line a file."""
-    from hilrig_replay.export import export_foxglove, export_tables
-    from hilrig_replay.run import open_run
+    from hilrig_replay.export.export import export_foxglove, export_tables
+    from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
     if foxglove is None and csv is None and parquet is None:

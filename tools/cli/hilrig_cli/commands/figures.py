@@ -21,7 +21,7 @@ def figures(
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_replay.figures import compute, draw
+    from hilrig_sim.validation.paper_figures import compute, draw
 
     found = compute(step_ms)
     files = draw(found, out)

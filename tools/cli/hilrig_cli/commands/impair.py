@@ -9,7 +9,7 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from hilrig_runtime.impairment_config import ImpairmentConfig
+    from hilrig_runtime.config.impairment import ImpairmentConfig
     from hilrig_schemas import ImpairmentStatus
 
 DELAYS = (
@@ -50,8 +50,8 @@ def impair(
     What is set holds until it is set otherwise or the edge is started anew. The watchdog's zero torque is never delayed
     or lost. Every change is an event of the recording, and every delay stands with its command.
     """
-    from hilrig_cli.asking import ask_edges
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.client import ask_edges
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_schemas import ImpairmentRequest, topics
 
@@ -81,9 +81,9 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     """
     from pydantic import ValidationError
 
+    from hilrig_runtime.config.impairment import ImpairmentConfig
+    from hilrig_runtime.config.validation import mistakes_in
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.impairment_config import ImpairmentConfig
-    from hilrig_runtime.mistakes import mistakes_in
 
     try:
         ways = ImpairmentConfig(preset=preset or "none").ways
@@ -92,8 +92,8 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
             "command": command or ways.command.delay,
         }
         if trace is not None:
-            from hilrig_replay.delay_trace import delay_trace
-            from hilrig_replay.run import open_run
+            from hilrig_replay.export.delay_trace import delay_trace
+            from hilrig_replay.io.run import open_run
 
             delays["command"] = delay_trace(open_run(trace))
         losses = {"state": loss or ways.state.loss, "command": loss or ways.command.loss}
@@ -120,7 +120,7 @@ def _print_table(statuses: "list[ImpairmentStatus]") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_runtime.impairment_config import Ways
+    from hilrig_runtime.config.impairment import Ways
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("rig", "way", "impairment", "messages", "lost", "overtaken"):

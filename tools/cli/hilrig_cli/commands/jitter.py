@@ -11,7 +11,7 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
-    from hilrig_cli.timekeeping import Timekeeping
+    from hilrig_cli.bench.timing_benchmark import Timekeeping
 
 COLUMNS = ("p50", "p95", "p99", "p999", "max")
 
@@ -29,8 +29,8 @@ def jitter(
     A lab of its own runs on free ports with a quick controller: ticks, bus, Modbus and loop are those of the rig.
     Exit code 1: it is not fit; the reasons are printed.
     """
-    from hilrig_cli.jitter import measure_timekeeping
-    from hilrig_sim.machine import machine_name
+    from hilrig_cli.bench.jitter import measure_timekeeping
+    from hilrig_sim.platform_fingerprint import machine_name
 
     measured = []
     for loaded in (False, True) if load else (False,):

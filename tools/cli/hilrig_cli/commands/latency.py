@@ -12,8 +12,8 @@ from hilrig_cli.options import AsJson
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hilrig_replay.distribution import Statistics
-    from hilrig_replay.latency import LatencyReport
+    from hilrig_replay.analysis.distribution import Statistics
+    from hilrig_replay.analysis.latency import LatencyReport
 
 
 def latency(
@@ -31,14 +31,14 @@ def latency(
 
     Exit code 1: the recording (or one of them) is not fit for latency claims; the reasons are printed.
     """
-    from hilrig_replay.latency import measure
-    from hilrig_replay.run import open_run
-    from hilrig_replay.selection import names_of, recordings
+    from hilrig_replay.analysis.latency import measure
+    from hilrig_replay.io.paths import names_of, recordings
+    from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
     paths = recordings(runs)
     if plot is not None:
-        from hilrig_replay.latency_plot import check_plot_path, save_plot
+        from hilrig_replay.plots.latency_plot import check_plot_path, save_plot
 
         if len(paths) > 1:
             raise InputError(f"--plot draws one run, and {len(paths)} were given")
@@ -82,7 +82,7 @@ def print_report(report: "LatencyReport") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_replay.palette import STAGE_NAMES
+    from hilrig_replay.plots.palette import STAGE_NAMES
 
     console = Console()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"

@@ -21,8 +21,8 @@ def lease(
 
     Exit code 1 with --release when nobody held it.
     """
-    from hilrig_cli.asking import ask_edges
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.client import ask_edges
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_schemas import LeaseRequest, topics
 

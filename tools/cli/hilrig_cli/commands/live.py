@@ -22,16 +22,16 @@ def live(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
 ) -> None:
     """Follow a running rig: the same view as of a recording, as it happens; until it is closed, or Ctrl-C."""
-    from hilrig_cli.asking import check_rig
-    from hilrig_replay.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
-    from hilrig_replay.rerun_layout import layout
-    from hilrig_replay.streams import to_file, to_viewer
-    from hilrig_replay.viewer import browser_address, free_port, running_viewer
-    from hilrig_runtime.clock import SYSTEM_CLOCK
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import stop_on_signals
+    from hilrig_cli.client import check_rig
+    from hilrig_replay.rerun_view.layout import layout
+    from hilrig_replay.rerun_view.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
+    from hilrig_replay.rerun_view.sinks import to_file, to_viewer
+    from hilrig_replay.rerun_view.viewer import browser_address, free_port, running_viewer
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
     if save is not None and web:
         raise InputError("--save writes a file and --web serves a browser: choose one")

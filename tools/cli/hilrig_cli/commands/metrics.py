@@ -18,11 +18,11 @@ def metrics(
 
     One process for the whole lab; the services only send the reports that they send anyway.
     """
-    from hilrig_cli.prometheus import metrics_server, text_of
-    from hilrig_console.lab_watch import LabWatch
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import stop_on_signals, wait_for
+    from hilrig_monitoring.lab_watch import LabWatch
+    from hilrig_monitoring.prometheus import metrics_server, text_of
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_runtime.process.shutdown import stop_on_signals, wait_for
 
     lab = load_lab(config)
     host, colon, port = listen.rpartition(":")

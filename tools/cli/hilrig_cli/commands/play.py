@@ -9,8 +9,8 @@ import typer
 from hilrig_cli.options import Config
 
 if TYPE_CHECKING:
-    from hilrig_runtime.bus import Bus
-    from hilrig_runtime.config import LabConfig
+    from hilrig_runtime.bus.api import Bus
+    from hilrig_runtime.config.lab import LabConfig
 
 
 def play(
@@ -24,12 +24,12 @@ def play(
     """Put a recording back on the bus with its own timing, so that whatever follows a running rig follows it."""
     import threading
 
-    from hilrig_replay.player import Player, play_on, rig_config
-    from hilrig_replay.run import open_run
-    from hilrig_runtime.clock import SYSTEM_CLOCK
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import stop_on_signals
+    from hilrig_replay.export.player import Player, play_on, rig_config
+    from hilrig_replay.io.run import open_run
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_runtime.timing.clock import SYSTEM_CLOCK
     from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
 
     lab = load_lab(config)
@@ -48,8 +48,8 @@ def play(
 
 def _bus(lab: "LabConfig", rig: str) -> "Bus":
     """The bus, in the simulation's place: where none runs, that is who tools on this host look for."""
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas.topics import CONFIG
 
     if lab.bus.topology == "mesh":

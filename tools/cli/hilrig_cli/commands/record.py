@@ -42,10 +42,10 @@ def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
 
 
 def _ask(config: "Path | None", request: "Event") -> "Event":
-    from hilrig_cli.asking import all_rosters, check_rig
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.client import all_rosters, check_rig
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas.topics import CONTROL
 
     lab = load_lab(config)

@@ -14,7 +14,7 @@ def registers(
     as_json: AsJson = False,
 ) -> None:
     """Print what each register and coil of a rig holds."""
-    from hilrig_modbus_edge import register_tables
+    from hilrig_modbus_edge.registers import export as register_tables
 
     if as_csv:
         print(register_tables.as_csv(), end="")

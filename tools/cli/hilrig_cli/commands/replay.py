@@ -19,11 +19,11 @@ def replay(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
 ) -> None:
     """Show what happened: the arm in 3D, its curves, the loop latency and its stages, events; until it is closed."""
-    from hilrig_replay.rerun_view import save_rrd, send_runs
-    from hilrig_replay.run import open_run
-    from hilrig_replay.viewer import browser_address, free_port, running_viewer, wait_for_end
-    from hilrig_runtime.ending import stop_on_signals
+    from hilrig_replay.io.run import open_run
+    from hilrig_replay.rerun_view.view import save_rrd, send_runs
+    from hilrig_replay.rerun_view.viewer import browser_address, free_port, running_viewer, wait_for_end
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.process.shutdown import stop_on_signals
 
     if save is not None and web:
         raise InputError("--save writes a file and --web serves a browser: choose one")

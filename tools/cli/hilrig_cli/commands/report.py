@@ -37,10 +37,10 @@ def report(
     from rich.console import Console
     from rich.progress import Progress
 
-    from hilrig_replay.assignment import read_task
-    from hilrig_replay.recording_file import refuse_recording
-    from hilrig_replay.report import report as make_report
-    from hilrig_replay.selection import recordings
+    from hilrig_replay.grading.task_loading import read_task
+    from hilrig_replay.io.paths import recordings
+    from hilrig_replay.io.recording_file import refuse_recording
+    from hilrig_replay.report.report import report as make_report
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():

@@ -9,8 +9,8 @@ import typer
 from hilrig_cli.options import AsJson, Config, config_for_commands
 
 if TYPE_CHECKING:
-    from hilrig_runtime.bus import Bus
-    from hilrig_runtime.config import LabConfig, RigSettings
+    from hilrig_runtime.bus.api import Bus
+    from hilrig_runtime.config.lab import LabConfig, RigSettings
     from hilrig_schemas import Event, Roster
 
 app = typer.Typer(
@@ -28,8 +28,8 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.zenoh_bus import ZenohBus
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
@@ -63,9 +63,9 @@ def add(
 
     It is there until the lab ends, or its simulation or edge is started anew: to keep it, write it into lab.toml too.
     """
-    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import HilrigError, OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas import Event
 
     lab = load_lab(config)
@@ -89,10 +89,10 @@ def add(
 @app.command()
 def remove(rig: Name, config: Config = None) -> None:
     """Take a rig away from a running lab: no torque, its session ends, its port closes; the others do not feel it."""
-    from hilrig_cli.asking import SERVING, check_rig
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.client import SERVING, check_rig
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas import Event
 
     lab = load_lab(config)
@@ -109,10 +109,10 @@ def remove(rig: Name, config: Config = None) -> None:
 @app.command()
 def reset(rig: Name, config: Config = None) -> None:
     """Put a rig's arm and parts back to the start; a controller that holds it goes on from there."""
-    from hilrig_cli.asking import check_rig
-    from hilrig_runtime.config import load_lab
+    from hilrig_cli.client import check_rig
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_runtime.zenoh_bus import ZenohBus
     from hilrig_schemas import Event
 
     lab = load_lab(config)
@@ -126,7 +126,7 @@ def reset(rig: Name, config: Config = None) -> None:
 
 
 def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
-    from hilrig_cli.asking import all_rosters
+    from hilrig_cli.client import all_rosters
     from hilrig_runtime.errors import OperationError
 
     found = all_rosters(bus, lab, {"sim", "edge"})
@@ -152,7 +152,7 @@ def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
 def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
     import tomllib
 
-    from hilrig_runtime.config import read_lab_text, read_rig
+    from hilrig_runtime.config.lab import read_lab_text, read_rig
     from hilrig_runtime.errors import InputError
 
     if any(rig in roster.rigs for roster in rosters if roster.service in ("sim", "edge")):
@@ -176,7 +176,7 @@ def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "R
 
 
 def _ask(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
-    from hilrig_cli.asking import ANSWER_WITHIN_S
+    from hilrig_cli.client import ANSWER_WITHIN_S
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import Event, topics
 

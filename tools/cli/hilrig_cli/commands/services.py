@@ -9,7 +9,7 @@ import typer
 from hilrig_cli.options import Config
 
 if TYPE_CHECKING:
-    from hilrig_runtime.service import Service
+    from hilrig_runtime.process.service import Service
 
 StopWithParent = Annotated[
     bool, typer.Option("--stop-with-parent", help="End when standard input ends: whoever started this is gone.")
@@ -53,7 +53,7 @@ def edge(
     stop_with_parent: StopWithParent = False,
 ) -> None:
     """Run the Modbus edge: one TCP port a rig, torques in, positions out."""
-    from hilrig_modbus_edge.bridge import run
+    from hilrig_modbus_edge.service import run
 
     _run("edge", run, config, rigs, instance, log_format, stop_with_parent)
 
@@ -80,10 +80,10 @@ def _run(
     log_format: str,
     stop_with_parent: bool,
 ) -> None:
-    from hilrig_runtime.config import load_lab
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.lifecycle import run_service
-    from hilrig_runtime.logs import start_logging
+    from hilrig_runtime.process.lifecycle import run_service
+    from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_schemas.topics import is_name
 
     if not is_name(instance):

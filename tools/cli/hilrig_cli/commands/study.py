@@ -73,8 +73,8 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     if live and not chosen.live:
         raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
     # Before these, which take a moment: what is wrong with a study is said at once.
-    from hilrig_study.pictures import Dot, plane_figure, save_pictures, traces
-    from hilrig_study.rerun_pictures import save_study_rrd
+    from hilrig_study.plots import Dot, plane_figure, save_pictures, traces
+    from hilrig_study.rerun_plots import save_study_rrd
     from hilrig_study.results import save_results
     from hilrig_study.sweep import sweep
 
@@ -150,8 +150,8 @@ def _ms(seconds: float | None) -> str:
 
 
 def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Console") -> None:
-    from hilrig_replay.run import open_run
-    from hilrig_study.from_recording import judge_gains
+    from hilrig_replay.io.run import open_run
+    from hilrig_study.live.from_recording import judge_gains
     from hilrig_study.study_config import load_study
 
     study = None if file is None else load_study(file)

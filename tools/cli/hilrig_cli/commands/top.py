@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-    from hilrig_console.lab_view import LabView
+    from hilrig_monitoring.lab_view import LabView
 
 REFRESH_S: Final = 0.5
 SERVICE_COLUMNS: Final = {
@@ -57,8 +57,8 @@ def top(
     from rich.console import Console
     from rich.live import Live
 
-    from hilrig_console.lab_watch import LabWatch
-    from hilrig_runtime.config import load_lab
+    from hilrig_monitoring.lab_watch import LabWatch
+    from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
     console = Console()

@@ -23,10 +23,10 @@ def up(
 
     A service that dies is restarted. Ctrl-C or SIGTERM ends everything in order: torques to zero, recordings finished.
     """
-    from hilrig_cli.lab import POLL_S, running_lab
-    from hilrig_cli.supervisor import own_process_group, shared
-    from hilrig_runtime.config import load_lab
-    from hilrig_runtime.ending import stop_on_signals, stop_with_stdin
+    from hilrig_cli.local.local_lab import POLL_S, running_lab
+    from hilrig_cli.local.supervisor import own_process_group, shared
+    from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.process.shutdown import stop_on_signals, stop_with_stdin
 
     lab = load_lab(config)
     stopping = threading.Event()

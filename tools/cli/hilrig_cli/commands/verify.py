@@ -33,9 +33,9 @@ def verify(
     from rich.console import Console
     from rich.text import Text
 
-    from hilrig_replay.index import write_verdict
-    from hilrig_replay.selection import recordings
-    from hilrig_replay.verify import verify as resimulate
+    from hilrig_replay.analysis.verify import verify as resimulate
+    from hilrig_replay.io.index import write_verdict
+    from hilrig_replay.io.paths import recordings
 
     console = Console()
     found = []

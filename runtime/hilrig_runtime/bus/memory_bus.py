@@ -1,0 +1,164 @@
+"""The bus within one process: for tests, and for what runs in virtual time. Delivery is synchronous and complete."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from hilrig_runtime.bus.api import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.errors import HilrigError
+from hilrig_schemas.topics import Traffic
+
+T = TypeVar("T")
+
+
+def matches(key_expr: str, key: str) -> bool:
+    """Whether a key expression covers a key: `*` stands for one part, `**` for any number of parts."""
+
+    def match(pattern: list[str], parts: list[str]) -> bool:
+        if not pattern:
+            return not parts
+        head, rest = pattern[0], pattern[1:]
+        if head == "**":
+            return any(match(rest, parts[skip:]) for skip in range(len(parts) + 1))
+        return bool(parts) and head in ("*", parts[0]) and match(rest, parts[1:])
+
+    return match(key_expr.split("/"), key.split("/"))
+
+
+@dataclass
+class MemoryHub:
+    """What connects the buses of one process; give the same hub to each."""
+
+    subscribers: list[tuple[str, OnMessage]] = field(default_factory=list)
+    servers: list[tuple[str, Callable[[bytes], bytes]]] = field(default_factory=list)
+    tokens: list[str] = field(default_factory=list)
+    watchers: list[tuple[str, OnAlive]] = field(default_factory=list)
+    history: dict[str, list[bytes]] = field(default_factory=dict)
+    lock: threading.RLock = field(default_factory=threading.RLock)
+
+    def deliver(self, key: str, payload: bytes) -> None:
+        """Hand a message to everyone who subscribed to its key."""
+        with self.lock:
+            for key_expr, on_message in list(self.subscribers):
+                if matches(key_expr, key):
+                    on_message(key, payload)
+
+    def tell(self, key: str, alive: bool) -> None:
+        """Tell the watchers of a token that it appeared or went."""
+        for key_expr, on_alive in list(self.watchers):
+            if matches(key_expr, key):
+                on_alive(key, alive)
+
+
+class _Undo(Handle):
+    def __init__(self, undo: Callable[[], None]) -> None:
+        self._undo: Callable[[], None] | None = undo
+
+    def close(self) -> None:
+        undo, self._undo = self._undo, None
+        if undo is not None:
+            undo()
+
+
+class _MemoryPublisher(Publisher):
+    def __init__(self, hub: MemoryHub, key: str, traffic: Traffic) -> None:
+        self._hub = hub
+        self._key = key
+        self._keeps = traffic is Traffic.RECORDING
+
+    def put(self, payload: bytes) -> None:
+        if self._keeps:
+            self._hub.history.setdefault(self._key, []).append(payload)
+        self._hub.deliver(self._key, payload)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class MemoryBus(Bus):
+    """See `hilrig_runtime.bus.api.Bus`."""
+
+    def __init__(self, hub: MemoryHub | None = None) -> None:
+        self.hub = MemoryHub() if hub is None else hub
+        self._handles: list[Handle] = []
+
+    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
+        """See `Bus.publisher`."""
+        return _MemoryPublisher(self.hub, key, traffic)
+
+    def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
+        """See `Bus.subscribe`."""
+        return self._keep(self.hub.subscribers, (key_expr, on_message))
+
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:  # noqa: ARG002
+        """See `Bus.subscribe_newest`; delivery is at once, so nothing ever waits."""
+        return self.subscribe(key_expr, on_message)
+
+    def subscribe_recording(
+        self,
+        key_expr: str,
+        on_message: OnMessage,
+        on_loss: OnLoss,  # noqa: ARG002
+        kept: int = KEPT,  # noqa: ARG002
+    ) -> Handle:
+        """See `Bus.subscribe_recording`; nothing is ever lost here."""
+        with self.hub.lock:
+            for key, payloads in self.hub.history.items():
+                if matches(key_expr, key):
+                    for payload in payloads:
+                        on_message(key, payload)
+            return self._keep(self.hub.subscribers, (key_expr, on_message))
+
+    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+        """See `Bus.serve`."""
+        return self._keep(self.hub.servers, (key, answer))
+
+    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:  # noqa: ARG002
+        """See `Bus.ask`."""
+        answers = []
+        for key, answer in list(self.hub.servers):
+            if matches(key_expr, key):
+                try:
+                    answers.append(Answer(key, answer(payload)))
+                except HilrigError as error:
+                    answers.append(Answer(key, b"", str(error)))
+        return answers
+
+    def announce(self, key: str) -> Handle:
+        """See `Bus.announce`."""
+        self.hub.tokens.append(key)
+        self.hub.tell(key, True)
+
+        def undo() -> None:
+            self.hub.tokens.remove(key)
+            self.hub.tell(key, False)
+
+        return self._hold(_Undo(undo))
+
+    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
+        """See `Bus.watch`."""
+        for key in self.alive(key_expr):
+            on_alive(key, True)
+        return self._keep(self.hub.watchers, (key_expr, on_alive))
+
+    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:  # noqa: ARG002
+        """See `Bus.alive`."""
+        return sorted(key for key in self.hub.tokens if matches(key_expr, key))
+
+    def close(self) -> None:
+        """Take back everything, newest first."""
+        while self._handles:
+            self._handles.pop().close()
+
+    def _keep(self, where: list[T], what: T) -> Handle:
+        where.append(what)
+
+        def undo() -> None:
+            where.remove(what)
+
+        return self._hold(_Undo(undo))
+
+    def _hold(self, handle: Handle) -> Handle:
+        self._handles.append(handle)
+        return handle

@@ -1,0 +1,218 @@
+"""The bus between processes, over zenoh."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from hilrig_runtime.bus.api import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.bus.reliable import CompleteStream, declare_recording_publisher
+from hilrig_runtime.bus.zenoh_config import (
+    FIRST_INSTANCE,
+    MESH_ORDER,
+    finds_others_by_gossip,
+    mesh_endpoint,
+    system_reason,
+    unknown_host,
+    zenoh_config,
+)
+from hilrig_runtime.config.bus import BusConfig
+from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.timing.realtime import one_ahead
+from hilrig_schemas.topics import Traffic
+
+_GOSSIP_S: Final = 1.0
+"""Ample: gossip takes some 50 ms where nothing else runs."""
+_PRIORITIES: Final = {
+    Traffic.CONTROL: zenoh.Priority.REAL_TIME,
+    Traffic.RECORDING: zenoh.Priority.DATA_LOW,
+    Traffic.REPORT: zenoh.Priority.BACKGROUND,
+}
+
+logger = logging.getLogger(__name__)
+
+
+class _Declared(Handle):
+    def __init__(self, item: Any, *more: Any) -> None:
+        self._items = [item, *more]
+
+    def close(self) -> None:
+        while self._items:
+            self._items.pop().undeclare()
+
+
+class _NewestReader(Handle):
+    """Reads a ring of the newest samples on a thread of its own.
+
+    A callback would stand behind a queue of 256 samples: a process that was held up for a moment would then work
+    through what is over, at a step of 1 ms for a quarter of a second.
+    """
+
+    def __init__(self, session: zenoh.Session, key_expr: str, on_message: OnMessage, waiting: int) -> None:
+        self._subscriber: Any = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(waiting))
+        # The thread waits in the ring, not in the subscriber: that could not be undeclared meanwhile.
+        self._ring = self._subscriber.handler
+        self._on_sample = _deliver(on_message)
+        self._closing = False
+        self._thread = threading.Thread(target=self._read, name=f"newest {key_expr}", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with one_ahead():
+            self._read_all()
+
+    def _read_all(self) -> None:
+        recv, on_sample = self._ring.recv, self._on_sample
+        while not self._closing:
+            try:
+                sample = recv()
+            except zenoh.ZError:
+                # Undeclared, or the session is closed.
+                return
+            if not self._closing:
+                on_sample(sample)
+
+    def close(self) -> None:
+        if not self._closing:
+            self._closing = True
+            self._subscriber.undeclare()
+            self._thread.join(timeout=1.0)
+
+
+class _ZenohPublisher(Publisher):
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+        # The instance's put is zenoh's own: no frame of ours on the control path.
+        self.put = publisher.put  # type: ignore[method-assign]
+
+    def put(self, payload: bytes) -> None:
+        """See `Publisher.put`."""
+        self._publisher.put(payload)
+
+    def close(self) -> None:
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            publisher.undeclare()
+
+
+class ZenohBus(Bus):
+    """See `hilrig_runtime.bus.api.Bus`. Raises `OperationError` where the session can't be opened."""
+
+    def __init__(self, bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> None:
+        self._express = bus.express
+        if finds_others_by_gossip(bus, service, instance):
+            self.settling_s = _GOSSIP_S
+        try:
+            with one_ahead():
+                self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
+        except zenoh.ZError as error:
+            raise OperationError(_why_not_open(bus, service, error)) from error
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The zenoh session underneath."""
+        if self._session is None:
+            raise OperationError("the bus is closed")
+        return self._session
+
+    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:
+        """See `Bus.publisher`."""
+        if traffic is Traffic.RECORDING:
+            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic], kept))
+        return _ZenohPublisher(
+            self.session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=_PRIORITIES[traffic],
+                express=self._express and traffic is Traffic.CONTROL,
+            )
+        )
+
+    def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
+        """See `Bus.subscribe`."""
+        return _Declared(self.session.declare_subscriber(key_expr, _deliver(on_message)))
+
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:
+        """See `Bus.subscribe_newest`."""
+        return _NewestReader(self.session, key_expr, on_message, waiting)
+
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int = KEPT) -> Handle:
+        """See `Bus.subscribe_recording`."""
+        return CompleteStream(self.session, key_expr, on_message, on_loss, kept)
+
+    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+        """See `Bus.serve`."""
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                try:
+                    query.reply(key, answer(b"" if query.payload is None else query.payload.to_bytes()))
+                except HilrigError as error:
+                    query.reply_err(str(error).encode())
+                except Exception:
+                    logger.exception("answering a question on %s failed", key)
+                    query.reply_err(b"the service failed to answer; its log says why")
+
+        return _Declared(self.session.declare_queryable(key, reply))
+
+    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        """See `Bus.ask`."""
+        answers = []
+        for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
+            if reply.ok is not None:
+                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                text = reply.err.payload.to_bytes().decode(errors="replace")
+                # zenoh answers a question that nobody answered in time with an error of its own.
+                if text.lower() != "timeout":
+                    answers.append(Answer(key_expr, b"", text))
+        return answers
+
+    def announce(self, key: str) -> Handle:
+        """See `Bus.announce`."""
+        return _Declared(self.session.liveliness().declare_token(key))
+
+    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
+        """See `Bus.watch`."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            on_alive(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return _Declared(self.session.liveliness().declare_subscriber(key_expr, on_sample, history=True))
+
+    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
+        """See `Bus.alive`."""
+        replies = self.session.liveliness().get(key_expr, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def close(self) -> None:
+        """Close the session: a process that ends with one open can hang."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
+    def on_sample(sample: zenoh.Sample) -> None:
+        on_message(str(sample.key_expr), sample.payload.to_bytes())
+
+    return on_sample
+
+
+def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
+    if bus.topology == "router":
+        host = unknown_host(bus.router)
+        if host:
+            return (
+                f"no zenoh router answers at {bus.router} (bus.router in lab.toml): the name {host!r} is not known here"
+            )
+        certificate = "" if bus.tls is None else ", or it and our certificate do not trust each other: hilrig doctor"
+        return f"no zenoh router answers at {bus.router} (bus.router in lab.toml){certificate}"
+    if service not in MESH_ORDER:
+        return f"can't join the bus: {error}"
+    return (
+        f"can't listen on {mesh_endpoint(bus, service)} for the bus ({system_reason(error)}): "
+        "is another hilrig running here? End it, or choose another bus.first_port in lab.toml"
+    )

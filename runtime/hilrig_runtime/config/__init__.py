@@ -1,0 +1,1 @@
+"""The lab's configuration: the models behind `lab.toml`, their validation and the template."""

@@ -1,0 +1,163 @@
+"""The `[scene]` of a lab: the table, the trays and the parts that the magnet picks.
+
+Lengths are millimetres and angles degrees, world frame, seen from above: x forwards, y to the left. Footprints are
+taken as discs (docs/model.md), so that what overlaps here is what carries there.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from hilrig_runtime.config.types import Colour, Flag, Name, Number, Positive, Section, Vector2
+
+
+class TableConfig(Section):
+    """The table that the arm's pedestal and all else stands on."""
+
+    height_mm: Annotated[float, Field(strict=True, lt=0, ge=-1000, allow_inf_nan=False)] = -60.0
+    """World z of its top; negative, for the arm's base plane lies above it."""
+    centre_mm: Vector2 = (0.0, 0.0)
+    """Middle of its top: x, y."""
+    size_mm: tuple[Positive, Positive] = (1300.0, 1300.0)
+    """Its extent along x and y; by default all that the arm can reach is above it."""
+
+
+class MagnetConfig(Section):
+    """What the magnet at the tool's tip can take hold of."""
+
+    reach_mm: Positive = 15.0
+    """Largest sideways distance from the tip to the middle of a part's top."""
+    gap_mm: Positive = 5.0
+    """Largest difference in height between the tip and a part's top."""
+
+
+class PartConfig(Section):
+    """A part that lies in the scene when it starts."""
+
+    name: Name
+    shape: Literal["cylinder", "box"] = "cylinder"
+    size_mm: tuple[Positive, Positive, Positive] = (40.0, 40.0, 30.0)
+    """Length, width, height; a cylinder's length and width are both its diameter."""
+    mass_kg: Positive = 0.2
+    ferromagnetic: Flag = True
+    """Whether the magnet holds it."""
+    colour: Colour = "#c8ccd0"
+    position_mm: Vector2
+    """Where its middle is: x, y. It stands on what is below: a tray or the table."""
+    yaw_deg: Number = 0.0
+
+    @model_validator(mode="after")
+    def _a_cylinder_is_round(self) -> "PartConfig":
+        if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
+            raise ValueError(
+                f"the cylinder {self.name!r} has two diameters, {self.size_mm[0]:g} and {self.size_mm[1]:g}"
+            )
+        return self
+
+    @property
+    def footprint_radius_mm(self) -> float:
+        """Radius of the largest disc inside its footprint, mm."""
+        return min(self.size_mm[0], self.size_mm[1]) / 2
+
+
+class TrayConfig(Section):
+    """A flat tray with places for parts, in rows and columns about its middle."""
+
+    name: Name
+    position_mm: Vector2
+    """Where its middle is: x, y."""
+    yaw_deg: Number = 0.0
+    size_mm: tuple[Positive, Positive, Positive] = (150.0, 150.0, 8.0)
+    """Length, width, height above the table."""
+    rows: Annotated[int, Field(strict=True, ge=1, le=20)] = 2
+    """Places along its length."""
+    columns: Annotated[int, Field(strict=True, ge=1, le=20)] = 2
+    """Places along its width."""
+    pitch_mm: Positive = 70.0
+    """Distance between neighbouring places."""
+    colour: Colour = "#4a5560"
+
+    @model_validator(mode="after")
+    def _places_are_on_it(self) -> "TrayConfig":
+        for count, length, along in ((self.rows, self.size_mm[0], "long"), (self.columns, self.size_mm[1], "wide")):
+            span = (count - 1) * self.pitch_mm
+            if span > length:
+                raise ValueError(f"tray {self.name!r} is {length:g} mm {along}, its places need {span:g} mm")
+        return self
+
+    @property
+    def places_mm(self) -> tuple[tuple[float, float], ...]:
+        """World x, y of each place, row by row, mm."""
+        c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
+        places = []
+        for row in range(self.rows):
+            for column in range(self.columns):
+                u = (row - (self.rows - 1) / 2) * self.pitch_mm
+                v = (column - (self.columns - 1) / 2) * self.pitch_mm
+                places.append((self.position_mm[0] + c * u - s * v, self.position_mm[1] + s * u + c * v))
+        return tuple(places)
+
+
+DEFAULT_PARTS = (
+    PartConfig(name="red", colour="#d6453d", mass_kg=0.20, position_mm=(376.0, 137.0)),
+    PartConfig(
+        name="blue",
+        shape="box",
+        size_mm=(36.0, 36.0, 30.0),
+        colour="#2f6fc4",
+        mass_kg=0.30,
+        position_mm=(328.0, 229.0),
+        yaw_deg=35.0,
+    ),
+    PartConfig(name="green", colour="#3d9a50", mass_kg=0.15, position_mm=(257.0, 306.0)),
+    PartConfig(
+        name="yellow",
+        shape="box",
+        size_mm=(36.0, 36.0, 30.0),
+        colour="#e8b32e",
+        mass_kg=0.25,
+        position_mm=(169.0, 363.0),
+        yaw_deg=65.0,
+    ),
+)
+DEFAULT_TRAYS = (TrayConfig(name="tray", position_mm=(320.0, -220.0), yaw_deg=-35.0),)
+
+
+class SceneConfig(Section):
+    """Everything around the arm; four parts and a tray with four places by default."""
+
+    table: TableConfig = TableConfig()
+    magnet: MagnetConfig = MagnetConfig()
+    trays: tuple[TrayConfig, ...] = DEFAULT_TRAYS
+    parts: Annotated[tuple[PartConfig, ...], Field(max_length=64)] = DEFAULT_PARTS
+
+    @model_validator(mode="after")
+    def _everything_has_its_place(self) -> "SceneConfig":
+        things: tuple[TrayConfig | PartConfig, ...] = (*self.trays, *self.parts)
+        names = [thing.name for thing in things]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two things are called {name!r}: names must be distinct")
+        half = [length / 2 for length in self.table.size_mm]
+        for thing in things:
+            x, y = (at - centre for at, centre in zip(thing.position_mm, self.table.centre_mm, strict=True))
+            if abs(x) > half[0] or abs(y) > half[1]:
+                raise ValueError(
+                    f"{thing.name!r} at {_place(thing.position_mm)} is outside the table, which is "
+                    f"{self.table.size_mm[0]:g} mm by {self.table.size_mm[1]:g} mm about {_place(self.table.centre_mm)}"
+                )
+        for index, one in enumerate(self.parts):
+            for other in self.parts[index + 1 :]:
+                needed = one.footprint_radius_mm + other.footprint_radius_mm
+                distance = math.dist(one.position_mm, other.position_mm)
+                if distance < needed:
+                    raise ValueError(
+                        f"parts {one.name!r} and {other.name!r} overlap: their middles are {distance:.1f} mm apart "
+                        f"and need {needed:.1f} mm"
+                    )
+        return self
+
+
+def _place(position_mm: tuple[float, float]) -> str:
+    return f"({position_mm[0]:g}, {position_mm[1]:g}) mm"

@@ -1,0 +1,126 @@
+"""How a service is: counters that it keeps, and a report of them once a second."""
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Final
+
+from hilrig_runtime.bus.api import Publisher
+from hilrig_runtime.process.discovery import ClockOffset
+from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate import Tick
+from hilrig_runtime.timing.realtime import realtime_priority
+from hilrig_schemas import Health, RigReport
+
+REPORT_PERIOD_NS: Final = 1_000_000_000
+
+
+@dataclass(slots=True)
+class Counters:
+    """What a service counts; whoever knows a figure sets it, the reporter reads. Counts are since the start."""
+
+    rigs: int = 0
+    ticks: int = 0
+    overruns: int = 0
+    missed_steps: int = 0
+    received: int = 0
+    published: int = 0
+    lost_transport: int = 0
+    lost_recorder: int = 0
+    queue_depth: int = 0
+    queue_capacity: int = 0
+    connections: int = 0
+    requests: int = 0
+    malformed: int = 0
+    refused: int = 0
+    recordings: int = 0
+    bytes_written: int = 0
+    trouble: str = ""
+    latenesses_ns: list[int] = field(default_factory=list)
+    """Of the ticks since the last report."""
+
+    def count_tick(self, tick: Tick, period_ns: int) -> None:
+        """Count one tick of the service's loop."""
+        self.ticks += 1
+        self.latenesses_ns.append(tick.lateness_ns)
+        if tick.missed_steps or tick.lateness_ns > period_ns:
+            self.overruns += 1
+            self.missed_steps += tick.missed_steps
+
+
+class HealthReporter:
+    """Sends `Health` from `counters` once a second."""
+
+    def __init__(self, publisher: Publisher, service: str, instance: str, incarnation: int, clock: Clock) -> None:
+        self.counters = Counters()
+        self.rig_reports: Callable[[], Iterable[RigReport]] = tuple
+        """Asked at each report for what the service knows of its rigs."""
+        self.clock_offset: Callable[[], ClockOffset] = ClockOffset
+        self._publisher = publisher
+        self._identity = {
+            "service": service,
+            "instance": instance,
+            "incarnation": incarnation,
+            "host": platform.node(),
+            "software_version": version("hilrig"),
+            "realtime_priority": realtime_priority(),
+        }
+        self._clock = clock
+        self._start_ns = clock.monotonic_ns()
+        self._last_ns = self._start_ns
+        self._last = (0, 0)
+
+    def report_if_due(self, now_ns: int) -> None:
+        """Send a report when the last one is a second old; `now_ns` is of the monotonic clock."""
+        if now_ns - self._last_ns >= REPORT_PERIOD_NS:
+            self.report(now_ns)
+
+    def report(self, now_ns: int) -> None:
+        """Send a report now."""
+        counters = self.counters
+        seconds = max(1, now_ns - self._last_ns) * 1e-9
+        received, published = self._last
+        latenesses, counters.latenesses_ns = sorted(counters.latenesses_ns), []
+        clock = self.clock_offset()
+        health = Health(
+            **self._identity,  # type: ignore[arg-type]
+            wall_ns=self._clock.wall_ns(),
+            uptime_ns=now_ns - self._start_ns,
+            cpu_ns=time.process_time_ns(),
+            resident_bytes=resident_bytes(),
+            received_hz=(counters.received - received) / seconds,
+            published_hz=(counters.published - published) / seconds,
+            lateness_p50_ns=_percentile(latenesses, 0.50),
+            lateness_p99_ns=_percentile(latenesses, 0.99),
+            lateness_max_ns=latenesses[-1] if latenesses else 0,
+            clock_peer=clock.peer,
+            clock_offset_ns=clock.offset_ns,
+            clock_uncertainty_ns=clock.uncertainty_ns,
+            rig_reports=self.rig_reports(),
+        )
+        for name in _COPIED:
+            setattr(health, name, getattr(counters, name))
+        self._last = (counters.received, counters.published)
+        self._last_ns = now_ns
+        self._publisher.put(health.SerializeToString())
+
+
+_COPIED: Final = tuple(name for name in Counters.__slots__ if name in Health.DESCRIPTOR.fields_by_name)
+
+
+def _percentile(ordered: list[int], share: float) -> int:
+    return ordered[round(share * (len(ordered) - 1))] if ordered else 0
+
+
+def resident_bytes() -> int:
+    """Memory of this process that is resident, bytes; 0 where the system does not tell."""
+    if sys.platform == "linux":
+        # A process that may open no more files, for all of them are connections, works on.
+        with suppress(OSError), open("/proc/self/statm", "rb") as statm:  # noqa: PTH123  # once a second on a real-time loop
+            return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0

@@ -1,0 +1,1 @@
+"""Monotonic time: clocks, periodic deadlines and real-time scheduling."""

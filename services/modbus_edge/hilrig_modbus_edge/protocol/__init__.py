@@ -1,0 +1,1 @@
+"""The Modbus TCP protocol: MBAP frames, PDUs and exception codes."""

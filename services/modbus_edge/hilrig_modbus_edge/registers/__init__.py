@@ -1,0 +1,1 @@
+"""The register map: its definition, value encoding, register contents and export."""

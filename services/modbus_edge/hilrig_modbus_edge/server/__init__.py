@@ -1,0 +1,1 @@
+"""The Modbus TCP server: the listening socket, the event loop, TLS and admission of clients."""

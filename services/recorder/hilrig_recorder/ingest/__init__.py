@@ -1,0 +1,1 @@
+"""From recording streams to the messages of a session: queue, sessions and pre-roll."""

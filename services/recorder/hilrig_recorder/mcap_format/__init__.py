@@ -1,0 +1,1 @@
+"""The MCAP file format: writing, scanning and recovering files."""

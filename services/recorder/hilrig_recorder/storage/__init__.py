@@ -1,0 +1,1 @@
+"""Recordings on disk: segment files, synchronization, disk space and retention."""

@@ -1,0 +1,123 @@
+"""One fixed step of an explicit Runge–Kutta method for N rigs, with nothing allocated.
+
+Only the joint velocities and θ2 enter the right-hand side, so the stages are taken for these five quantities, and the
+positions are sums of the stages' velocities: the same method on fewer rows. Each sum over stages is one product and
+one reduction along the first axis, whose order of additions is the same for any number of rigs.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_sim.arm.dynamics import STAGE_ROWS, ReducedDynamics, StageViews, stage_views
+from hilrig_sim.arm.integrators import Tableau
+
+Floats = NDArray[np.float64]
+
+
+FEW_RIGS: Final = 64
+"""Up to so many, weights are stored once a rig: the same products, without the cost of broadcasting."""
+
+
+@cache
+def _packed(tableau: Tableau) -> tuple[Floats, Floats]:
+    """Weights of all sums of a step, one after the other, (terms, 1, 1): what they are, and what a second adds.
+
+    First those of the stages and of the end, each led by the 1 of the state at the step's start; then those of the
+    position's change and of its error.
+    """
+    led = [(1.0, row) for row in (*tableau.a[1:], tableau.b)]
+    bare = [tableau.b, tableau.error_weights]
+    one = [value for lead, row in led for value in (lead, *(0.0 for _ in row))] + [0.0 for row in bare for _ in row]
+    scaled = [value for _, row in led for value in (0.0, *row)] + [value for row in bare for value in row]
+    return np.array(one)[:, np.newaxis, np.newaxis], np.array(scaled)[:, np.newaxis, np.newaxis]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sum:
+    """A weighted sum over stages; `values`, `weights` and `products` are (terms, 5, N), or broadcast to it."""
+
+    values: Floats
+    weights: Floats
+    products: Floats
+    first: Floats
+    second: Floats | None = None
+
+    def into(self, out: Floats, multiply: Any = np.multiply, add: Any = np.add, total: Any = np.add.reduce) -> None:
+        multiply(self.values, self.weights, self.products)
+        if self.second is None:
+            out[:] = self.first
+        elif len(self.products) == 2:
+            add(self.first, self.second, out)
+        else:
+            total(self.products, 0, None, out)
+
+
+class FixedStep:
+    """Steps `dynamics` by `length`: seconds, one number or one for each rig, (N,)."""
+
+    def __init__(self, dynamics: ReducedDynamics, tableau: Tableau, length: float | Floats) -> None:
+        count, stages = dynamics.count, tableau.stages
+        self._dynamics = dynamics
+        lengths = np.asarray(length, dtype=np.float64).reshape(1, -1)
+        # Slot 0 holds the state at the step's start, slot i the rates of stage i.
+        self._slots = np.zeros((1 + stages, STAGE_ROWS, count))
+        self._states = np.zeros((stages, STAGE_ROWS, count))
+        self._products = np.empty((1 + stages, STAGE_ROWS, count))
+        self._drive = np.empty((4, count))
+        self._start = self._slots[0]
+        self._start_velocity, self._start_theta2 = self._start[:4], self._start[4]
+        self._first = self._states[0]
+        self._result = np.empty((STAGE_ROWS, count))
+        self._result4 = self._result[:4]
+
+        one, scaled = _packed(tableau)
+        table = one + scaled * lengths
+        if count <= FEW_RIGS:
+            table = np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy()
+        used = 0
+
+        def terms(number: int, values: Floats) -> _Sum:
+            nonlocal used
+            used += number
+            products = self._products[:number]
+            return _Sum(values[:number], table[used - number : used], products, *products[:2])
+
+        self._stages: list[StageViews] = [stage_views(self._states[i], self._slots[1 + i]) for i in range(stages)]
+        self._following = [(terms(1 + i, self._slots), self._states[i], self._stages[i]) for i in range(1, stages)]
+        self._end = terms(1 + stages, self._slots)
+        self._quadrature = terms(stages, self._states)
+        self._error = terms(stages, self._states) if tableau.embedded else None
+
+    def advance(self, position: Floats, velocity: Floats, effort: Floats, error: Floats | None = None) -> None:
+        """Move `position` and `velocity`, (4, N), on by one step under constant `effort`, (4, N).
+
+        `error`, (4, N), gets the embedded estimate of the position's error; a method without one leaves it.
+        """
+        rates, drive, result, result4 = self._dynamics.rates, self._drive, self._result, self._result4
+        self._dynamics.drive(effort, drive)
+        self._start_velocity[:] = velocity
+        self._start_theta2[:] = position[1]
+        self._first[:] = self._start
+        rates(self._stages[0], drive)
+        for terms, state, stage in self._following:
+            terms.into(state)
+            rates(stage, drive)
+        self._quadrature.into(result)
+        np.add(position, result4, position)
+        if error is not None and self._error is not None:
+            self._error.into(result)
+            error[:] = result4
+        self._end.into(result)
+        velocity[:] = result4
+
+    def accelerations(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
+        """Joint accelerations, (4, N), at a state and under an effort, (4, N) each; valid until the next call."""
+        self._dynamics.drive(effort, self._drive)
+        self._states[0, :4] = velocity
+        self._states[0, 4] = position[1]
+        self._dynamics.rates(self._stages[0], self._drive)
+        return self._slots[1, :4]

@@ -1,0 +1,1 @@
+"""Validation of the simulation against published results."""

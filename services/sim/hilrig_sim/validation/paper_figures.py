@@ -1,0 +1,235 @@
+"""The paper's experiment (44) by its three methods: figures 4, 5 and 6, and the numbers that tell them apart.
+
+Two torque pulses move joints 1 and 2 of an arm at rest. At the paper's step of 20 ms Euler's method is beyond its limit
+of stability and blows up, Runge–Kutta–Fehlberg is within it, and Dormand–Prince with a variable step is the reference.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_runtime.errors import InputError, OperationError
+from hilrig_sim.arm.dynamics import ReducedDynamics, stage_views
+from hilrig_sim.arm.integrators import EULER, RK4, RKF45, Tableau, reference_solution
+from hilrig_sim.arm.model import GRAVITY, ArmParameters
+from hilrig_sim.arm.stability import fastest_mode
+from hilrig_sim.arm.stepping import FixedStep
+
+Floats = NDArray[np.float64]
+
+DURATION_S: Final = 10.0
+PAPER_STEP_MS: Final = 20.0
+# Of m2 and m3 only the sum counts in the plane, and the paper has 1 kg and 0: the quill takes half of it here, for an
+# arm without a quill has no joint 3 to simulate. Its weight is carried, so that it rests.
+ARM: Final = ArmParameters(masses=(1.0, 0.5, 0.5), friction=(2.0, 2.0, 5.0, 0.05))
+BREAKS_S: Final = (2.0, 3.0, 5.0, 6.0)
+EXPECTED_END: Final = (0.05000, 0.19998)
+"""θ(10 s), rad: the friction's b·Δθ is the torque's ∫τ dt, but for what still coasts."""
+EXPECTED_LIMITS_MS: Final = {"euler": 15.4, "rk4": 21.5, "rkf45, order 4": 23.3, "rkf45": 28.4}
+DIVERGED: Final = 1.0
+"""A joint faster than so many rad/s has diverged: it is twenty times what the torques could drive against friction.
+The growth ends there, for sines are bounded: what remains is a violent oscillation at the rate of the steps."""
+
+
+def torque(time_s: float) -> tuple[float, float]:
+    """τ1 = 0.05(u(t−3) − u(t−5)), τ2 = 0.1(u(t−2) − u(t−6)), N·m, (44)."""
+    return (0.05 if 3.0 <= time_s < 5.0 else 0.0), (0.1 if 2.0 <= time_s < 6.0 else 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Experiment (44) by one method."""
+
+    name: str
+    title: str
+    time_s: Floats
+    """(n,)."""
+    position: Floats
+    """θ1, θ2, rad, (2, n)."""
+    velocity: Floats
+    """θ̇1, θ̇2, rad/s, (2, n)."""
+
+    @property
+    def diverged_s(self) -> float | None:
+        """When it left all that the arm can do, s; None: it did not."""
+        beyond = ~(np.abs(self.velocity) < DIVERGED).all(axis=0)
+        return float(self.time_s[np.argmax(beyond)]) if beyond.any() else None
+
+    @property
+    def end(self) -> tuple[float, float] | None:
+        """θ1, θ2 at the end, rad; None: it diverged."""
+        return None if self.diverged_s is not None else (float(self.position[0, -1]), float(self.position[1, -1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What the experiment gives by each method."""
+
+    step_ms: float
+    mode: float
+    """Fastest mode at θ2 = 0, 1/s."""
+    euler: Solution
+    reference: Solution
+    fehlberg: Solution
+    limits_ms: dict[str, float]
+    """Largest stable step of each method, ms."""
+
+    @property
+    def deviation(self) -> float | None:
+        """Of Runge–Kutta–Fehlberg from the reference at the end, rad; None: it diverged."""
+        end, reference = self.fehlberg.end, self.reference.end
+        return (
+            None if end is None or reference is None else max(abs(e - r) for e, r in zip(end, reference, strict=True))
+        )
+
+    def checks(self) -> list[tuple[str, str, str, bool]]:
+        """What was expected at the paper's step, what came out, and whether it agrees."""
+        end, deviation = self.reference.end, self.deviation
+        diverged_s = self.euler.diverged_s
+        rows = [
+            (
+                "θ(10 s), reference",
+                "0.05000, 0.19998 rad",
+                "diverged" if end is None else f"{end[0]:.5f}, {end[1]:.5f} rad",
+                end is not None and all(abs(e - x) < 1e-5 for e, x in zip(end, EXPECTED_END, strict=True)),
+            ),
+            (
+                f"Euler at {self.step_ms:g} ms",
+                "diverges",
+                "stays" if diverged_s is None else f"diverges (beyond {DIVERGED:g} rad/s at {diverged_s:.2f} s)",
+                diverged_s is not None,
+            ),
+            (
+                f"RKF at {self.step_ms:g} ms, off the reference",
+                "at most 2e-6 rad",
+                "diverged" if deviation is None else f"{deviation:.1e} rad",
+                deviation is not None and deviation <= 2.05e-6,
+            ),
+            ("fastest mode at θ2 = 0", "129.5 1/s", f"{self.mode:.1f} 1/s", abs(self.mode - 129.5) < 0.1),
+        ]
+        for name, expected in EXPECTED_LIMITS_MS.items():
+            found = self.limits_ms[name]
+            rows.append(
+                (f"largest stable step, {name}", f"{expected} ms", f"{found:.2f} ms", abs(found / expected - 1) < 0.01)
+            )
+        return rows
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return {
+            "step_ms": self.step_ms,
+            "fastest_mode_per_s": self.mode,
+            "methods": {
+                solution.name: {
+                    "theta_end_rad": solution.end,
+                    "diverged_s": solution.diverged_s,
+                    "peak_speed_rad_s": None
+                    if solution.diverged_s is not None
+                    else np.abs(solution.velocity).max(axis=1).tolist(),
+                }
+                for solution in (self.euler, self.reference, self.fehlberg)
+            },
+            "deviation_rad": self.deviation,
+            "limits_ms": self.limits_ms,
+            "checks": [
+                {"what": what, "expected": expected, "found": found, "holds": holds}
+                for what, expected, found, holds in self.checks()
+            ],
+        }
+
+
+def compute(step_ms: float = PAPER_STEP_MS) -> Figures:
+    """Do the experiment by all methods, the fixed ones with a step of `step_ms`.
+
+    Raises:
+        InputError: no whole number of steps makes up each second.
+    """
+    per_second = 1000.0 / step_ms if step_ms > 0 else 0.0
+    if per_second < 1 or abs(per_second - round(per_second)) > 1e-9:
+        raise InputError(f"a step of {step_ms:g} ms does not divide a second, at which the torques switch")
+    mode = fastest_mode(ARM, theta2=0.0)
+    limits = {table.name: table.negative_real_limit() / mode * 1e3 for table in (EULER, RK4, RKF45)}
+    limits["rkf45, order 4"] = RKF45.negative_real_limit(RKF45.embedded) / mode * 1e3
+    count = round(DURATION_S * per_second)
+    return Figures(
+        step_ms=step_ms,
+        mode=mode,
+        euler=_fixed(EULER, "Euler", step_ms, count),
+        reference=_reference(),
+        fehlberg=_fixed(RKF45, "Runge–Kutta–Fehlberg", step_ms, count),
+        limits_ms={name: limits[name] for name in EXPECTED_LIMITS_MS},
+    )
+
+
+def _fixed(table: Tableau, title: str, step_ms: float, count: int) -> Solution:
+    stepper = FixedStep(ReducedDynamics([ARM]), table, step_ms / 1e3)
+    position, velocity, effort = np.zeros((4, 1)), np.zeros((4, 1)), np.zeros((4, 1))
+    effort[2] = -ARM.masses[2] * GRAVITY
+    positions, velocities = np.zeros((2, count + 1)), np.zeros((2, count + 1))
+    time_s = np.asarray(np.arange(count + 1) * (step_ms / 1e3), dtype=np.float64)
+    # A method that diverges runs out of numbers.
+    with np.errstate(all="ignore"):
+        for k in range(count):
+            effort[:2, 0] = torque(time_s[k] + 1e-9)
+            stepper.advance(position, velocity, effort)
+            positions[:, k + 1], velocities[:, k + 1] = position[:2, 0], velocity[:2, 0]
+    return Solution(table.name, f"{title}, fixed step of {step_ms:g} ms", time_s, positions, velocities)
+
+
+def _reference() -> Solution:
+    dynamics = ReducedDynamics([ARM])
+    state, rates, drive = np.zeros((5, 1)), np.zeros((5, 1)), np.zeros((4, 1))
+    views = stage_views(state, rates)
+    effort = np.zeros((4, 1))
+    effort[2] = -ARM.masses[2] * GRAVITY
+
+    def derivative(time_s: float, y: Floats) -> Floats:
+        effort[:2, 0] = torque(time_s)
+        dynamics.drive(effort, drive)
+        state[:2, 0], state[4, 0] = y[2:], y[1]
+        dynamics.rates(views, drive)
+        return np.concatenate([y[2:], rates[:2, 0]])
+
+    time_s = np.asarray(np.linspace(0.0, DURATION_S, 1001), dtype=np.float64)
+    y = reference_solution(derivative, np.zeros(4), time_s, breaks=BREAKS_S)
+    return Solution("dop853", "Dormand–Prince, variable step", time_s, y[:2], y[2:])
+
+
+def draw(figures: Figures, folder: Path) -> list[Path]:
+    """Draw figures 4, 5 and 6 into `folder`, which is made where it is not there; gives the files.
+
+    Raises:
+        OperationError: the folder can't be written.
+    """
+    from matplotlib.figure import Figure
+
+    written = []
+    for number, solution in ((4, figures.euler), (5, figures.reference), (6, figures.fehlberg)):
+        figure = Figure(figsize=(8, 5), layout="constrained", dpi=120)
+        angles, speeds = figure.subplots(2, 1, sharex=True)
+        for axes, values, unit, reach in (
+            (angles, solution.position, "position, rad", 0.25),
+            (speeds, solution.velocity, "velocity, rad/s", 0.08),
+        ):
+            for joint, color in ((0, "#4c78a8"), (1, "#f58518")):
+                width = 1.6 if solution.diverged_s is None else 0.5
+                axes.plot(solution.time_s, values[joint], color=color, label=f"joint {joint + 1}", linewidth=width)
+            axes.set_ylabel(unit)
+            if solution.diverged_s is None:
+                axes.set_ylim(-0.25 * reach, reach)
+            axes.grid(alpha=0.3)
+        angles.legend(loc="upper left")
+        angles.set_xlim(0, DURATION_S)
+        speeds.set_xlabel("time, s")
+        figure.suptitle(f"Figure {number}: {solution.title}")
+        path = folder / f"figure{number}_{solution.name}.png"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path)
+        except OSError as error:
+            raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+        written.append(path)
+    return written

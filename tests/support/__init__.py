@@ -1,0 +1,1 @@
+"""Helpers shared by tests: labs, rigs, clients, networks and recordings for them."""

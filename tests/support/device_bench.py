@@ -1,0 +1,88 @@
+"""A Modbus device on a bench: a clock and a simulation that the test owns, and everything that the device says kept."""
+
+import random
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.device.settings import DeviceSettings
+from hilrig_modbus_edge.registers.map import Table
+from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.timing.clock import ManualClock
+from hilrig_schemas import Event, JointState, TorqueCommand
+
+MS = 1_000_000
+
+
+class Bench:
+    """A device on a bench: what it says is kept."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.clock = ManualClock()
+        self.commands: list[TorqueCommand] = []
+        self.repeats: list[TorqueCommand] = []
+        self.events: list[Event] = []
+        self.session_changes = 0
+        self.deadlines: list[int] = []
+        self.sends: list[int] = []
+        self.arrive: Callable[[Arrival], None] | None = None
+        self.arrival: Arrival | None = None
+        self.device = Device(
+            "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
+        )
+
+    def send_command(self, command: TorqueCommand) -> None:
+        self.commands.append(TorqueCommand.FromString(command.SerializeToString()))
+
+    def repeat_command(self, command: TorqueCommand) -> None:
+        self.repeats.append(TorqueCommand.FromString(command.SerializeToString()))
+
+    def emit(self, event: Event) -> None:
+        self.events.append(event)
+
+    def sessions_changed(self) -> None:
+        self.session_changes += 1
+
+    def watch(self, deadline_ns: int) -> None:
+        self.deadlines.append(deadline_ns)
+
+    def send_at(self, deadline_ns: int) -> None:
+        self.sends.append(deadline_ns)
+
+    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+        self.arrive = arrive
+
+    def state(self, step: int, **fields: Any) -> None:
+        message = JointState(
+            rig="rig1",
+            incarnation=7,
+            step=step,
+            position=fields.pop("position", (0.1, 0.2, 0.03, 0.4)),
+            velocity=fields.pop("velocity", (0, 0, 0, 0)),
+            effort=fields.pop("effort", (0, 0, 0, 0)),
+            **fields,
+        )
+        self.arrival = Arrival(message.SerializeToString(), self.clock.monotonic_ns())
+        if self.arrive is not None:
+            self.arrive(self.arrival)
+
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
+        return self.device.connect(host, port, **rights)
+
+    def read(self, client: Client, address: int, count: int, table: Table = Table.HOLDING_REGISTER) -> list[int]:
+        client.heard(self.clock.monotonic_ns())
+        return list(struct.unpack(f">{count}H", self.device.read_registers(client, table, address, count)))
+
+    def write(self, client: Client, address: int, *words: int) -> None:
+        now_ns = self.clock.monotonic_ns()
+        client.heard(now_ns)
+        self.device.write_registers(client, address, struct.pack(f">{len(words)}H", *words), now_ns)
+
+    def wait(self, ms: float) -> None:
+        self.clock.advance(round(ms * MS))
+        self.device.check(self.clock.monotonic_ns())
+
+    def kinds(self) -> list[str]:
+        return [Event.Kind.Name(event.kind) for event in self.events]

@@ -1,0 +1,198 @@
+"""A whole lab for a test: `hilrig up` as a user starts it, on ports that are free, in a folder of its own."""
+
+import functools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Self
+
+from support.waiting import eventually
+
+HILRIG = [sys.executable, "-m", "hilrig_cli"]
+
+
+def free_ports(count: int) -> int:
+    """First of `count` neighbouring ports that are free on loopback."""
+    while True:
+        with closing(socket.socket()) as probe:
+            probe.bind(("127.0.0.1", 0))
+            first: int = probe.getsockname()[1]
+        try:
+            for port in range(first, first + count):
+                with closing(socket.socket()) as probe:
+                    probe.bind(("127.0.0.1", port))
+        except (OSError, OverflowError):
+            continue
+        return first
+
+
+def hilrig(
+    *arguments: str | Path, cwd: Path | None = None, timeout_s: float = 120.0
+) -> subprocess.CompletedProcess[str]:
+    """Run a `hilrig` command to its end, in a process of its own that was spared Python's start and imports.
+
+    That commands start from nothing too is shown by tests/rig/test_documentation.py.
+    """
+    words = list(map(str, arguments))
+    with TemporaryDirectory() as folder:
+        out, err = (Path(folder) / name for name in ("out", "err"))
+        for path in (out, err):
+            path.touch()
+        server = _command_server()
+        assert server.stdin is not None
+        assert server.stdout is not None
+        job = {"words": words, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
+        server.stdin.write(json.dumps({**job, "out": str(out), "err": str(err)}) + "\n")
+        server.stdin.flush()
+        pid = int(server.stdout.readline())
+        killer = threading.Timer(timeout_s, os.kill, (pid, signal.SIGKILL))
+        killer.start()
+        code = int(server.stdout.readline())
+        late = not killer.is_alive()
+        killer.cancel()
+        if late:
+            raise subprocess.TimeoutExpired(words, timeout_s, out.read_text(), err.read_text())
+        return subprocess.CompletedProcess(words, code, out.read_text(), err.read_text())
+
+
+@functools.cache
+def _command_server() -> "subprocess.Popen[str]":
+    """One for all commands of this process; it ends with us, for then its standard input does."""
+    command = [sys.executable, str(Path(__file__).with_name("command_server.py"))]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:
+    """Write a `lab.toml` with free ports and recordings in `folder`; `extra` are more `[table.key]` lines of TOML.
+
+    Lines of `extra` of the form `edge.watchdog_ms = 300` go into their tables.
+    """
+    tables: dict[str, list[str]] = {
+        "edge": [f"first_port = {free_ports(rigs)}"],
+        "bus": [f"first_port = {free_ports(3)}"],
+        "recorder": [f"folder = '{folder / 'recordings'}'"],
+    }
+    for line in filter(None, map(str.strip, extra.splitlines())):
+        table, _, setting = line.partition(".")
+        tables.setdefault(table, []).append(setting)
+    text = "".join(f"[{table}]\n" + "\n".join(lines) + "\n" for table, lines in tables.items())
+    text += "".join(f'[[rigs]]\nname = "rig{number}"\n' for number in range(1, rigs + 1))
+    path = folder / "lab.toml"
+    path.write_text(text)
+    return path
+
+
+class RunningLab:
+    """`hilrig up` on a lab's file; a context manager that leaves no process behind."""
+
+    def __init__(self, config: Path, *options: str) -> None:
+        from hilrig_runtime.config.lab import load_lab
+
+        self.config = config
+        self.options = options
+        self.lab = load_lab(config)
+        self.log = config.parent / "up.log"
+
+    @property
+    def port(self) -> int:
+        """Modbus port of the first rig."""
+        return self.lab.ports[self.lab.rigs[0].name]
+
+    @property
+    def recordings(self) -> list[Path]:
+        """Finished recordings, oldest first."""
+        return sorted(self.lab.recorder.folder.rglob("*.mcap"), key=lambda path: path.stat().st_mtime)
+
+    def output(self) -> str:
+        """What `up` and its services said so far."""
+        return self.log.read_text()
+
+    def service_pid(self, name: str) -> int:
+        """Process id of a service: the child of `up` that runs that command.
+
+        Raises:
+            LookupError: none runs now.
+        """
+        for pid in _children(self.process.pid):
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            if name.encode() in words:
+                return pid
+        raise LookupError(name)
+
+    def service_pids(self) -> list[int]:
+        """Process ids of all children of `up`."""
+        return _children(self.process.pid)
+
+    def stop(self, number: signal.Signals = signal.SIGTERM, *, timeout_s: float = 30.0) -> int:
+        """Send a signal to `up` and wait for its end; gives the exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(timeout_s)
+
+    def __enter__(self) -> Self:
+        with self.log.open("w") as log:
+            # It ends with the tests, also where these are killed.
+            command = [*HILRIG, "up", "--stop-with-parent", "--config", str(self.config), *self.options]
+            self.process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
+            )
+
+        def up() -> bool:
+            assert self.process.poll() is None, self.output()
+            return "running; Ctrl-C ends it" in self.output()
+
+        try:
+            eventually(up)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.stop()
+        except subprocess.TimeoutExpired:
+            children = self.service_pids()
+            self.process.kill()
+            self.process.wait()
+            for pid in children:
+                os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def steady_controller(port: int) -> Iterator[None]:
+    """A controller that turns joint 1, fifty times a second, with a connection of its own."""
+    program = Path(__file__).with_name("steady_controller.py")
+    process = subprocess.Popen(
+        [sys.executable, str(program), "127.0.0.1", str(port)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
+    try:
+        yield
+    finally:
+        process.communicate()
+
+
+def _children(parent: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                stat = (entry / "stat").read_text()
+            except OSError:
+                continue
+            # The name in brackets may hold spaces; state and parent follow it.
+            state, ppid = stat.rpartition(")")[2].split()[:2]
+            if int(ppid) == parent and state != "Z":
+                found.append(int(entry.name))
+    return found

@@ -1,0 +1,81 @@
+"""A service's log stream for tests of the recorder: what it sends is kept, to be compared with what was recorded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from google.protobuf.message import Message
+
+from hilrig_runtime.messaging.recording_stream import put_entries
+from hilrig_schemas import Event, JointState, LogBatch, OpenSession, TorqueCommand
+from hilrig_schemas.topics import COMMAND, EVENT, STATE, RigTopic
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+LAB = "lab"
+
+
+@dataclass
+class Sent:
+    """One message as it was put on the stream."""
+
+    key: str
+    sequence: int
+    publish_ns: int
+    payload: bytes
+
+
+@dataclass
+class FakeSource:
+    """Makes the batches of one run of a service; nothing is sent, `batch` gives the bytes."""
+
+    name: str = "sim/1"
+    incarnation: int = 1
+    lab: str = LAB
+    sequence: int = 0
+    sent: list[Sent] = field(default_factory=list)
+    _waiting: list[Sent] = field(default_factory=list)
+    _sequences: dict[str, int] = field(default_factory=dict)
+
+    def put(self, topic: RigTopic[Message], rig: str, message: Message, publish_ns: int) -> Sent:
+        """Add a message to the next batch."""
+        key = topic.key(self.lab, rig)
+        number = self._sequences[key] = self._sequences.get(key, 0) + 1
+        sent = Sent(key, number, publish_ns, message.SerializeToString())
+        self._waiting.append(sent)
+        self.sent.append(sent)
+        return sent
+
+    def state(self, rig: str, publish_ns: int, session: str = "") -> Sent:
+        """Add a state."""
+        step = self._sequences.get(STATE.key(self.lab, rig), 0) + 1
+        state = JointState(rig=rig, session=session, incarnation=self.incarnation, step=step, wall_ns=publish_ns)
+        state.position.extend([0.1 * step, 0.2, 0.03, 0.4])
+        return self.put(STATE, rig, state, publish_ns)
+
+    def command(self, rig: str, publish_ns: int, session: str = "") -> Sent:
+        """Add a command."""
+        command = TorqueCommand(rig=rig, session=session, seq=len(self.sent), effort=[0.1, 0.2, 0.3, 0.4])
+        return self.put(COMMAND, rig, command, publish_ns)
+
+    def start(self, rig: str, session: str, publish_ns: int, controller: str = "192.0.2.7:40001") -> Sent:
+        """Add the event that begins a session."""
+        event = Event(rig=rig, session=session, kind=Event.SESSION_START, wall_ns=publish_ns, source=self.name)
+        event.session_data.controller = controller
+        return self.put(EVENT, rig, event, publish_ns)
+
+    def end(self, rig: str, session: str, publish_ns: int, reason: str = "the controller left") -> Sent:
+        """Add the event that ends a session."""
+        event = Event(rig=rig, session=session, kind=Event.SESSION_END, wall_ns=publish_ns, source=self.name)
+        event.session_data.reason = reason
+        return self.put(EVENT, rig, event, publish_ns)
+
+    def batch(self, sessions: Sequence[OpenSession] | None = None) -> LogBatch:
+        """What was added since the last batch; `sessions` are stated completely where they are given."""
+        self.sequence += 1
+        batch = LogBatch(source=self.name, incarnation=self.incarnation, sequence=self.sequence)
+        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._waiting])
+        self._waiting.clear()
+        if sessions is not None:
+            batch.sessions.extend(sessions)
+            batch.complete_sessions = True
+        return batch

@@ -1,0 +1,93 @@
+"""Who may do what on the bus: every topic has a rule, and the rules say what is meant."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from hilrig_runtime.bus.acl import RULES, access_control
+from hilrig_runtime.config.bus import BusTlsConfig
+from hilrig_runtime.config.lab import parse_lab
+from hilrig_runtime.errors import InputError
+from hilrig_runtime.messaging.endpoints import LatestOfBatches
+from hilrig_runtime.process.health import Counters
+from hilrig_runtime.timing.clock import ManualClock
+from hilrig_schemas import RigBatch
+from hilrig_schemas.topics import COMMANDS, all_topics
+
+TLS = BusTlsConfig(edges={"east": ("rig1", "rig2"), "west": ("rig3",)})
+
+
+def granted(name: str, flow: str, message: str, tls: BusTlsConfig = TLS, lab: str = "lab") -> set[str]:
+    def keys() -> Iterator[str]:
+        section = access_control(tls, lab)
+        [policy] = [policy for policy in section["policies"] if policy["subjects"] == [name]]
+        for rule in section["rules"]:
+            if rule["id"] in policy["rules"] and flow in rule["flows"] and message in rule["messages"]:
+                yield from rule["key_exprs"]
+
+    return set(keys())
+
+
+def test_every_topic_has_a_rule_and_every_rule_a_topic() -> None:
+    assert {topic.name for topic in all_topics()} == set(RULES)
+
+
+def test_an_edge_commands_its_own_rigs_only() -> None:
+    assert {key for key in granted("east", "ingress", "put") if "/commands/" in key} == {"hil/lab/commands/edge/east"}
+    assert {key for key in granted("east", "ingress", "put") if key.endswith("/command")} == {
+        "hil/lab/rig1/command",
+        "hil/lab/rig2/command",
+    }
+    assert {key for key in granted("west", "ingress", "put") if key.endswith("/command")} == {"hil/lab/rig3/command"}
+
+
+def test_without_edges_of_their_own_one_edge_commands_all() -> None:
+    assert "hil/lab/*/command" in granted("edge", "ingress", "put", BusTlsConfig())
+
+
+@pytest.mark.parametrize("tool", ["operator", "viewer"])
+def test_tools_send_nothing(tool: str) -> None:
+    assert granted(tool, "ingress", "put") == set()
+    assert granted(tool, "ingress", "declare_queryable") == set()
+    assert granted(tool, "ingress", "liveliness_token") == set()
+
+
+def test_nothing_is_allowed_outside_the_lab_and_nothing_by_default() -> None:
+    section = access_control(TLS, "lab")
+    assert (section["enabled"], section["default_permission"]) == (True, "deny")
+    assert all(rule["permission"] == "allow" for rule in section["rules"])
+    assert all(key.startswith("hil/lab/") for rule in section["rules"] for key in rule["key_exprs"])
+
+
+def test_every_rule_belongs_to_one_identity() -> None:
+    section = access_control(TLS, "lab")
+    ids = [rule["id"] for rule in section["rules"]]
+    assert len(ids) == len(set(ids))
+    assert sorted(ids) == sorted(rule for policy in section["policies"] for rule in policy["rules"])
+
+
+def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
+    def heard(permitted: dict[str, tuple[str, ...]], instance: str) -> set[str]:
+        commands = LatestOfBatches(ManualClock(), Counters(), permitted)
+        batch = RigBatch(rigs=["rig1", "rig3"], messages=[b"one", b"three"])
+        commands.on_message(COMMANDS.key("lab", "edge", instance), batch.SerializeToString())
+        return {rig for rig in ("rig1", "rig3") if commands.get(rig) is not None}
+
+    assert heard(dict(TLS.edges), "east") == {"rig1"}
+    assert heard(dict(TLS.edges), "west") == {"rig3"}
+    assert heard(dict(TLS.edges), "stranger") == set()
+    assert heard({}, "1") == {"rig1", "rig3"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('topology = "router"\nrouter = "tcp/a:7447"\n[bus.tls]', "expected an endpoint that begins with tls/"),
+        ('topology = "router"\nrouter = "tls/a:7447"', r"expected an endpoint that begins with tcp/.*no \[bus.tls\]"),
+        ('[bus.tls]\nedges = {sim = ["rig1"]}', r"edges.sim: that is the name of another certificate"),
+        ('[bus.tls]\nedges = {east = ["rig9"]}', "bus.tls.edges.east: no rig is called 'rig9'"),
+    ],
+)
+def test_what_does_not_fit_together_is_named(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_lab(f"[bus]\n{text}\n")

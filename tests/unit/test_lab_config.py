@@ -1,0 +1,107 @@
+"""`lab.toml`: sensible defaults, and every mistake named with its place, what was expected and what was found."""
+
+from pathlib import Path
+
+import pytest
+
+from hilrig_runtime.config.lab import LabConfig, load_lab, parse_lab
+from hilrig_runtime.errors import InputError
+
+
+def test_without_a_file_there_is_one_rig_on_loopback() -> None:
+    lab = load_lab(None)
+    assert [rig.name for rig in lab.rigs] == ["rig1"]
+    assert lab.ports == {"rig1": 5020}
+    assert lab.edge.host == "127.0.0.1"
+    assert lab.sim.step_ns == 20_000_000
+
+
+def test_ports_follow_each_other_around_those_that_are_named() -> None:
+    lab = parse_lab('[[rigs]]\nname="a"\n[[rigs]]\nname="b"\nport=5021\n[[rigs]]\nname="c"\n')
+    assert lab.ports == {"a": 5020, "b": 5021, "c": 5022}
+
+
+def test_a_class_of_rigs_is_one_table_and_single_ones_stand_beside_it() -> None:
+    lab = parse_lab(
+        '[rigs]\ncount = 3\n[rigs.arm]\nl2_m = 0.2\n[[rigs.single]]\nname = "rig2"\nport = 6000\n'
+        '[[rigs.single]]\nname = "teacher"\n'
+    )
+    assert lab.ports == {"rig1": 5020, "rig2": 6000, "rig3": 5021, "teacher": 5022}
+    assert [rig.arm.l2_m for rig in lab.rigs] == [0.2, 0.3, 0.2, 0.3]
+
+
+def test_a_large_lab_is_read_at_once() -> None:
+    lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
+    assert lab.addresses()["seat-2000"] == {"Modbus TCP": "127.0.0.1:7019"}
+
+
+def test_addresses_are_those_that_the_edge_listens_on() -> None:
+    tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
+    plain, secured = "Modbus TCP", "Modbus TCP with TLS"
+    assert parse_lab("").addresses()["rig1"] == {plain: "127.0.0.1:5020"}
+    assert parse_lab(tls).addresses()["rig1"] == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
+    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: "127.0.0.1:8020"}
+
+
+def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
+    file = tmp_path / "lab.toml"
+    file.write_text('name = "robotics"\n')
+    assert load_lab(file).source == 'name = "robotics"\n'
+    assert LabConfig().source == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[sim\n", r"lab\.toml: no valid TOML: .*line 1"),
+        ("[sim]\nstep = 20\n", r"lab\.toml: sim\.step: unknown key"),
+        ('[sim]\nstep_ms = "fast"\n', r"lab\.toml: sim\.step_ms: expected .*number.*, found 'fast'"),
+        ("[sim]\nstep_ms = -1\n", r"sim\.step_ms: expected greater than or equal to 0\.5, found -1"),
+        ("[sim]\nstep_ms = nan\n", r"sim\.step_ms: expected"),
+        ('[[rigs]]\nname = "a b"\n', r"rigs\[0\]\.name: .*found 'a b'"),
+        ('[[rigs]]\nname = "log"\n', r"rigs\[0\]: 'log' is a reserved name"),
+        ('[[rigs]]\nname = "edge"\n', r"rigs\[0\]: 'edge' is a reserved name"),
+        ('[[rigs]]\nname="a"\n[[rigs]]\nname="a"\n', r"two rigs are called 'a'"),
+        ('[[rigs]]\nname="a"\nport=5020\n[[rigs]]\nname="b"\nport=5020\n', r"port 5020 is taken by another rig"),
+        ("[[rigs]]\nport = 70000\n", r"rigs\[0\]\.port: expected less than or equal to 65535, found 70000"),
+        ("[edge]\nfirst_port=65535\n[[rigs]]\nname='a'\n[[rigs]]\nname='b'\n", r"no port is left"),
+        ('name = "a b"\n', r"name: expected 1 to 63 letters, digits, - and _, beginning .*, found 'a b'"),
+        ('realtime = "yes"\n', r"realtime: expected boolean, found 'yes'"),
+        ('[rigs]\ncount = "12"\n', r"rigs\.count: expected integer, found '12'"),
+        ('[sim]\nstep_ms = "20"\n', r"sim\.step_ms: expected number, found '20'"),
+        ("[rigs]\narm.masses_kg = [1, 1]\n", r"rigs\.arm\.masses_kg\[2\]: is missing"),
+        ("rigs = []\n", r"rigs: .*at least 1"),
+        ("[rigs]\ncount = 0\n", r"rigs\.count: expected greater than or equal to 1, found 0"),
+        ("[rigs]\ncount = 2\nports = 3\n", r"rigs\.ports: unknown key"),
+        ("[rigs]\n[[rigs.single]]\nname = 'a b'\n", r"rigs\.single\[0\]\.name: .*found 'a b'"),
+        ("[rigs]\n[[rigs.single]]\nname='a'\n[[rigs.single]]\nname='a'\n", r"rigs: two rigs are called 'a'"),
+        ("[rigs]\n[rigs.arm]\nl2_m = -1\n", r"rigs\.arm\.l2_m: expected greater than 0, found -1"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_lab(text)
+
+
+def test_all_mistakes_are_named_at_once() -> None:
+    with pytest.raises(InputError) as caught:
+        parse_lab("[sim]\nstep = 1\n[edge]\nhots = 2\n")
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_a_file_that_is_not_there_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml: can't be read: No such file or directory"):
+        load_lab(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_no_text_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="it is not UTF-8 text"):
+        load_lab(tmp_path / "lab.toml")
+
+
+def test_a_rig_that_is_not_in_the_lab_is_refused_with_those_that_are() -> None:
+    with pytest.raises(InputError, match="no rig is called 'rig9'; this lab has rig1"):
+        LabConfig().rig("rig9")
+    with pytest.raises(InputError, match=r"this lab has rig1, (rig\d+, ){14}rig16 and 1984 more \(hilrig rig list\)$"):
+        parse_lab("[rigs]\ncount = 2000\n").rig("rig9999")

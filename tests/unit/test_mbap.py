@@ -1,0 +1,52 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU
+
+from hilrig_modbus_edge.protocol.mbap import MAX_FRAME, Request, frame, split
+
+REQUEST = st.builds(Request, st.integers(0, 65535), st.integers(0, 255), st.binary(min_size=1, max_size=253))
+
+
+@given(st.lists(REQUEST, max_size=5), st.data())
+def test_requests_come_out_whole_and_in_order_however_the_stream_is_cut(
+    requests: list[Request], data: st.DataObject
+) -> None:
+    stream = b"".join(frame(*request) for request in requests)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
+    seen: list[Request] = []
+    rest = b""
+    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        rest += stream[start:end]
+        found = split(rest)
+        assert not found.malformed
+        seen += found.requests
+        rest = rest[found.used :]
+        assert len(rest) < MAX_FRAME
+    assert seen == requests
+    assert rest == b""
+
+
+@given(REQUEST)
+def test_frames_are_pymodbuss(request: Request) -> None:
+    framer = FramerSocket(DecodePDU(is_server=True))
+    assert frame(*request) == framer.encode(request.pdu, request.unit, request.transaction)
+
+
+@given(st.binary(max_size=600))
+def test_any_bytes_are_requests_a_beginning_or_malformed(data: bytes) -> None:
+    found = split(data)
+    assert b"".join(frame(*request) for request in found.requests) == data[: found.used]
+    rest = data[found.used :]
+    if not found.malformed:
+        assert len(rest) < MAX_FRAME
+        assert rest[2:4] in (b"", b"\0", b"\0\0")
+
+
+@pytest.mark.parametrize("length", [0, 1, 255, 65535])
+def test_a_length_that_no_request_has_is_malformed(length: int) -> None:
+    good = frame(1, 1, b"\x07")
+    found = split(good + b"\0\0\0\0" + length.to_bytes(2, "big"))
+    assert found.requests == [Request(1, 1, b"\x07")]
+    assert f"length {length}" in found.malformed

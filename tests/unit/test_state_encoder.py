@@ -1,0 +1,108 @@
+"""States put together of pieces are what protobuf would have encoded, and the same whenever the commands came."""
+
+import struct
+from functools import partial
+
+import numpy as np
+import pytest
+
+from hilrig_runtime.config.lab import parse_lab
+from hilrig_schemas import Event, JointState
+from hilrig_sim.loop import MANY
+from hilrig_sim.plant.plant import Plant
+from hilrig_sim.state_encoder import loop_bytes, motion_bytes
+from support.virtual_rig import VirtualRig
+
+LAB = parse_lab(f"[rigs]\ncount = {MANY}\n")
+
+
+def test_motion_is_what_protobuf_reads_and_writes() -> None:
+    with VirtualRig(parse_lab("[rigs]\ncount = 3\n")) as lab:
+        plant = Plant(lab.parameters)
+    random = np.random.default_rng(3)
+    for values in (plant.position, plant.velocity, plant.error):
+        values[:] = random.normal(size=values.shape)
+    plant.position[0, 1], plant.velocity[:, 2] = -0.0, 0.0
+    for rig, encoded in enumerate(motion_bytes(plant)):
+        state = JointState.FromString(encoded)
+        assert state.SerializeToString() == encoded
+        for found, expected in (
+            (state.position, plant.position),
+            (state.velocity, plant.velocity),
+            (state.integration_error, plant.error),
+        ):
+            assert struct.pack("<4d", *found) == struct.pack("<4d", *expected[:, rig])
+
+
+@pytest.mark.parametrize("latency_ns", [0, 1, 20_000_000, 2**62])
+def test_the_end_of_a_state_says_its_latency(latency_ns: int) -> None:
+    assert JointState.FromString(loop_bytes(latency_ns)).loop_latency_ns == latency_ns
+
+
+def played(at_ms: float) -> tuple[list[JointState], list[Event]]:
+    """Two rigs of many are commanded, held, reset and left alone, `at_ms` before each tick."""
+    with VirtualRig(LAB) as lab:
+        waking, sent = lab.clock.sleep_until_ns, [False]
+        tick_ns = [0]
+
+        def until(commands: object, deadline_ns: int) -> None:
+            # On its way to the deadline: the moment at which the commands come.
+            come_ns = tick_ns[0] - round(at_ms * 1e6)
+            if not sent[0] and deadline_ns >= come_ns:
+                waking(come_ns)
+                sent[0] = True
+                commands()  # type: ignore[operator]
+            waking(deadline_ns)
+
+        for step in range(70):
+
+            def commands(step: int = step) -> None:
+                for rig, turn in (("rig1", 0), ("rig7", 1)):
+                    if step < 30 and (step + turn) % 3:
+                        options = {"basis_step": max(0, step - turn), "resets": int(step > 20), "magnet": step > 5}
+                        lab.command((3.0, -1.0, -5.0, 0.1 * step), rig=rig, **options)  # type: ignore[arg-type]
+
+            lab.clock.sleep_until_ns = partial(until, commands)  # type: ignore[method-assign]
+            tick_ns[0], sent[0] = lab._rate.next_ns, False
+            lab.tick()
+        return lab.states, lab.events
+
+
+@pytest.mark.parametrize("at_ms", [1.0, 0.1])
+def test_states_do_not_depend_on_when_before_the_tick_a_command_came(at_ms: float) -> None:
+    early, late = played(5.0), played(at_ms)
+    # Only when it came and when the process was started differ.
+    fields = {field.name for field in JointState.DESCRIPTOR.fields} - {"command_arrived_ns", "incarnation"}
+    for one, other in zip(early[0], late[0], strict=True):
+        for name in fields:
+            assert getattr(one, name) == getattr(other, name), (one.step, one.rig, name)
+        assert bool(one.command_arrived_ns) == bool(other.command_arrived_ns)
+    assert [event.kind for event in early[1]] == [event.kind for event in late[1]]
+    assert {Event.RESET, Event.COMMAND_LOST} <= {event.kind for event in early[1]}
+    assert any(state.loop_latency_ns for state in early[0])
+
+
+def test_parts_are_stated_on_time_though_a_command_came_after_the_state_was_encoded() -> None:
+    lab = parse_lab(f"[rigs]\ncount = {MANY}\n[[scene.parts]]\nname = 'red'\nposition_mm = [300, 0]\n")
+    with VirtualRig(lab) as rig:
+        for _ in range(120):
+            rig.simulation.look_ahead(rig._rate.next_ns)
+            rig.command((0.1, 0.0, 0.0, 0.0))
+            rig.simulation.tick(rig._rate.wait())
+        stated = [state.step for state in rig.states if state.rig == "rig1" and state.parts]
+        others = [state.step for state in rig.states if state.rig == "rig2" and state.parts]
+    assert stated == others
+    assert len(stated) >= 3
+
+
+def test_a_command_that_became_too_old_while_its_tick_was_held_up_does_not_act() -> None:
+    with VirtualRig(LAB) as rig:
+        rig.command((3.0, 0.0, 0.0, 0.0))
+        rig.tick(2)
+        assert rig.states[-MANY].effort[0] == 3.0
+        rig.simulation.look_ahead(rig._rate.next_ns)
+        rig.clock.advance(LAB.sim.command_timeout_ns)
+        rig.simulation.tick(rig._rate.wait())
+        (state,) = [state for state in rig.states[-MANY:] if state.rig == "rig1"]
+        assert (list(state.effort), state.safe) == ([0.0] * 4, True)
+        assert state.missed_steps or state.lateness_ns > LAB.sim.step_ns

@@ -1,0 +1,1 @@
+"""Measurements of the local machine: timing jitter and CPU load."""

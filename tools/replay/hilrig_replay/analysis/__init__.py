@@ -1,0 +1,1 @@
+"""Measurements on recordings: latency, data quality, verification and comparison."""

@@ -1,0 +1,251 @@
+"""What a run amounts to, in one pass: its latency, its motion, what happened in it, and a thinned course for plots."""
+
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.analysis.distribution import percentiles
+from hilrig_replay.analysis.latency import LatencyReport, measure
+from hilrig_replay.analysis.similarity import Torques
+from hilrig_replay.grading.grade import Grade, Grader
+from hilrig_replay.grading.placement import TaskResult, placed_parts
+from hilrig_replay.grading.task_loading import task_of
+from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.records import Records
+from hilrig_replay.io.run import Run
+from hilrig_replay.rerun_view.scene import parameters_of
+from hilrig_runtime.config.task import TaskConfig
+from hilrig_sim.arm.kinematics import forward
+from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, RigParameters
+
+COURSE_POINTS: Final = 4000
+"""A course keeps about so many states, however long the run."""
+_SATURATED: Final = LARGEST_REGISTER_FORCE - 1e-9
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What the arm did."""
+
+    tool_path_m: float
+    """Length of the tool's way, m."""
+    top_speed: float
+    """Of the tool, m/s."""
+    work_j: float
+    """Mechanical work of the drives, |effort · velocity| summed over time and joints, J."""
+    peak_effort: tuple[float, float, float, float]
+    """Largest magnitude applied; N·m, N·m, N, N·m."""
+    saturated_share: tuple[float, float, float, float]
+    """Share of the steps with the effort at its register's limit, by joint, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """A run's states, thinned evenly; each array has one row a state that was kept."""
+
+    time_s: Floats
+    position: Floats
+    """Shape (n, 4); rad, rad, m, rad."""
+    velocity: Floats
+    """Shape (n, 4)."""
+    effort: Floats
+    """Shape (n, 4); N·m, N·m, N, N·m."""
+    tip: Floats
+    """The tool, world, m, shape (n, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """One run, ready to be shown or compared."""
+
+    name: str
+    """What people call it: the file's name without its suffix, which is the session unless somebody renamed it."""
+    session: str
+    rig: str
+    lab: str
+    controller: str
+    start: str
+    """As recorded, UTC."""
+    duration_s: float
+    ended: str
+    latency: LatencyReport
+    motion: Motion
+    events: dict[str, int]
+    """How often each kind of event happened."""
+    task: TaskResult | None
+    """Which parts stand in their places at the end; None: there are no places."""
+    grade: Grade | None
+    """None: there was no task."""
+    box_ms: tuple[float, ...]
+    """Loop latency: its percentiles 1, 25, 50, 75 and 99; empty: there are no samples."""
+    course: Course = field(repr=False, compare=False)
+    torques: Torques = field(repr=False, compare=False)
+    """What its controllers wrote, to be held against other runs."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for JSON: without what is there to be drawn."""
+        return {
+            "name": self.name,
+            "session": self.session,
+            "rig": self.rig,
+            "lab": self.lab,
+            "controller": self.controller,
+            "start": self.start,
+            "duration_s": self.duration_s,
+            "ended": self.ended,
+            "latency": self.latency.as_dict(),
+            "motion": asdict(self.motion),
+            "events": self.events,
+            "parts_placed": None if self.task is None else self.task.placed,
+            "largest_placing_error_mm": None if self.task is None else self.task.largest_error_mm,
+            "grade": None if self.grade is None else self.grade.as_dict(),
+        }
+
+
+def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
+    """Go through a run once.
+
+    Args:
+        run: the recording.
+        task: what it is graded by; None: what its own lab said.
+
+    Raises:
+        InputError: it is damaged, or its parameters or its task are not understood.
+    """
+    collector = _Collector(run, parameters_of(run.parameters_json), task or task_of(run))
+    latency = measure(run, collector.add)
+    return RunSummary(
+        name=run.path.stem,
+        session=run.session,
+        rig=run.rig,
+        lab=run.lab,
+        controller=run.controller,
+        start=run.started,
+        duration_s=run.duration_s,
+        ended=run.ended,
+        latency=latency,
+        motion=collector.motion(),
+        events=dict(sorted(collector.events.items())),
+        task=collector.task(),
+        grade=collector.grade(),
+        box_ms=_box_ms(latency),
+        course=collector.course(),
+        torques=collector.torques,
+    )
+
+
+def under_command(run: Run, states: Rows) -> NDArray[np.bool_]:
+    """Where a controller's command acts, shape (n,): what is from before its session may belong to the one before."""
+    if run.controller:
+        return np.asarray((states["command_seq"] > 0) & (states["session"] == run.names.code(run.session)))
+    # Recorded by hand, controllers come and go; where there is none, the edge's own command of no torque acts.
+    return np.asarray((states["basis_step"] != 0) | (states["effort"] != 0).any(axis=1))
+
+
+def _box_ms(latency: LatencyReport) -> tuple[float, ...]:
+    if not latency.samples:
+        return ()
+    return tuple((percentiles(latency.table.column("loop"), (1, 25, 50, 75, 99)) / 1e6).tolist())
+
+
+class _Collector:
+    def __init__(self, run: Run, parameters: RigParameters, task: TaskConfig | None) -> None:
+        self._run = run
+        self._parameters = parameters
+        self._grader = None if task is None else Grader(task, parameters)
+        self._every = max(1, run.file.counts["state"] // COURSE_POINTS)
+        self._pieces: list[tuple[Floats, Rows, Floats]] = []
+        self._seen = 0
+        self._last_tip: Floats | None = None
+        self._path = self._top_speed = self._work = 0.0
+        self._peak, self._saturated = np.zeros(4), np.zeros(4)
+        self._poses: dict[str, Any] = {}
+        self._held = ""
+        self.events: Counter[str] = Counter()
+        self.torques = Torques()
+
+    def add(self, block: Records) -> None:
+        self.events.update(block.events["kind"].tolist())
+        names = self._run.names
+        written = block.commands[(block.commands["controller"] != names.code("")) & ~block.commands["safe"]]
+        self.torques.add(written["effort"])
+        if self._grader is not None:
+            dropped = block.events[block.events["kind"] == "PART_DROPPED"]
+            for event, time_s in zip(dropped, self._run.time_s(dropped), strict=True):
+                self._grader.add_drop(event["message"].part_data.part, float(time_s))
+        for row in _last_of_each_part(block.parts):
+            name = names[int(row["part"])]
+            self._poses[name] = SimpleNamespace(name=name, x=float(row["x"]), y=float(row["y"]), z=float(row["z"]))
+        if len(block.states):
+            self._add_states(block.states)
+
+    def _add_states(self, states: Rows) -> None:
+        self._held = self._run.names[int(states["held_part"][-1])]
+        time_s = self._run.time_s(states)
+        pose = np.ascontiguousarray(forward(self._parameters.arm, states["position"].T).T)
+        tip = pose[:, :3]
+        if self._grader is not None:
+            self._grader.add_states(time_s, pose, under_command(self._run, states))
+        way = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
+        lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
+        step_s = self._run.step_ns / 1e9
+        self._path += float(lengths.sum())
+        self._top_speed = max(self._top_speed, float(lengths.max(initial=0.0)) / step_s)
+        self._work += float(np.abs(states["effort"] * states["velocity"]).sum()) * step_s
+        magnitude = np.abs(states["effort"])
+        self._peak = np.maximum(self._peak, magnitude.max(axis=0))
+        self._saturated += (magnitude >= _SATURATED).sum(axis=0)
+        first = -self._seen % self._every
+        self._pieces.append(
+            (
+                # A view would keep the whole block.
+                time_s[first :: self._every].copy(),
+                states[first :: self._every].copy(),
+                tip[first :: self._every].copy(),
+            )
+        )
+        self._seen += len(states)
+        self._last_tip = tip[-1:]
+
+    def grade(self) -> Grade | None:
+        return None if self._grader is None else self._grader.grade(self.task())
+
+    def motion(self) -> Motion:
+        return Motion(
+            tool_path_m=self._path,
+            top_speed=self._top_speed,
+            work_j=self._work,
+            peak_effort=_four(self._peak),
+            saturated_share=_four(self._saturated / max(self._seen, 1)),
+        )
+
+    def task(self) -> TaskResult | None:
+        scene = self._parameters.scene
+        if not scene.parts or not any(tray.places for tray in scene.trays):
+            return None
+        return placed_parts(scene, list(self._poses.values()), held=self._held)
+
+    def course(self) -> Course:
+        states = np.concatenate([states for _, states, _ in self._pieces])
+        return Course(
+            time_s=np.concatenate([time_s for time_s, _, _ in self._pieces]),
+            position=np.ascontiguousarray(states["position"]),
+            velocity=np.ascontiguousarray(states["velocity"]),
+            effort=np.ascontiguousarray(states["effort"]),
+            tip=np.concatenate([tip for _, _, tip in self._pieces]),
+        )
+
+
+def _last_of_each_part(parts: Rows) -> list[np.void]:
+    codes, last = np.unique(parts["part"][::-1], return_index=True)
+    return [parts[len(parts) - 1 - at] for at in last[: len(codes)]]
+
+
+def _four(values: Floats) -> tuple[float, float, float, float]:
+    return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))

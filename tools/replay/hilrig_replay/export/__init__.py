@@ -1,0 +1,1 @@
+"""Recordings exported for other tools, and played back on the bus."""

@@ -1,0 +1,1 @@
+"""Grading of recordings against a lab's task."""

@@ -1,0 +1,34 @@
+"""The Modbus requests of a recording as rows, in the form that they have now and in the one of before."""
+
+import struct
+
+from google.protobuf.message import DecodeError
+
+from hilrig_replay.io.columns import Decode, Names, Table
+from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
+
+
+def traffic_decoder(requests: Table, names: Names) -> Decode:
+    """A function that adds the requests of `ModbusTraffic` messages to a `columns.TRAFFIC` table."""
+    message = ModbusTraffic()
+    parse, add = message.ParseFromString, requests.append
+
+    def fields(kind: ModbusKind | ModbusRequest) -> tuple[int, ...]:
+        controller = names.code(kind.controller)
+        return kind.address & 0xFFFF, kind.count & 0xFFFF, controller, kind.function & 0xFF, kind.exception & 0xFF
+
+    def decode(payload: bytes, sequence: int, log_ns: int) -> None:  # noqa: ARG001
+        parse(payload)
+        wall_from_monotonic = message.wall_ns - message.closed_ns
+        kinds = [fields(kind) for kind in message.kinds]
+        columns = zip(message.kind_indexes, message.arrived_ns, message.answered_after_ns, strict=True)
+        try:
+            for index, arrived_ns, after_ns in columns:
+                add(wall_from_monotonic + arrived_ns, arrived_ns, arrived_ns + after_ns, *kinds[index])
+        except (ValueError, IndexError, struct.error) as error:
+            raise DecodeError(f"requests that do not fit together: {error}") from error
+        for request in message.requests:
+            arrived_ns = request.arrived_ns
+            add(wall_from_monotonic + arrived_ns, arrived_ns, request.answered_ns, *fields(request))
+
+    return decode

@@ -1,0 +1,1 @@
+"""Recordings and running rigs in the rerun viewer."""

@@ -1,0 +1,1 @@
+"""Controllers for studies: built in, LQR and the user's own."""

@@ -1,0 +1,1 @@
+"""Studies on a running rig, and simulations of recorded conditions."""

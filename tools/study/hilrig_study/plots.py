@@ -1,0 +1,239 @@
+"""A study's pictures: cost over the plane with theory's boundary and margins on it, and traces at chosen points."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from hilrig_replay.plots.latency_plot import save_figure
+from hilrig_replay.plots.palette import INK, RUN_COLORS
+from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
+from hilrig_study.sweep import SweepResult, cell_at, run_cells
+from hilrig_study.theory.gain_theory import GainTheory
+
+Floats = NDArray[np.float64]
+
+FAILED: Final = "#5b5b5b"
+BOUNDARY: Final = "#d62728"
+DELAY_MARGIN: Final = "#ffffff"
+JITTER_MARGIN: Final = "#f5a623"
+MEAN_SQUARE: Final = "#ff5fc8"
+_LETTERS: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """A run at a chosen point."""
+
+    letter: str
+    point: PointConfig
+    controller: int
+    time_s: Floats
+    """(T,)."""
+    error: Floats
+    """Position less goal; degrees, degrees, mm, degrees, (T, 4)."""
+    effort: Floats
+    """N·m, N·m, N, N·m, (T, 4)."""
+    outcome: str
+    """In words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """A point of the plane as it was measured on the live loop."""
+
+    x: float
+    y: float
+    as_predicted: bool
+
+
+def traces(study: StudyConfig, folder: Path) -> list[Trace]:
+    """Run the study's chosen points.
+
+    Raises:
+        InputError: as `run_cells`.
+    """
+    names = [controller.name for controller in study.controllers]
+    found = []
+    for letter, point in zip(_LETTERS, study.traces, strict=False):
+        number = names.index(point.controller) if point.controller else 0
+        cells = cell_at(study, point.x, point.y, number)
+        results, outcome = run_cells(study, cells, folder, keep=True)
+        step_s = float(cells["step_ms"][0]) * 1e-3
+        time_s: Floats = np.asarray(np.arange(len(outcome.positions)) * step_s, dtype=np.float64)
+        goal = study.task.scenario().goal(time_s).T
+        said = "comes to rest" if results["settled"][0] else "does not come to rest"
+        if not math.isnan(results["failed_s"][0]):
+            said = f"fails at {results['failed_s'][0]:.2f} s"
+        # A run that has failed is over: what is parked is no trace.
+        going = np.where(np.isnan(results["failed_s"]) | (time_s <= results["failed_s"]), 1.0, np.nan)[:, np.newaxis]
+        error = going * (outcome.positions[:, :, 0] - goal) * JOINT_SCALE
+        found.append(Trace(letter, point, number, time_s, error, going * outcome.efforts[:, :, 0], said))
+    return found
+
+
+def plane_figure(
+    study: StudyConfig, swept: SweepResult, number: int, points: Sequence[Trace] = (), dots: Sequence[Dot] = ()
+) -> Figure:
+    """The plane of one controller: mean cost in colour, grey where runs failed, theory as lines, points and dots."""
+    shown = [trace for trace in points if trace.controller == number]
+    figure = Figure(figsize=(11, 5.2) if shown else (7, 5.2), layout="constrained", dpi=100)
+    if shown:
+        grid = figure.add_gridspec(len(shown), 2, width_ratios=(1.25, 1))
+        axes = figure.add_subplot(grid[:, 0])
+        _draw_traces([figure.add_subplot(grid[row, 1]) for row in range(len(shown))], shown, study)
+    else:
+        axes = figure.subplots()
+    cost = swept.plane(study, number, swept.results["cost"])
+    finite = cost[np.isfinite(cost)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.1, 10.0)
+    norm = LogNorm(max(low, 1e-9), max(high, low * 1.01, 1.1e-9))
+    axes.set_facecolor(FAILED)
+    mesh = axes.pcolormesh(
+        study.x.points,
+        study.y.points,
+        np.ma.masked_invalid(cost),
+        norm=norm,
+        cmap="viridis",
+        shading="nearest",
+        rasterized=True,
+    )
+    bar = figure.colorbar(mesh, ax=axes, pad=0.01, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
+    bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    bar.set_label("mean of Σ (error / 1° or 1 mm)² + 0.01 Σ effort²", fontsize=8)
+    for axis, config in ((axes.xaxis, study.x), (axes.yaxis, study.y)):
+        if config.spacing == "log":
+            (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
+    theory = [one for one in swept.theory if one.controller == number]
+    predicts = study.controllers[number].kind == "lqr" and study.controllers[number].compensate
+    _draw_theory(axes, study, theory, predicts)
+    _draw_radius(axes, study, swept, number)
+    for trace in shown:
+        axes.annotate(
+            trace.letter,
+            (trace.point.x, trace.point.y),
+            ha="center",
+            va="center",
+            fontsize=9,
+            color="white",
+            bbox={"boxstyle": "circle,pad=0.2", "facecolor": "black", "edgecolor": "white"},
+        )
+    for as_predicted, color, label in (
+        (True, "#7CFC00", "live: as predicted"),
+        (False, "#ff4d4d", "live: not as predicted"),
+    ):
+        mine = [dot for dot in dots if dot.as_predicted is as_predicted]
+        if mine:
+            axes.scatter(
+                [dot.x for dot in mine],
+                [dot.y for dot in mine],
+                c=color,
+                edgecolors="black",
+                s=46,
+                zorder=5,
+                label=label,
+            )
+    axes.set_xlim(*_ends(study.x))
+    axes.set_ylim(*_ends(study.y))
+    axes.set_xlabel(study.x.label, color=INK)
+    axes.set_ylabel(study.y.label, color=INK)
+    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=INK)
+    axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")
+    return figure
+
+
+def _ends(axis: AxisConfig) -> tuple[float, float]:
+    points = axis.points
+    if axis.spacing == "log" or len(points) < 2:
+        return float(points.min()) * (1 if len(points) > 1 else 0.9), float(points.max()) * (
+            1 if len(points) > 1 else 1.1
+        )
+    half = float(points.max() - points.min()) / (len(points) - 1) / 2
+    return float(points.min()) - half, float(points.max()) + half
+
+
+def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], predicts: bool) -> None:
+    """Boundaries over the gain, where one axis is the gain and the other a time that is added."""
+    what = (study.x.what, study.y.what)
+    if "gain" not in what or not theory:
+        return
+    other = what[0] if what[1] == "gain" else what[1]
+    gain = np.array([one.gain for one in theory])
+    order = np.argsort(gain)
+    lines: list[tuple[str, str, str, list[float]]] = []
+    # One that predicts over the latency that it measures bears less of what it does not know of.
+    unknown = ", if not measured" if predicts else ""
+    drawn = not all(math.isnan(one.mean_square_until) for one in theory)
+    if other == "delay_ms":
+        label = "spectral radius 1, without what is drawn" if drawn else "exact: spectral radius 1"
+        lines.append((label, BOUNDARY, "-", [one.stable_until_ms for one in theory]))
+        lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
+    if other in ("delay_ms", "jitter_ms"):
+        lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(one, "jitter") for one in theory]))
+    if drawn:
+        lines.append(("stable in the mean square", MEAN_SQUARE, "-.", [one.mean_square_until for one in theory]))
+    most = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
+    for label, color, style, values_ms in lines:
+        values = np.array(values_ms)[order]
+        # What lies beyond the plane is drawn at its edge, so that lines do not end without a word.
+        values = np.where(values < 0, np.nan, np.minimum(values, 2 * most))
+        if not (values <= most).any():
+            continue
+        across, up = (values, gain[order]) if other == what[0] else (gain[order], values)
+        axes.plot(across, up, color=color, linestyle=style, linewidth=1.8, label=label)
+
+
+def _margin_ms(one: GainTheory, kind: str) -> float:
+    """A margin as delay that may be added; less than none is none, for the loop's own latency is counted."""
+    if one.nominal is None or not one.nominal.stable:
+        return math.nan
+    return 1e3 * (one.nominal.delay_margin_s if kind == "delay" else one.nominal.jitter_margin_s)
+
+
+def _draw_radius(axes: Axes, study: StudyConfig, swept: SweepResult, number: int) -> None:
+    """The contour of radius 1 on planes of which the gain is no axis."""
+    if "gain" in (study.x.what, study.y.what):
+        return
+    radius = swept.plane(study, number, swept.radius)
+    if np.isfinite(radius).all() and radius.min() < 1 < radius.max():
+        axes.contour(study.x.points, study.y.points, radius, levels=[1.0], colors=[BOUNDARY], linewidths=1.8)
+
+
+def _draw_traces(panels: Sequence[Axes], shown: Sequence[Trace], study: StudyConfig) -> None:
+    for axes, trace in zip(panels, shown, strict=True):
+        for joint, (name, unit) in enumerate((("θ1", "°"), ("θ2", "°"))):
+            axes.plot(
+                trace.time_s, trace.error[:, joint], color=RUN_COLORS[joint], linewidth=1.0, label=f"{name}, {unit}"
+            )
+        where = f"{study.x.label} {trace.point.x:g}; {study.y.label} {trace.point.y:g}"
+        axes.set_title(f"{trace.letter}: {trace.outcome} ({where})", fontsize=8, loc="left", color=INK)
+        axes.tick_params(labelsize=7)
+        axes.grid(color="#e5e5e5", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        most = float(np.nanmax(np.abs(trace.error[:, :2]), initial=1e-3))
+        axes.set_ylim(-1.1 * most, 1.1 * most)
+    panels[0].legend(fontsize=7, loc="upper right", title="error", title_fontsize=7)
+    panels[-1].set_xlabel("time, s", fontsize=8, color=INK)
+
+
+def save_pictures(figure: Figure, stem: Path) -> list[Path]:
+    """Write a picture as PNG and SVG.
+
+    Raises:
+        OperationError: it can't be written.
+    """
+    paths = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
+    for path in paths:
+        save_figure(figure, path)
+    return paths

@@ -1,0 +1,1 @@
+"""The control loop simulated in virtual time."""

@@ -1,0 +1,1 @@
+"""Theory of the control loop: linear models, stability margins and expected cost."""
