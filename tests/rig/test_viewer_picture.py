@@ -23,8 +23,8 @@ from waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
-DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
-"""Vulkan in software, of Debian's mesa-vulkan-drivers."""
+DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
+"""Vulkan in software, of Debian's mesa-vulkan-drivers; Debian 12 writes the architecture into the name, 13 does not."""
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +34,13 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.rrd"
 
 
-@pytest.mark.skipif(shutil.which("xvfb-run") is None or not DRIVER.exists(), reason="needs xvfb, mesa-vulkan-drivers")
+@pytest.mark.skipif(shutil.which("xvfb-run") is None or not DRIVERS, reason="needs xvfb, mesa-vulkan-drivers")
 def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> None:
     shot = tmp_path / "shot.png"
     command = ["xvfb-run", "-a", "-s", "-screen 0 4000x3000x24", str(executable()), str(rrd)]
     command += ["--screenshot-to", str(shot), "--window-size", "1000x600"]
-    environ = {**environment(), "VK_DRIVER_FILES": str(DRIVER), "XDG_RUNTIME_DIR": str(tmp_path)}
+    drivers = os.pathsep.join(map(str, DRIVERS))
+    environ = {**environment(), "VK_DRIVER_FILES": drivers, "XDG_RUNTIME_DIR": str(tmp_path)}
     result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100, env=environ)
     assert shot.exists(), result.stderr
     picture = imread(shot)[..., :3]
