@@ -4,6 +4,8 @@
 # missing part says so when it is skipped.
 set -eu
 packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl docker-compose xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
+# What the viewer loads by itself when it opens a window.
+packages="$packages libxkbcommon-x11-0 libxcursor1 libxi6"
 # Node.js may have come another way than by apt.
 command -v npm >/dev/null 2>&1 || packages="$packages nodejs npm"
 

@@ -136,15 +136,32 @@ def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compo
 
 
 def test_a_compose_implementation_reads_it() -> None:
-    if shutil.which("docker-compose") is None:
-        pytest.skip("needs docker-compose (Debian's package of that name)")
-    command = ["docker-compose", "--file", "compose.yaml", "config"]
+    command = [*compose_command(), "--file", "compose.yaml", "config"]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     understood = yaml.safe_load(done.stdout)
     assert set(understood["services"]) == set(SERVICES)
-    assert understood["services"]["east"]["ports"] == ["127.0.0.1:5020:5020/tcp", "127.0.0.1:5021:5021/tcp"]
+    assert published(understood["services"]["east"]) == ["127.0.0.1:5020:5020/tcp", "127.0.0.1:5021:5021/tcp"]
+    assert published(understood["services"]["console"]) == ["127.0.0.1:8050:8050/tcp"]
     assert all(service["read_only"] for service in understood["services"].values())
+
+
+def compose_command() -> list[str]:
+    """The compose implementation that is installed: a command of its own, or a part of `docker`."""
+    for command in (["docker-compose"], ["docker", "compose"]):
+        if shutil.which(command[0]) is None:
+            continue
+        if subprocess.run([*command, "version"], check=False, capture_output=True, timeout=60).returncode == 0:
+            return command
+    pytest.skip("needs docker-compose (Debian's package of that name), or docker with its plugin compose")
+
+
+def published(service: dict[str, Any]) -> list[str]:
+    """Ports of a service as compose 1 prints them; compose 2 prints each as a table."""
+    return [
+        port if isinstance(port, str) else "{host_ip}:{published}:{target}/{protocol}".format_map(port)
+        for port in service["ports"]
+    ]
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """The viewer itself, on a virtual display: a recording opens as the arm, its table and its curves."""
 
+import ctypes
 import os
 import shutil
 import signal
@@ -23,8 +24,16 @@ from support.waiting import PATIENT_S, eventually
 
 pytestmark = pytest.mark.rig
 
-DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
-"""Vulkan in software, of Debian's mesa-vulkan-drivers."""
+DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
+"""Vulkan in software, of Debian's mesa-vulkan-drivers; Debian 12 writes the architecture into the name, 13 does not."""
+
+LIBRARIES = {
+    "libvulkan.so.1": "libvulkan1",
+    "libxkbcommon-x11.so.0": "libxkbcommon-x11-0",
+    "libXcursor.so.1": "libxcursor1",
+    "libXi.so.6": "libxi6",
+}
+"""What the viewer loads by itself when it opens a window, and Debian's packages of it."""
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +43,30 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.rrd"
 
 
-@pytest.mark.skipif(shutil.which("xvfb-run") is None or not DRIVER.exists(), reason="needs xvfb, mesa-vulkan-drivers")
+def require_a_display() -> None:
+    """Skip a test, with the reason, where the viewer can't open a window on a virtual display."""
+    missing = [name for name, package in LIBRARIES.items() if not can_be_loaded(name)]
+    if missing:
+        pytest.skip(f"needs {', '.join(missing)} (Debian's packages {', '.join(LIBRARIES[name] for name in missing)})")
+    if shutil.which("xvfb-run") is None or shutil.which("xauth") is None or not DRIVERS:
+        pytest.skip("needs xvfb-run, xauth and a software Vulkan driver (Debian's xvfb, xauth, mesa-vulkan-drivers)")
+
+
+def can_be_loaded(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
 def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> None:
+    require_a_display()
     shot = tmp_path / "shot.png"
     command = ["xvfb-run", "-a", "-s", "-screen 0 4000x3000x24", str(executable()), str(rrd)]
     command += ["--screenshot-to", str(shot), "--window-size", "1000x600"]
-    environ = {**environment(), "VK_DRIVER_FILES": str(DRIVER), "XDG_RUNTIME_DIR": str(tmp_path)}
+    drivers = os.pathsep.join(map(str, DRIVERS))
+    environ = {**environment(), "VK_DRIVER_FILES": drivers, "XDG_RUNTIME_DIR": str(tmp_path)}
     result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100, env=environ)
     assert shot.exists(), result.stderr
     picture = imread(shot)[..., :3]

@@ -1,13 +1,15 @@
-"""Several hosts on one machine: network namespaces on one bridge, names resolving as on a compose network.
+"""Several hosts on one machine: network namespaces around a gateway, names resolving as on a compose network.
 
-Needs root and iproute2. Everything is taken down when the context is left, and every process that was started in it
-is ended by its id.
+Each host has a cable of its own to the gateway, which forwards between them. No bridge is needed: containers and small
+kernels often have none. Needs root and iproute2. Everything is taken down when the context is left, and every process
+that was started in it is ended by its id.
 """
 
 import os
 import shutil
 import subprocess
 from contextlib import ExitStack
+from functools import cache
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -18,21 +20,33 @@ import pytest
 
 def require_namespaces() -> None:
     """Skip a test, with the reason, where namespaces can't be had."""
+    if reason := _missing():
+        pytest.skip(reason)
+
+
+@cache
+def _missing() -> str | None:
+    """What is missing for namespaces; tried once with all that a network needs."""
     if shutil.which("ip") is None:
-        pytest.skip("needs `ip` (Debian's package iproute2)")
+        return "needs `ip` (Debian's package iproute2)"
     if os.name != "posix" or os.geteuid() != 0:
-        pytest.skip("needs root, for network namespaces")
-    probe = subprocess.run(["ip", "netns", "add", f"hr{os.getpid()}probe"], check=False, capture_output=True, text=True)
-    if probe.returncode:
-        pytest.skip(f"network namespaces can't be made here: {probe.stderr.strip()}")
-    subprocess.run(["ip", "netns", "delete", f"hr{os.getpid()}probe"], check=True)
+        return "needs root, for network namespaces"
+    try:
+        with Network(["near", "far"]) as network:
+            network.run("near", ["getent", "hosts", "far"], capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        said = " ".join((error.stderr or "").split()) or f"exit code {error.returncode}"
+        return f"network namespaces can't be had here: `{' '.join(error.cmd)}`: {said}"
+    return None
 
 
 _NUMBERS = count()
+_NET = "10.77.0.0/24"
+_GATEWAY = "10.77.0.1"
 
 
 class Network:
-    """Hosts by name, each in a namespace of its own, all on one bridge; use it as a context manager."""
+    """Hosts by name, each in a namespace of its own, around one gateway; use it as a context manager."""
 
     def __init__(self, hosts: list[str]) -> None:
         self._prefix = f"hr{os.getpid()}n{next(_NUMBERS)}"
@@ -61,8 +75,8 @@ class Network:
         return subprocess.run(words, check=False, capture_output=True).returncode
 
     def set_link(self, host: str, up: bool) -> None:
-        """Plug a host's cable in or out."""
-        _ip("-n", self._switch, "link", "set", self._port(host), "up" if up else "down")
+        """Plug a host's cable in or out; senders are not told that what they send is lost."""
+        _ip("-n", self._gateway, "link", "set", self._port(host), "up" if up else "down")
 
     def __enter__(self) -> Self:
         try:
@@ -78,9 +92,10 @@ class Network:
         self._closing.close()
 
     def _build(self) -> None:
-        self._add_namespace(self._switch)
-        _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
-        _ip("-n", self._switch, "link", "set", "bridge", "up")
+        self._add_namespace(self._gateway)
+        _ip("netns", "exec", self._gateway, "sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
+        # Of a host whose cable is out no sender hears that it can't be reached.
+        _ip("-n", self._gateway, "route", "add", "blackhole", _NET)
         names = "127.0.0.1 localhost\n" + "".join(f"{address} {host}\n" for host, address in self._addresses.items())
         for host, address in self._addresses.items():
             namespace, port = self._namespace(host), self._port(host)
@@ -90,15 +105,17 @@ class Network:
             etc.mkdir(parents=True)
             self._closing.callback(shutil.rmtree, etc, ignore_errors=True)
             (etc / "hosts").write_text(names)
-            _ip("-n", self._switch, "link", "add", port, "type", "veth", "peer", "name", "eth0", "netns", namespace)
-            _ip("-n", self._switch, "link", "set", port, "master", "bridge", "up")
-            _ip("-n", namespace, "addr", "add", f"{address}/24", "dev", "eth0")
+            _ip("-n", self._gateway, "link", "add", port, "type", "veth", "peer", "name", "eth0", "netns", namespace)
+            _ip("-n", self._gateway, "addr", "add", _GATEWAY, "peer", address, "dev", port)
+            _ip("-n", self._gateway, "link", "set", port, "up")
+            _ip("-n", namespace, "addr", "add", address, "peer", _GATEWAY, "dev", "eth0")
             _ip("-n", namespace, "link", "set", "eth0", "up")
             _ip("-n", namespace, "link", "set", "lo", "up")
+            _ip("-n", namespace, "route", "add", _NET, "via", _GATEWAY)
 
     @property
-    def _switch(self) -> str:
-        return f"{self._prefix}-switch"
+    def _gateway(self) -> str:
+        return self._prefix
 
     def _namespace(self, host: str) -> str:
         return f"{self._prefix}-{host}"
@@ -113,7 +130,7 @@ class Network:
 
 
 def _ip(*arguments: str) -> None:
-    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
 
 
 def _end(process: subprocess.Popen[Any]) -> None:

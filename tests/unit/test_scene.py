@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hilrig_replay.export.urdf_geometry import fixed_joints, solids_of
 from hilrig_replay.rerun_view.scene import multiply, parameters_of, reach_outline, read_arm, rotate, tips
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import in_reach
@@ -13,6 +14,13 @@ from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_sim.arm.urdf import urdf
 
 SEED = 7
+
+
+class UntestedElement(ElementTree.Element):
+    """An element whose truth value must not be asked for: Python deprecates it, from 3.12 on with a warning."""
+
+    def __bool__(self) -> bool:
+        raise AssertionError(f"the truth value of <{self.tag}> was asked for")
 
 
 def random_joints(arm: ArmParameters, count: int) -> np.ndarray:
@@ -55,6 +63,30 @@ def test_a_joints_own_frame_is_respected() -> None:
     origin.set("rpy", "0.3 -0.2 0.5")
     joint = read_arm(ElementTree.tostring(robot, encoding="unicode")).joints[1]
     assert np.allclose(joint.rotation, Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_quat())
+
+
+def test_no_elements_truth_value_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = urdf(RigParameters())
+    picture, solids, fixed = read_arm(text), solids_of(text), fixed_joints(text)
+
+    def parsed(text: str) -> ElementTree.Element:
+        builder = ElementTree.TreeBuilder(element_factory=UntestedElement)
+        return ElementTree.XML(text, parser=ElementTree.XMLParser(target=builder))
+
+    monkeypatch.setattr(ElementTree, "fromstring", parsed)
+    assert read_arm(text).solids == picture.solids != ()
+    assert len(solids_of(text)) == len(solids) > 0
+    assert len(fixed_joints(text)) == len(fixed)
+
+
+def test_a_visual_without_a_shape_is_no_solid() -> None:
+    robot = ElementTree.fromstring(urdf(RigParameters()))
+    solids = read_arm(ElementTree.tostring(robot, encoding="unicode")).solids
+    link = robot.find("link[visual]")
+    assert link is not None
+    ElementTree.SubElement(link, "visual")
+    ElementTree.SubElement(ElementTree.SubElement(link, "visual"), "geometry")
+    assert read_arm(ElementTree.tostring(robot, encoding="unicode")).solids == solids
 
 
 def test_the_outline_encloses_what_the_tool_reaches() -> None:

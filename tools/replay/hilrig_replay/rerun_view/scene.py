@@ -78,7 +78,7 @@ def read_arm(urdf: str) -> ArmPicture:
             (link.attrib["name"], number, shape.tag)
             for link in robot.iter("link")
             for number, visual in enumerate(link.findall("visual"))
-            for shape in visual.find("geometry") or ()
+            for shape in visual.iterfind("geometry/*")
             if shape.tag in ("box", "cylinder", "sphere")
         )
         return ArmPicture(urdf, root, tuple(_frames(joints[name]) for name in JOINT_NAMES), solids)
