@@ -16,9 +16,13 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
 FORBIDDEN: Final = {
-    r"\bwhat (is|was|has|are|were|had|came|comes|stands|goes|can|could|it|they|a|an|the|of|each|every|one|we)\b": "a noun",
+    r"\bwhat (is|was|has|are|were|had|came|comes|stands|goes|can|could|it|they|a|an|the|of|each|every|one|we)\b": (
+        "a noun"
+    ),
     r"\bwhoever\b|\bwho (is|are|was|has|have|does|do|may|must|can|comes?|goes|asks?|reads?|writes?|says?|sends?|"
-    r"holds?|listens?|looks?|hears?|waits?|wants?|takes?|runs?|serves?|sees?|uses?|keeps?|makes?|gets?)\b": "the client, process, …",
+    r"holds?|listens?|looks?|hears?|waits?|wants?|takes?|runs?|serves?|sees?|uses?|keeps?|makes?|gets?)\b": (
+        "the client, process, …"
+    ),
     r"\b(stands?|stood) (in|on|with|there|behind|beside|for)\b": "is in, is stored in",
     r"\b(has|have|had) come\b": "arrived, received",
     r"\btroubles?\b": "alert, error",
@@ -42,7 +46,9 @@ FORBIDDEN: Final = {
     r"\bthe way of\b|\bof the house\b": "data flow",
     r"\b(colour|centre|metre|millimetre|behaviour|neighbour|authoris|quantis|analys(e|es|ed|ing)\b|catalogue|grey\b|"
     r"synchronis|linearis|recognis|organis|initialis|normalis|minimis|maximis|optimis|serialis|discretis|summaris|"
-    r"acknowledgement|favour|honour|labelled|modelled|travelled|signalled|cancelled|towards|whilst|licence)": "American spelling",
+    r"acknowledgement|favour|honour|labelled|modelled|travelled|signalled|cancelled|towards|whilst|licence)": (
+        "American spelling"
+    ),
 }
 """Expression → what to write instead."""
 KINDS: Final = {".py", ".md", ".proto", ".js", ".html", ".css", ".toml", ".yaml", ".c", ".sh", ".st", ".cfg", ""}
@@ -51,6 +57,7 @@ _PATTERNS: Final = [(re.compile(pattern, re.IGNORECASE), instead) for pattern, i
 
 
 def main() -> int:
+    """Print each forbidden expression under the given path prefixes, and the counts on standard error."""
     names = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.splitlines()
