@@ -69,7 +69,7 @@ class Troubles:
         self._bus.subscribe(HEALTH.key(lab.name, "recorder", "*"), self._on_health)
 
     def _on_health(self, _key: str, payload: bytes) -> None:
-        self.heard.append(Health.FromString(payload).trouble)
+        self.heard.append(Health.FromString(payload).alert)
 
     def close(self) -> None:
         self._bus.close()

@@ -138,7 +138,7 @@ def test_the_teacher_sees_and_frees_a_lease() -> None:
         key = topics.LEASE.key(rig.lab.name, "rig1")
 
         def ask(release: bool = False) -> LeaseStatus:
-            [answer] = teacher.ask(key, LeaseRequest(release=release).SerializeToString())
+            [answer] = teacher.query(key, LeaseRequest(release=release).SerializeToString())
             return LeaseStatus.FromString(answer.payload)
 
         assert ask().holder == ""

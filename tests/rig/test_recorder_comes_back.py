@@ -27,7 +27,7 @@ BATCH = bytes(130_000)
 """What a tick of 500 rigs is on the record."""
 STEP_S = 0.02
 BEFORE = 400
-KEPT = 1_000
+CACHE_DEPTH = 1_000
 """Ample, also where the machine is busy: this is not about how far a cache reaches."""
 HELD_UP_S = 1.5
 READER = f"""
@@ -45,7 +45,7 @@ def on_message(key, payload):
         done.set()
 
 with ZenohBus(BusConfig(first_port=int(sys.argv[1])), "recorder") as bus:
-    bus.subscribe_recording("hil/lab/log/*/*", on_message, lost.append, {KEPT})
+    bus.subscribe_recording("hil/lab/log/*/*", on_message, lost.append, {CACHE_DEPTH})
     in_time = done.wait(30)
 print(in_time, numbers == list(range(len(numbers))), sum(lost))
 """
@@ -61,7 +61,7 @@ def test_what_is_fetched_from_a_cache_does_not_hold_its_publisher_up() -> None:
     puts_s: list[float] = []
     held_up_s: float | None = None
     with ZenohBus(BusConfig(first_port=port), "sim") as bus:
-        put = bus.publisher(KEY, Traffic.RECORDING, KEPT).put
+        put = bus.publisher(KEY, Traffic.RECORDING, CACHE_DEPTH).put
         for number in range(BEFORE):
             put(number.to_bytes(4, "big") + BATCH)
         with subprocess.Popen([sys.executable, "-c", READER, str(port)], stdout=subprocess.PIPE, text=True) as reader:

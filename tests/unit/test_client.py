@@ -4,12 +4,12 @@ import pytest
 
 from hilrig_cli import client as asking
 from hilrig_cli.client import check_rig
-from hilrig_runtime.bus.api import Answer
+from hilrig_runtime.bus.api import Reply
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import Roster
-from hilrig_schemas.topics import ROSTER
+from hilrig_schemas import ServiceInfo
+from hilrig_schemas.topics import SERVICE_INFO
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 
@@ -17,30 +17,32 @@ LAB = parse_lab("[rigs]\ncount = 3\n")
 class CountingBus(MemoryBus):
     """Knows how often it was asked; services that come later come before the second time."""
 
-    def __init__(self, *early: Roster, late: tuple[Roster, ...] = ()) -> None:
+    def __init__(self, *early: ServiceInfo, late: tuple[ServiceInfo, ...] = ()) -> None:
         super().__init__(MemoryHub())
         self.asked = 0
         self._late = late
         self._serve(early)
 
-    def _serve(self, rosters: tuple[Roster, ...]) -> None:
-        for one in rosters:
+    def _serve(self, infos: tuple[ServiceInfo, ...]) -> None:
+        for one in infos:
             answer = one.SerializeToString()
-            self.serve(ROSTER.key(LAB.name, one.service, one.instance), lambda _, answer=answer: answer)
+            self.declare_queryable(
+                SERVICE_INFO.key(LAB.name, one.service, one.instance), lambda _, answer=answer: answer
+            )
 
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         self.asked += 1
         if self.asked == 2:
             self._serve(self._late)
-        return super().ask(key_expr, payload, timeout_s=timeout_s)
+        return super().query(key_expr, payload, timeout_s=timeout_s)
 
 
-def roster(service: str, instance: str, *rigs: str) -> Roster:
-    return Roster(service=service, instance=instance, rigs=rigs)
+def info(service: str, instance: str, *rigs: str) -> ServiceInfo:
+    return ServiceInfo(service=service, instance=instance, rigs=rigs)
 
 
-SIM = roster("sim", "1", "rig1", "rig2", "rig3", "guest")
-FIRST, SECOND = roster("edge", "1", "rig1", "rig2"), roster("edge", "2", "rig3", "guest")
+SIM = info("sim", "1", "rig1", "rig2", "rig3", "guest")
+FIRST, SECOND = info("edge", "1", "rig1", "rig2"), info("edge", "2", "rig3", "guest")
 
 
 def test_a_rig_of_the_file_is_not_asked_for() -> None:
@@ -66,9 +68,9 @@ def test_once_every_rig_of_the_file_is_served_another_name_is_refused_at_once(
 
 
 @pytest.mark.parametrize("missing", [SIM, SECOND], ids=["sim", "edge"])
-def test_a_service_that_is_not_linked_yet_is_waited_for(missing: Roster) -> None:
-    there = [one for one in (roster("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
-    bus = CountingBus(*there, late=(missing, roster("edge", "3", "late")))
+def test_a_service_that_is_not_linked_yet_is_waited_for(missing: ServiceInfo) -> None:
+    there = [one for one in (info("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
+    bus = CountingBus(*there, late=(missing, info("edge", "3", "late")))
     check_rig(bus, LAB, "late")
     assert bus.asked == 2
 
@@ -88,6 +90,6 @@ def test_where_a_service_stays_away_it_is_said_what_is_waited_for(
 def test_of_many_rigs_some_are_named() -> None:
     lab = parse_lab("[rigs]\ncount = 128\n")
     rigs = [rig.name for rig in lab.rigs]
-    bus = CountingBus(roster("sim", "1", *rigs), roster("edge", "1", *rigs))
+    bus = CountingBus(info("sim", "1", *rigs), info("edge", "1", *rigs))
     with pytest.raises(InputError, match=r"rig1, .* and 112 more \(hilrig rig list\)$"):
         check_rig(bus, lab, "rig129")

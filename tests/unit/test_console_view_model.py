@@ -13,7 +13,7 @@ from hilrig_console.poses import Poses
 from hilrig_console.view_model import Frame, Page, Seen
 from hilrig_monitoring.lab_view import FORGOTTEN_S, SILENT_S, LabView
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
+from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, ServiceInfo
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_sim.parameters import rig_parameters
@@ -179,7 +179,7 @@ def page() -> Page:
     made.view.hear(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
     made.view.hear(Health(service="edge", instance="1", rig_reports=edge), 0.0)
     made.view.hear(Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 0.0)
-    made.know([Roster(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])])
+    made.know([ServiceInfo(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])])
     return made
 
 

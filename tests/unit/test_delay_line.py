@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hilrig_modbus_edge.impairment.delay_line import Line, StateWay
 from hilrig_modbus_edge.impairment.schedule import Course
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 MS = 1_000_000
 
@@ -67,7 +67,7 @@ def test_a_reader_sees_the_newest_state_that_has_arrived_and_never_an_older_one(
     way = StateWay(iter([(delay, lost) for _, delay, lost in messages]), None)
     starts = list(itertools.accumulate(gap for gap, _, _ in messages))
     for start, number in zip(starts, range(len(messages)), strict=True):
-        way.arrive(Arrival(bytes([number]), start))
+        way.arrive(TimestampedPayload(bytes([number]), start))
     seen = -1
     # What is read before all have come is no other case: a message is drawn for by its number.
     for now in sorted(looks):
@@ -88,13 +88,13 @@ def test_a_reader_sees_the_newest_state_that_has_arrived_and_never_an_older_one(
 
 
 def test_a_state_that_was_shown_stays_until_a_newer_one_has_arrived() -> None:
-    first = Arrival(b"first", 0)
+    first = TimestampedPayload(b"first", 0)
     way = StateWay(itertools.repeat((100, False)), first)
     assert way.newest(10) is first
-    way.arrive(Arrival(b"second", 20))
+    way.arrive(TimestampedPayload(b"second", 20))
     assert way.newest(119) is first
     second = way.newest(120)
-    assert second == Arrival(b"second", 20, 100)
+    assert second == TimestampedPayload(b"second", 20, 100)
     assert way.newest(500) is second
 
 
@@ -124,17 +124,17 @@ def scheduled() -> ImpairmentConfig:
 def test_a_schedule_runs_from_the_start_of_each_session() -> None:
     course = Course(scheduled())
     assert not course.check(10**12)
-    assert (course.ways, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
+    assert (course.links, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
     for start_ns in (5_000 * MS, 50_000 * MS):
         course.begin_session(start_ns)
         assert not course.check(start_ns + 499 * MS)
-        assert course.ways == PRESETS["mobile"]
+        assert course.links == PRESETS["mobile"]
         assert course.check(start_ns + 500 * MS)
-        assert (course.ways, course.source) == (PRESETS["vpn"], "schedule")
+        assert (course.links, course.source) == (PRESETS["vpn"], "schedule")
         assert not course.check(start_ns + 501 * MS)
         # A check that comes late goes straight to what holds by then.
         assert course.check(start_ns + 3_100 * MS)
-        assert course.ways.describe() == "state way constant delay 7 ms; command way none"
+        assert course.links.describe() == "state way constant delay 7 ms; command way none"
 
 
 def test_what_is_set_by_hand_holds_until_it_is_taken_back() -> None:
@@ -144,9 +144,9 @@ def test_what_is_set_by_hand_holds_until_it_is_taken_back() -> None:
     assert not course.check(600 * MS)
     course.begin_session(10_000 * MS)
     assert not course.check(11_000 * MS)
-    assert (course.ways, course.source, course.seed) == (PRESETS["wired"], "hand", 3)
+    assert (course.links, course.source, course.seed) == (PRESETS["wired"], "hand", 3)
     course.set_as_lab()
-    assert (course.ways, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
+    assert (course.links, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
     assert not course.check(12_000 * MS), "the schedule waits for the next session"
     course.begin_session(20_000 * MS)
     assert course.check(20_600 * MS)

@@ -7,7 +7,7 @@ import pytest
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.registers import map as registers
 from hilrig_modbus_edge.registers.map import Status, Table
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
 
@@ -576,7 +576,7 @@ def test_a_message_that_is_no_state_is_left_out(bench: Bench) -> None:
     client = bench.connect()
     before = bench.read(client, 4, 4)
     for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
-        bench.arrival = Arrival(payload, bench.clock.monotonic_ns())
+        bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
 
 

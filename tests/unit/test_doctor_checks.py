@@ -11,7 +11,7 @@ import pytest
 from hilrig_cli.doctor import Finding, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
 from hilrig_runtime.config.lab import LabConfig, parse_lab
-from hilrig_runtime.security.x509 import Identity, issue_client, issue_peer, issue_server, load, make_authority
+from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health
 from support.bus_certificates import HOSTS, NOW, make_bus_folder, write
@@ -43,7 +43,7 @@ def secured(folder: Path, more: str = "") -> LabConfig:
     return parse_lab(f'{more}\n[bus.tls]\nfolder = "{folder}"\n')
 
 
-def reissue(folder: Path, name: str, days: int, begin: datetime = NOW, signed: Identity | None = None) -> None:
+def reissue(folder: Path, name: str, days: int, begin: datetime = NOW, signed: Credential | None = None) -> None:
     authority = signed or load((folder / "ca.pem").read_bytes(), (folder / "ca.key").read_bytes())
     write(folder, name, issue_peer(authority, name, HOSTS, begin, days))
 
@@ -214,7 +214,7 @@ def test_a_service_that_is_missing_silent_or_in_trouble_is_named() -> None:
     del silent.healths["edge/1"]
     assert "edge/1 shows that it lives, but says nothing" in only_wrong(services.check_services(lab, silent))
     troubled = heard(*ALL)
-    troubled.healths["recorder/1"][0].trouble = "the disk is full"
+    troubled.healths["recorder/1"][0].alert = "the disk is full"
     assert "recorder/1: the disk is full" in only_wrong(services.check_services(lab, troubled))
     assert by_level(services.check_services(lab, heard()))[Level.NOTICE] == ["nothing of lab 'lab' runs"]
 

@@ -163,7 +163,7 @@ def test_whatever_happens_stages_hold_and_numbers_grow(preset: str, seed: int, s
         assert_stages_hold(command)
     status = bench.device.impaired.status()
     assert status.commands == 60
-    assert len(words_of(bench)) == status.commands - status.commands_lost - status.commands_overtaken
+    assert len(words_of(bench)) == status.commands - status.commands_lost - status.commands_superseded
 
 
 def test_the_same_seed_gives_the_same_delays_in_each_session() -> None:
@@ -198,7 +198,7 @@ def test_the_watchdogs_zero_is_not_held_up_and_voids_what_is_on_its_way() -> Non
     assert last.command_injected_ns == 0
     let_pass(bench, 3000)
     assert not words_of(bench), "the torque of a controller that is gone comes no more"
-    assert bench.device.impaired.status().commands_overtaken == 1
+    assert bench.device.impaired.status().commands_superseded == 1
 
 
 def test_a_controller_whose_words_are_all_lost_is_silent_to_the_watchdog() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from hilrig_modbus_edge.impairment.model import Impairment, way_seed
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 
 COUNT = 20_000
 DISTRIBUTIONS = {
@@ -24,7 +24,7 @@ DISTRIBUTIONS = {
 
 
 def drawn_ms(text: str, count: int = COUNT, seed: int = 1) -> np.ndarray:
-    delay_ns, lost = Impairment(WayImpairment.model_validate(text), seed).draw(count)
+    delay_ns, lost = Impairment(LinkImpairment.model_validate(text), seed).draw(count)
     assert delay_ns.dtype == np.int64
     assert not lost.any()
     return np.asarray(delay_ns / 1e6)
@@ -46,7 +46,7 @@ def test_a_delay_is_never_negative() -> None:
 
 def test_a_trace_goes_round_in_its_order() -> None:
     trace = [1.0, 2.0, 3.0, 50.0, 7.0]
-    way = WayImpairment.model_validate({"delay": {"kind": "trace", "delays_ms": trace}})
+    way = LinkImpairment.model_validate({"delay": {"kind": "trace", "delays_ms": trace}})
     starts = set()
     for seed in range(40):
         delays = (Impairment(way, seed).draw(3000)[0] / 1e6).tolist()
@@ -57,15 +57,15 @@ def test_a_trace_goes_round_in_its_order() -> None:
 
 
 def test_independent_losses_have_their_rate() -> None:
-    way = WayImpairment.model_validate({"loss": "bernoulli:0.03"})
+    way = LinkImpairment.model_validate({"loss": "bernoulli:0.03"})
     lost = Impairment(way, 5).draw(100_000)[1]
     assert stats.binomtest(int(lost.sum()), len(lost), 0.03).pvalue > 0.01
-    assert Impairment(WayImpairment.model_validate({"loss": "bernoulli:1"}), 5).draw(3000)[1].all()
+    assert Impairment(LinkImpairment.model_validate({"loss": "bernoulli:1"}), 5).draw(3000)[1].all()
 
 
 def test_losses_of_a_bad_channel_come_in_bursts_of_the_length_that_was_asked() -> None:
     """In the long run a share to_bad / (to_bad + to_good) is lost, in bursts that are geometric with 1/to_good."""
-    lost = Impairment(WayImpairment.model_validate({"loss": "gilbert:0.01,0.2"}), 5).draw(400_000)[1]
+    lost = Impairment(LinkImpairment.model_validate({"loss": "gilbert:0.01,0.2"}), 5).draw(400_000)[1]
     assert lost.mean() == pytest.approx(0.01 / 0.21, rel=0.05)
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     lengths = np.diff(edges)[(0 if lost[edges[0] + 1] else 1) :: 2]
@@ -78,13 +78,13 @@ def test_losses_of_a_bad_channel_come_in_bursts_of_the_length_that_was_asked() -
 
 
 def test_a_channel_begins_as_it_is_in_the_long_run() -> None:
-    way = WayImpairment.model_validate({"loss": "gilbert:0.05,0.2"})
+    way = LinkImpairment.model_validate({"loss": "gilbert:0.05,0.2"})
     first = [Impairment(way, seed).draw(1)[1][0] for seed in range(400)]
     assert stats.binomtest(sum(map(int, first)), len(first), 0.05 / 0.25).pvalue > 0.01
 
 
 def test_a_channel_may_lose_some_when_it_is_good_and_keep_some_when_it_is_bad() -> None:
-    lost = Impairment(WayImpairment.model_validate({"loss": "gilbert:0.1,0.3,0.6,0.05"}), 5).draw(200_000)[1]
+    lost = Impairment(LinkImpairment.model_validate({"loss": "gilbert:0.1,0.3,0.6,0.05"}), 5).draw(200_000)[1]
     assert lost.mean() == pytest.approx(0.25 * 0.6 + 0.75 * 0.05, rel=0.03)
 
 
@@ -97,7 +97,7 @@ def test_a_channel_may_lose_some_when_it_is_good_and_keep_some_when_it_is_bad() 
 def test_what_is_drawn_does_not_depend_on_how_it_is_asked_for(
     text: str, loss: str, pieces: list[int], seed: int
 ) -> None:
-    way = WayImpairment.model_validate({"delay": text, "loss": loss})
+    way = LinkImpairment.model_validate({"delay": text, "loss": loss})
     delays, losses = Impairment(way, seed).draw(sum(pieces))
     again = Impairment(way, seed)
     parts = [again.draw(count) for count in pieces]
@@ -108,13 +108,13 @@ def test_what_is_drawn_does_not_depend_on_how_it_is_asked_for(
 
 
 def test_the_loss_does_not_change_the_delays() -> None:
-    without = Impairment(WayImpairment.model_validate("gamma:20,8"), 3).draw(2000)[0]
-    lossy = WayImpairment.model_validate({"delay": "gamma:20,8", "loss": "bernoulli:0.5"})
+    without = Impairment(LinkImpairment.model_validate("gamma:20,8"), 3).draw(2000)[0]
+    lossy = LinkImpairment.model_validate({"delay": "gamma:20,8", "loss": "bernoulli:0.5"})
     assert Impairment(lossy, 3).draw(2000)[0].tolist() == without.tolist()
 
 
 def test_rigs_and_ways_have_streams_of_their_own() -> None:
-    way = WayImpairment.model_validate("uniform:0,10")
+    way = LinkImpairment.model_validate("uniform:0,10")
     streams = [
         Impairment(way, way_seed(seed, rig, name)).draw(4000)[0]
         for seed in (1, 2)

@@ -87,7 +87,7 @@ def test_a_silent_service_is_said_to_be_and_its_rigs_are_not_served_any_more() -
 
 def test_what_troubles_a_service_is_told() -> None:
     made = LabView()
-    made.hear(Health(service="recorder", instance="1", host="lab-pc", trouble="the disk is full"), 1.0)
+    made.hear(Health(service="recorder", instance="1", host="lab-pc", alert="the disk is full"), 1.0)
     assert made.troubles(1.0) == ["recorder/1 on lab-pc: the disk is full"]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hilrig_modbus_edge.impairment.model import Impairment
 from hilrig_modbus_edge.registers import codec
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_study.controllers.controllers import ComputedTorque, LawController, Measured, Pid
@@ -97,7 +97,7 @@ def test_constant_delays_give_the_pattern_that_theory_takes(
 @given(seed=st.integers(0, 10_000), jitter_ms=st.integers(1, 120), loss=st.floats(0, 0.5))
 def test_under_jitter_and_loss_the_newest_wins_and_nothing_is_early(seed: int, jitter_ms: int, loss: float) -> None:
     timing, ticks = LoopTiming(), 80
-    way = WayImpairment.model_validate({"delay": f"uniform:0,{jitter_ms}", "loss": f"bernoulli:{loss}"})
+    way = LinkImpairment.model_validate({"delay": f"uniform:0,{jitter_ms}", "loss": f"bernoulli:{loss}"})
     states, commands = Impairment(way, seed), Impairment(way, seed + 1)
     (state_ns, state_lost), (command_ns, command_lost) = states.draw(ticks), commands.draw(poll_count(timing, ticks))
     line = timeline(timing, ticks, state_ns, command_ns, state_lost, command_lost)
@@ -158,7 +158,7 @@ def test_a_loop_without_delay_takes_a_step_and_its_delay_is_rounded_up_to_ticks(
 
 
 def jittered(seed: int, ticks: int = 500, high_ms: int = 60) -> Timeline:
-    way = WayImpairment.model_validate(f"uniform:0,{high_ms}")
+    way = LinkImpairment.model_validate(f"uniform:0,{high_ms}")
     delay_ns, _ = Impairment(way, seed).draw(poll_count(LoopTiming(), ticks))
     return timeline(LoopTiming(), ticks, command_delay_ns=delay_ns)
 

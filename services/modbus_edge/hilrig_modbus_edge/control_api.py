@@ -15,7 +15,7 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import RigSettings, read_rig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest
 
@@ -43,7 +43,7 @@ def serve_on_loop(bus: Bus, key: str, loop: asyncio.AbstractEventLoop, answer: C
         loop.call_soon_threadsafe(_settle, done, partial(answer, payload))
         return done.result(ANSWER_TIMEOUT_S)
 
-    return bus.serve(key, ask)
+    return bus.declare_queryable(key, ask)
 
 
 def answer_lease(device: Device, payload: bytes) -> bytes:
@@ -66,8 +66,8 @@ def answer_impairment(device: Device, payload: bytes) -> bytes:
         try:
             device.impaired.set(ImpairmentConfig.model_validate_json(request.set_json))
         except ValidationError as error:
-            raise InputError("; ".join(mistakes_in(error))) from error
-    elif request.as_lab:
+            raise InputError("; ".join(format_validation_error(error))) from error
+    elif request.restore_lab:
         device.impaired.set(None)
     return device.impaired.status().SerializeToString()
 

@@ -16,7 +16,7 @@ from hilrig_modbus_edge.server.listener import RigServer, bind
 from hilrig_modbus_edge.server.tls import TlsPolicy
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings
-from hilrig_runtime.messaging.endpoints import Arrival, LatestOfBatches
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, RigReport, topics
 
@@ -27,9 +27,9 @@ class Wire:
     """A device's outlet: to the bus, to the log stream, and to the loop's timers."""
 
     def __init__(self, rig: str, service: Service, commands: Departures, sessions_changed: Callable[[], None]) -> None:
-        sender = service.sender(topics.COMMAND, rig, first=partial(commands.send, rig))
-        self.send_command = sender.send
-        self.repeat_command = sender.repeat
+        sender = service.rig_publisher(topics.COMMAND, rig, control_path=partial(commands.send, rig))
+        self.send_command = sender.publish
+        self.repeat_command = sender.republish
         self.emit: Callable[[Event], None] = service.emit
         self.sessions_changed = sessions_changed
         self.device: Device
@@ -55,7 +55,7 @@ class Wire:
             self._send_ns = deadline_ns
             asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """See `Outlet.follow_states`."""
         if self._states is not None:
             self._states.close()
@@ -63,7 +63,7 @@ class Wire:
         if arrive is not None:
             monotonic_ns = self._monotonic_ns
             self._states = self._bus.subscribe(
-                self._state_key, lambda _, payload: arrive(Arrival(payload, monotonic_ns()))
+                self._state_key, lambda _, payload: arrive(TimestampedPayload(payload, monotonic_ns()))
             )
 
     def _on_send(self) -> None:
@@ -86,7 +86,7 @@ class Seat:
         self,
         rig: RigSettings,
         service: Service,
-        states: LatestOfBatches,
+        states: LatestValueCache,
         commands: Departures,
         sessions_changed: Callable[[], None],
     ) -> None:
@@ -108,9 +108,9 @@ class Seat:
         self.closing = ExitStack()
         """What is closed with the seat."""
         self.address = ""
-        """Where it listens, for people. Kept, not asked of the sockets: the roster is answered on a thread of the bus,
-        also while the edge closes."""
-        self._traffic = service.sender(topics.TRAFFIC, rig.name)
+        """Where it listens, for people. Stored, not read from the sockets: the service info is served on a bus
+        thread, also while the edge closes."""
+        self._traffic = service.rig_publisher(topics.TRAFFIC, rig.name)
         self.traffic_due_ns = 0
         """When the requests that were noted are to be sent, ns, monotonic clock."""
         self._sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
@@ -172,4 +172,4 @@ class Seat:
 
     def _send_traffic(self) -> None:
         clock = self._clock
-        self._traffic.send(self._server.traffic.take(clock.monotonic_ns(), clock.wall_ns()))
+        self._traffic.publish(self._server.traffic.take(clock.monotonic_ns(), clock.wall_ns()))

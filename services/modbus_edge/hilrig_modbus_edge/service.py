@@ -17,7 +17,7 @@ from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Tick
-from hilrig_runtime.timing.realtime import freeze_garbage
+from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_schemas import topics
 
 TICK_NS: Final = 20_000_000
@@ -51,7 +51,7 @@ class Edge:
     def __init__(self, service: Service, loop: DirectLoop) -> None:
         self._service = service
         self._loop = loop
-        self._states = service.latest_of_batches(topics.STATES)
+        self._states = service.latest_value_cache(topics.STATES)
         self._commands = Departures(
             service.source,
             service.publisher(topics.COMMANDS).put,
@@ -87,7 +87,7 @@ class Edge:
                     seat.bind(ports[rig], tls_ports.get(rig))
             except OperationError:
                 # Who has the port may be another edge of the lab, with which the bus was not linked yet.
-                service.look_for_elders()
+                service.check_instance_conflict()
                 raise
             self._state_sessions()
             for seat in self._seats.values():
@@ -99,7 +99,7 @@ class Edge:
             await self._first_states()
             for seat in self._seats.values():
                 await seat.listen()
-            freeze_garbage()
+            freeze_gc()
             service.ready()
             await self._tick()
         finally:
@@ -188,7 +188,7 @@ class Edge:
     def _state_sessions(self) -> None:
         """Tell the log stream which sessions are open."""
         sessions = [session for seat in self._seats.values() if (session := seat.device.session) is not None]
-        self._service.log.set_sessions([session.as_message() for session in sessions])
+        self._service.recording_stream.set_sessions([session.as_message() for session in sessions])
 
     # -- time
 
@@ -233,4 +233,4 @@ class Edge:
             seat.shut("the edge stops")
         self._commands.flush()
         self._state_sessions()
-        self._service.log.flush(self._service.clock.monotonic_ns())
+        self._service.recording_stream.flush(self._service.clock.monotonic_ns())

@@ -108,7 +108,7 @@ class Recorder:
             service.clock,
             self._disk,
             instance=service.instance,
-            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _REPEATED_LATE_NS,
+            repeated_ns=service.batch_cache_depth * FLUSH_PERIOD_NS + _REPEATED_LATE_NS,
             tell=self._tell,
             ask_config=self._ask_config,
             give_up=self._give_up,
@@ -122,9 +122,11 @@ class Recorder:
         parts = [part for part in unfinished(self._files.folder) if share.has(part.parent.name)]
         self._restore(parts)
         self._stream = service.bus.subscribe_recording(
-            LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss, service.batches_kept
+            LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss, service.batch_cache_depth
         )
-        self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
+        self._control = service.bus.declare_queryable(
+            CONTROL.key(lab.name, service.name, service.instance), self._answer
+        )
         service.health.rig_reports = self._rig_reports
         self._housekeeping = Housekeeping(self._files.folder, parts, config, service.clock, self._troubles.put)
 
@@ -144,7 +146,7 @@ class Recorder:
         """Record until the service is told to stop, then what was sent before that."""
         service, clock = self._service, self._clock
         due_ns = clock.monotonic_ns()
-        service.log.set_sessions(self._by_hand.sessions)
+        service.recording_stream.set_sessions(self._by_hand.sessions)
         service.ready()
         while not service.stopping.is_set():
             due_ns = self._turn(due_ns)
@@ -205,7 +207,7 @@ class Recorder:
         counters.recordings = len(book.recordings)
         counters.rigs = len({recording.rig for recording in book.recordings})
         counters.bytes_written = self._files.bytes_written
-        counters.trouble = self._files.trouble
+        counters.alert = self._files.trouble
         self._service.beat(now_ns)
 
     def _rig_reports(self) -> list[RigReport]:
@@ -248,7 +250,7 @@ class Recorder:
             else:
                 raise OperationError("a request that the recorder does not know")
             self._service.emit(request.answer)
-            self._service.log.set_sessions(self._by_hand.sessions)
+            self._service.recording_stream.set_sessions(self._by_hand.sessions)
         except HilrigError as error:
             request.refusal = str(error)
         request.done.set()
@@ -266,7 +268,7 @@ class Recorder:
         config = None
         try:
             key = CONFIG.key(self._service.lab.name, rig)
-            for answer in self._service.bus.ask(key, timeout_s=_CONFIG_TIMEOUT_S):
+            for answer in self._service.bus.query(key, timeout_s=_CONFIG_TIMEOUT_S):
                 if not answer.error:
                     config = CONFIG.decode(answer.payload)
         except (DecodeError, OperationError) as error:

@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.arm.model import RigParameters
@@ -42,7 +42,7 @@ class Constant:
 class Membership:
     """Answers for each rig what it is, and changes which there are; a context manager."""
 
-    def __init__(self, service: Service, simulation: Simulation, turns: Turns) -> None:
+    def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
         self._service = service
         self._simulation = simulation
         self._turns = turns
@@ -51,7 +51,7 @@ class Membership:
             self._serve(rig.name, parameters)
             self._tell(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
-        self._control = service.bus.serve(key, self._answer)
+        self._control = service.bus.declare_queryable(key, self._answer)
         service.counters.rigs = len(service.rigs)
 
     def __enter__(self) -> Self:
@@ -67,7 +67,7 @@ class Membership:
     def _serve(self, rig: str, parameters: RigParameters) -> None:
         answer = Constant(configuration(self._service, rig, parameters).SerializeToString())
         key = topics.CONFIG.key(self._service.lab.name, rig)
-        self._served[rig] = self._service.bus.serve(key, answer)
+        self._served[rig] = self._service.bus.declare_queryable(key, answer)
 
     def _tell(self, rig: str, parameters: RigParameters) -> None:
         """Say that a simulation begins, and how it steps; a session that was going on records where it was replaced."""
@@ -83,7 +83,7 @@ class Membership:
             request = Event.FromString(payload)
         except DecodeError as error:
             raise OperationError("a request that can't be decoded") from error
-        with self._turns.alone:
+        with self._turns.exclusive:
             if request.kind == Event.RIG_ADDED:
                 text = self._add(read_rig(request.configuration_data.text))
             elif request.kind == Event.RIG_REMOVED:

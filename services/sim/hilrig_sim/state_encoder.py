@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState, PartState, RigReport
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import CommandFollower, StepTimes
@@ -70,7 +70,7 @@ class RigState:
         self.follower = CommandFollower(incarnation, command_timeout_ns)
         self.encoded = b""
         """The state but for what the tick adds: its stamps, and the latency of the loop; empty: not known yet."""
-        self.arrival: Arrival | None = None
+        self.arrival: TimestampedPayload | None = None
         """The command with which it was encoded."""
         self.basis_step = 0
         """Step to which the command answers that takes effect; 0: none does, or its step is not known."""
@@ -102,7 +102,7 @@ class RigState:
         self._motion, self._limit_flags = motion, limit_flags
         self.encoded = b""
 
-    def follow(self, arrival: Arrival | None, now_ns: int) -> None:
+    def follow(self, arrival: TimestampedPayload | None, now_ns: int) -> None:
         """Take the newest command, for the coming tick; again, if a newer one comes before it."""
         self.arrival = arrival
         self.encoded = b""

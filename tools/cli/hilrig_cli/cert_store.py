@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.security.x509 import Identity, load, make_authority, names_in
+from hilrig_runtime.security.x509 import Credential, load, make_authority, names_in
 
 AUTHORITY: Final = "ca"
 RENEWED_BEFORE: Final = timedelta(days=30)
@@ -34,7 +34,7 @@ class CertificateFolder:
         except OSError as error:
             raise OperationError(f"{folder}: can't be made: {error.strerror}") from error
 
-    def authority(self, name: str) -> Identity:
+    def authority(self, name: str) -> Credential:
         """The folder's authority; a new one, called `name`, where there is none.
 
         Raises:
@@ -72,7 +72,7 @@ class CertificateFolder:
         before = names_in(identity.certificate) if identity is not None else set()
         return [*hosts, *sorted(before - set(hosts))]
 
-    def write(self, name: str, identity: Identity) -> None:
+    def write(self, name: str, identity: Credential) -> None:
         """Write a certificate, and its key for its owner's eyes alone."""
         for suffix, data, mode in ((".pem", identity.certificate_pem, 0o644), (".key", identity.key_pem, 0o600)):
             path = self._folder / f"{name}{suffix}"
@@ -83,7 +83,7 @@ class CertificateFolder:
                 raise OperationError(f"{path}: can't be written: {error.strerror}") from error
             self.written.append(path)
 
-    def _read(self, name: str) -> Identity | None:
+    def _read(self, name: str) -> Credential | None:
         files = [self._folder / f"{name}{suffix}" for suffix in (".pem", ".key")]
         if not all(path.exists() for path in files):
             return None

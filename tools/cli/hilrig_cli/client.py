@@ -11,8 +11,8 @@ from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.discovery import rosters
-from hilrig_schemas import Roster
+from hilrig_runtime.process.discovery import list_services
+from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -41,8 +41,8 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
             check_rig(bus, lab, rig)
         else:
             # Else the first edge that answers would be taken for all.
-            all_rosters(bus, lab, {"edge"})
-        while not (answers := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
+            list_all_services(bus, lab, {"edge"})
+        while not (answers := bus.query(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
             time.sleep(0.05)
     for answer in answers:
         if answer.error:
@@ -54,14 +54,14 @@ def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Mes
     return [topic.decode(by_rig[rig]) for rig in sorted(by_rig, key=lambda rig: (places.get(rig, len(places)), rig))]
 
 
-def all_rosters(bus: Bus, lab: LabConfig, services: Set[str]) -> list[Roster]:
+def list_all_services(bus: Bus, lab: LabConfig, services: Set[str]) -> list[ServiceInfo]:
     """What the services of a lab say of themselves; waits `ANSWER_WITHIN_S` for those kinds of them, if it must."""
     deadline_s = time.monotonic() + ANSWER_WITHIN_S
-    found: list[Roster] = []
+    found: list[ServiceInfo] = []
     # A link to each has to be made first: what one look finds and the next one too is all that there is.
     while time.monotonic() < deadline_s:
-        before, found = found, rosters(bus, lab.name)
-        if services <= {roster.service for roster in found} and len(found) == len(before):
+        before, found = found, list_services(bus, lab.name)
+        if services <= {info.service for info in found} and len(found) == len(before):
             break
         time.sleep(0.05)
     return found
@@ -78,12 +78,12 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         return
     begun_s, told = time.monotonic(), False
     while True:
-        found = rosters(bus, lab.name)
-        if any(rig in roster.rigs for roster in found):
+        found = list_services(bus, lab.name)
+        if any(rig in info.rigs for info in found):
             return
         waited_s = time.monotonic() - begun_s
         if _all_heard(found, in_file) or waited_s > ANSWER_WITHIN_S:
-            added = {name for roster in found if roster.service in SERVING for name in roster.rigs}
+            added = {name for info in found if info.service in SERVING for name in info.rigs}
             raise lab.no_such_rig(rig, sorted(added))
         if waited_s > PATIENCE_S and not told:
             told = True
@@ -95,13 +95,12 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         time.sleep(0.05)
 
 
-def _all_heard(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
+def _all_heard(found: Sequence[ServiceInfo], in_file: Sequence[str]) -> bool:
     """Whether every service that can have a rig has answered.
 
     Each simulation and each edge begins with rigs of the lab's file, and one has a rig that another does not: once all
     of those are served, nobody is missing. (One that lost all of those rigs is known by the other kind of service.)
     """
     return all(
-        set(in_file) <= {rig for roster in found if roster.service == service for rig in roster.rigs}
-        for service in SERVING
+        set(in_file) <= {rig for info in found if info.service == service for rig in info.rigs} for service in SERVING
     )

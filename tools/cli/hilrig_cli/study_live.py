@@ -14,7 +14,14 @@ from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import POLL_S, running_lab
 from hilrig_cli.local.supervisor import Supervisor
 from hilrig_replay.io.run import Run, open_run
-from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment, Ways
+from hilrig_runtime.config.impairment import (
+    BernoulliLoss,
+    ConstantDelay,
+    LinkImpairment,
+    LinkImpairments,
+    NoLoss,
+    UniformDelay,
+)
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_study.live.live_loop import RigClient, drive, listen_for_ticks
@@ -44,7 +51,7 @@ def run_live_points(study: StudyConfig, folder: Path, out: Path, say: Callable[[
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
         mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        _write_lab(config, study, step_ms, {f"point{i + 1}": _ways(study, cells[i]) for i in mine}, recordings)
+        _write_lab(config, study, step_ms, {f"point{i + 1}": _links(study, cells[i]) for i in mine}, recordings)
         lab = load_lab(config)
         with running_lab(lab, config, say, threading.Event()) as supervisor:
             for index in mine:
@@ -60,26 +67,28 @@ def _said(point: PointConfig, controller: str, run: Run) -> dict[str, Any]:
     return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
-def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
+def _links(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
     """What is injected at a point.
 
     Raises:
         InputError: the study's own impairment and what the sweep adds are both on the command's way.
     """
-    base = study.ways(int(cell["controller"][0]))
+    base = study.links(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base
-    if not base.command.does_nothing:
+    if not base.command.is_inactive:
         raise InputError("a live point can't add to a command's way that is impaired already: leave one of them out")
     delay = (
         UniformDelay(low_ms=delay_ms, high_ms=delay_ms + jitter_ms) if jitter_ms else ConstantDelay(delay_ms=delay_ms)
     )
-    way = WayImpairment(delay=delay, loss=BernoulliLoss(rate=loss) if loss else NoLoss())
+    way = LinkImpairment(delay=delay, loss=BernoulliLoss(rate=loss) if loss else NoLoss())
     return base.model_copy(update={"command": way})
 
 
-def _write_lab(config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[str, Ways], recordings: Path) -> None:
+def _write_lab(
+    config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[str, LinkImpairments], recordings: Path
+) -> None:
     made = study.lab(step_ms)
     ports = free_ports(5020, len(rigs) + 1)
     lines = [
@@ -92,8 +101,8 @@ def _write_lab(config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[s
         f"scene = {_toml({'trays': [], 'parts': []})}",
     ]
     arm = _toml(made.rigs[0].arm.model_dump())
-    for name, ways in {CLOCK: Ways(), **rigs}.items():
-        impairment = {"seed": study.seed, **ways.model_dump()}
+    for name, links in {CLOCK: LinkImpairments(), **rigs}.items():
+        impairment = {"seed": study.seed, **links.model_dump()}
         lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {_toml(impairment)}"]
     try:
         config.write_text("\n".join(lines) + "\n", encoding="utf-8")

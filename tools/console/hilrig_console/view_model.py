@@ -13,7 +13,7 @@ from typing import Any
 from hilrig_console.events import EventLog
 from hilrig_console.poses import Poses
 from hilrig_monitoring.lab_view import LabView
-from hilrig_schemas import Roster
+from hilrig_schemas import ServiceInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +65,13 @@ class Page:
         """Say why the bus can't be read; empty: it can."""
         self._trouble = trouble
 
-    def know(self, rosters: list[Roster]) -> None:
+    def know(self, infos: list[ServiceInfo]) -> None:
         """Take where the rigs are reached, as the edges say."""
         self._addresses = {
             rig: address
-            for roster in rosters
-            if roster.service == "edge"
-            for rig, address in zip(roster.rigs, roster.addresses, strict=False)
+            for info in infos
+            if info.service == "edge"
+            for rig, address in zip(info.rigs, info.addresses, strict=False)
         }
 
     def has_newcomers(self, now_s: float) -> bool:

@@ -141,8 +141,8 @@ class LabView:
             health = service.health
             if self.is_silent(service, now_s):
                 told.append(f"{service.name} on {health.host}: silent for {now_s - service.heard_s:.0f} s")
-            elif health.trouble:
-                told.append(f"{service.name} on {health.host}: {health.trouble}")
+            elif health.alert:
+                told.append(f"{service.name} on {health.host}: {health.alert}")
         return told
 
     def as_dict(self, now_s: float) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def _service_row(service: ServiceView, silent: bool) -> dict[str, Any]:
         "clock_offset_ms": health.clock_offset_ns / 1e6,
         "clock_uncertainty_ms": health.clock_uncertainty_ns / 1e6,
         "clock_peer": health.clock_peer,
-        "trouble": health.trouble,
+        "trouble": health.alert,
     }
 
 

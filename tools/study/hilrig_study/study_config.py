@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from hilrig_runtime.config.impairment import ImpairmentSetting, Ways
+from hilrig_runtime.config.impairment import ImpairmentSetting, LinkImpairments
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_NAMES, RigParameters
 from hilrig_sim.parameters import rig_parameters
@@ -280,12 +280,12 @@ class StudyConfig(Section):
                 rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),),
             )
         except ValidationError as error:
-            raise InputError("; ".join(mistakes_in(error))) from error
+            raise InputError("; ".join(format_validation_error(error))) from error
 
-    def ways(self, controller: int) -> Ways:
+    def links(self, controller: int) -> LinkImpairments:
         """What is on a controller's ways before the sweep adds to the command's."""
         own = self.controllers[controller].impairment
-        return (self.impairment if own is None else own).ways
+        return (self.impairment if own is None else own).links
 
     def near(self) -> LinearPlant:
         """The arm near the task's pose.
@@ -319,7 +319,7 @@ def load_study(path: Path) -> StudyConfig:
     try:
         study = StudyConfig.model_validate(values)
     except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes_in(error))) from error
+        raise InputError("\n".join(f"{path}: {mistake}" for mistake in format_validation_error(error))) from error
     study.near()
     study.loop.timing()
     return study

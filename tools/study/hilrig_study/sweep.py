@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_modbus_edge.impairment.model import Impairment
-from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
-from hilrig_runtime.process.process_pool import all_cores
+from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, LinkImpairment, NoLoss, UniformDelay
+from hilrig_runtime.process.process_pool import process_pool
 from hilrig_study.simulation.plants import ArmPlant, LinearArms, StudyPlant
 from hilrig_study.simulation.simulated_loop import Outcome, simulate
 from hilrig_study.simulation.timing import LoopTiming, Timeline, poll_count, timeline
@@ -163,24 +163,24 @@ def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDAr
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
     """The timeline of each cell's run, all of one controller; runs whose times are the same share one."""
-    ways = study.ways(int(cells["controller"][0]))
+    links = study.links(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
     known: dict[tuple[float, ...], Timeline] = {}
     lines = []
     for cell in cells:
         delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
-        random = jitter_ms > 0 or loss > 0 or not ways.do_nothing
+        random = jitter_ms > 0 or loss > 0 or not links.is_inactive
         # A run's draws depend on the study's seed and its number alone: cells beside each other meet the same luck.
         key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
         if key not in known:
             seed = np.random.SeedSequence(study.seed, spawn_key=(int(cell["run"]),))
             states, commands, added = (np.random.SeedSequence(s.entropy, spawn_key=s.spawn_key) for s in seed.spawn(3))
-            more = WayImpairment(
+            more = LinkImpairment(
                 delay=UniformDelay(low_ms=0, high_ms=jitter_ms) if jitter_ms else ConstantDelay(),
                 loss=BernoulliLoss(rate=loss) if loss else NoLoss(),
             )
-            state_ns, state_lost = Impairment(ways.state, states).draw(ticks)
-            command_ns, command_lost = Impairment(ways.command, commands).draw(polls)
+            state_ns, state_lost = Impairment(links.state, states).draw(ticks)
+            command_ns, command_lost = Impairment(links.command, commands).draw(polls)
             more_ns, more_lost = Impairment(more, added).draw(polls)
             known[key] = timeline(
                 timing, ticks, state_ns, command_ns + more_ns + delay_ns, state_lost, command_lost | more_lost
@@ -214,7 +214,7 @@ def sweep(
     found: list[GainTheory] = []
     constant = _constant(study, cells)
     total, done = len(parts) * 20 + len(asked), 0
-    with all_cores(len(parts) + len(asked), workers) as executor:
+    with process_pool(len(parts) + len(asked), workers) as executor:
         batches: dict[Future[NDArray[np.void]], NDArray[np.intp]] = {
             executor.submit(_results_of, study, cells[rows], folder): rows for rows in parts
         }
@@ -243,7 +243,7 @@ def sweep(
 
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
     """Where nothing is random."""
-    nothing = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
+    nothing = np.array([study.links(number).is_inactive for number in range(len(study.controllers))])
     return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & nothing[cells["controller"]])
 
 
@@ -273,7 +273,7 @@ def _mean_square_until(study: StudyConfig, asked: _Asked) -> float:
     controller, gain, step_ms, poll_ms = asked
     config, axes = study.controllers[controller], (study.x, study.y)
     others = [axis for axis in axes if axis.what in ("delay_ms", "jitter_ms", "loss")]
-    drawn = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
+    drawn = not study.links(controller).is_inactive or any(axis.what != "delay_ms" for axis in others)
     predicts = config.kind == "lqr" and config.compensate
     if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not drawn or predicts or poll_ms != step_ms:
         return math.nan

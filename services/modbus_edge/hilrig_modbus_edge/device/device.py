@@ -23,7 +23,7 @@ from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.registers import map as registers
 from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_modbus_edge.registers.map import PAPER_END, POSITION, Status, Table
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
 
@@ -42,7 +42,7 @@ class Device:
         settings: DeviceSettings,
         clock: Clock,
         outlet: Outlet,
-        newest_state: Callable[[], Arrival | None],
+        newest_state: Callable[[], TimestampedPayload | None],
         letters: random.Random | None = None,
     ) -> None:
         self.rig = rig

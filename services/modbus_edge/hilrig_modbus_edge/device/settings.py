@@ -6,7 +6,7 @@ from typing import Final, Protocol
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import EdgeConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, TorqueCommand
 
 MS: Final = 1_000_000
@@ -34,7 +34,7 @@ class Outlet(Protocol):
     def send_at(self, deadline_ns: int) -> None:
         """A command is on an impaired way: `send_due` must be called at the deadline, and not much later."""
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """Call `arrive` with every state that comes, on any thread; None: no more."""
 
 

@@ -13,7 +13,7 @@ from hilrig_modbus_edge.impairment.delay_line import StateWay
 from hilrig_modbus_edge.impairment.model import Impairment, way_seed
 from hilrig_modbus_edge.impairment.schedule import Course
 from hilrig_runtime.config.impairment import ImpairmentConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, ImpairmentStatus
 
@@ -29,7 +29,7 @@ class ImpairedLoop:
         outlet: Outlet,
         commander: Commander,
         journal: Journal,
-        newest_state: Callable[[], Arrival | None],
+        newest_state: Callable[[], TimestampedPayload | None],
     ) -> None:
         self.newest_state = newest_state
         """The newest state that has come to the end of its way; None: none has yet."""
@@ -44,15 +44,15 @@ class ImpairedLoop:
 
     def begin(self) -> None:
         """Bring into force what the lab says."""
-        if not self._course.ways.do_nothing:
+        if not self._course.links.is_inactive:
             self._bring_into_force()
 
     def begin_session(self) -> None:
         """A session began: its schedule and its delays begin anew, and its recording is told of them."""
-        now_ns, before = self._monotonic_ns(), self._course.ways
+        now_ns, before = self._monotonic_ns(), self._course.links
         self._course.begin_session(now_ns)
         self._course.check(now_ns)
-        if self._course.ways != before or not before.do_nothing:
+        if self._course.links != before or not before.is_inactive:
             self._bring_into_force()
 
     def set(self, config: ImpairmentConfig | None) -> None:
@@ -76,34 +76,34 @@ class ImpairedLoop:
         course = self._course
         status = ImpairmentStatus(
             rig=self._rig,
-            text=course.ways.describe(),
-            ways_json=course.ways.model_dump_json(),
+            text=course.links.describe(),
+            links_json=course.links.model_dump_json(),
             seed=course.seed,
             source=course.source,
         )
         if self._state_way is not None:
             line = self._state_way.line
-            status.states, status.states_lost, status.states_overtaken = line.count, line.lost, line.overtaken
+            status.states, status.states_lost, status.states_superseded = line.count, line.lost, line.overtaken
         way = self._commander.way
         if way is not None:
-            status.commands, status.commands_lost, status.commands_overtaken = way.count, way.lost, way.overtaken
+            status.commands, status.commands_lost, status.commands_superseded = way.count, way.lost, way.overtaken
         return status
 
     def _bring_into_force(self) -> None:
         course = self._course
-        ways, seed = course.ways, course.seed
-        if ways.state.does_nothing:
+        links, seed = course.links, course.seed
+        if links.state.is_inactive:
             self._free_state_way()
         else:
-            self._impair_states(Impairment(ways.state, way_seed(seed, self._rig, "state")))
+            self._impair_states(Impairment(links.state, way_seed(seed, self._rig, "state")))
         fates = None
-        if not ways.command.does_nothing:
-            fates = Impairment(ways.command, way_seed(seed, self._rig, "command")).each()
+        if not links.command.is_inactive:
+            fates = Impairment(links.command, way_seed(seed, self._rig, "command")).each()
         self._commander.impair(fates)
-        seeded = "" if ways.do_nothing else f", seed {seed}"
-        text = f"impairment of {self._rig}: {ways.describe()}{seeded} (by {course.source})"
+        seeded = "" if links.is_inactive else f", seed {seed}"
+        text = f"impairment of {self._rig}: {links.describe()}{seeded} (by {course.source})"
         event = self._journal.event(Event.IMPAIRMENT_CHANGED, Event.INFO, text)
-        event.configuration_data.text = ways.model_dump_json()
+        event.configuration_data.text = links.model_dump_json()
         self._journal.tell(event)
 
     def _impair_states(self, impairment: Impairment) -> None:

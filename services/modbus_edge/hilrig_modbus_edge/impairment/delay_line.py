@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 T = TypeVar("T")
 Fates = Iterator[tuple[int, bool]]
@@ -86,14 +86,14 @@ class Line(Generic[T]):
 class StateWay:
     """The states of one rig on their way to the controller: looked at when a register is read, so without timers."""
 
-    def __init__(self, fates: Fates, shown: Arrival | None) -> None:
-        self.line: Line[Arrival] = Line(fates)
+    def __init__(self, fates: Fates, shown: TimestampedPayload | None) -> None:
+        self.line: Line[TimestampedPayload] = Line(fates)
         self._shown = shown
-        self._arrivals: deque[Arrival] = deque()
+        self._arrivals: deque[TimestampedPayload] = deque()
         self.arrive = self._arrivals.append
         """A state came to the edge; called on the bus's thread."""
 
-    def newest(self, now_ns: int) -> Arrival | None:
+    def newest(self, now_ns: int) -> TimestampedPayload | None:
         """The newest state that has come to the end of its way; the same object until the next one has."""
         line, arrivals = self.line, self._arrivals
         while arrivals:

@@ -19,11 +19,11 @@ from hilrig_runtime.config.impairment import (
     ExponentialDelay,
     GammaDelay,
     GilbertElliottLoss,
+    LinkImpairment,
     Loss,
     NormalDelay,
     TraceDelay,
     UniformDelay,
-    WayImpairment,
 )
 
 BLOCK: Final = 1024
@@ -41,7 +41,7 @@ def way_seed(seed: int, rig: str, way: Literal["state", "command"]) -> np.random
 class Impairment:
     """The fates of the messages on one way, one after the other."""
 
-    def __init__(self, config: WayImpairment, seed: int | np.random.SeedSequence) -> None:
+    def __init__(self, config: LinkImpairment, seed: int | np.random.SeedSequence) -> None:
         # Delay and loss have a stream each: changing the loss leaves the delays as they are.
         root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         streams = [np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, part)) for part in range(2)]

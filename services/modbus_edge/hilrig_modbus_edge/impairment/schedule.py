@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, Ways
+from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, LinkImpairments
 
 Source = Literal["lab.toml", "schedule", "hand"]
 
@@ -19,9 +19,9 @@ class Course:
         self._next = 0
 
     @property
-    def ways(self) -> Ways:
+    def links(self) -> LinkImpairments:
         """What is in force."""
-        return self._setting.ways
+        return self._setting.links
 
     @property
     def seed(self) -> int:

@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError
 from hilrig_modbus_edge.device.client import NO_BASIS, Basis
 from hilrig_modbus_edge.registers import codec
 from hilrig_modbus_edge.registers.map import MAP_VERSION, Status
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState
 
 FRESH_NS: Final = 1_000_000_000
@@ -24,7 +24,7 @@ class StateImage:
     """The newest state in register form."""
 
     def __init__(self) -> None:
-        self.arrival: Arrival | None = None
+        self.arrival: TimestampedPayload | None = None
         """What it was made from; None: no state has come yet, and all else is zero."""
         self.arrived_ns = 0
         self.step = 0
@@ -36,7 +36,7 @@ class StateImage:
         self._latency_us = 0
         self._floats = b""
 
-    def take(self, arrival: Arrival) -> None:
+    def take(self, arrival: TimestampedPayload) -> None:
         """Make the image of a state that came; a message that is none is left out."""
         try:
             message = JointState.FromString(arrival.payload)

@@ -24,8 +24,8 @@ from hilrig_modbus_edge.request_log import TrafficRecord
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.event_loop import DirectLoop, DirectTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsGate, TlsPolicy
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.health import Counters
 from hilrig_runtime.timing.clock import Clock
 
 BUFFER_BYTES: Final = 2048

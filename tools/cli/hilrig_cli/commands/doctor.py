@@ -112,8 +112,8 @@ def _one_service(lab: "LabConfig", service: str, instance: str) -> "list[Finding
         return [good(service, "it answers")]
     for name, (health, _) in heard.healths.items():
         if is_one(name, wanted):
-            if health.trouble:
-                return [wrong(service, health.trouble, "see its log")]
+            if health.alert:
+                return [wrong(service, health.alert, "see its log")]
             return [good(service, f"{name} is well, {health.uptime_ns / 1e9:.0f} s after it started")]
     return [wrong(service, f"no {wanted} says how it is", "see its log, or start it again")]
 

@@ -41,7 +41,7 @@ def play(
     stopping = threading.Event()
     stop_on_signals(stopping)
     with _bus(lab, name) as bus:
-        bus.serve(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
+        bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
         played = play_on(bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name)
     print(f"played {played} messages of {opened.session} as {name} in lab {lab.name}", file=sys.stderr)
 
@@ -61,7 +61,7 @@ def _bus(lab: "LabConfig", rig: str) -> "Bus":
                 "a --config whose bus.first_port is another"
             ) from error
     with ZenohBus(lab.bus, "tool") as asking:
-        if asking.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
+        if asking.query(CONFIG.key(lab.name, rig), timeout_s=0.5):
             raise OperationError(f"rig {rig} runs in lab {lab.name}: play it as another with --rig")
     # On a secured bus nobody else may say states.
     return ZenohBus(lab.bus, "sim")

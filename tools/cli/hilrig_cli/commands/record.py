@@ -42,7 +42,7 @@ def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
 
 
 def _ask(config: "Path | None", request: "Event") -> "Event":
-    from hilrig_cli.client import all_rosters, check_rig
+    from hilrig_cli.client import check_rig, list_all_services
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
@@ -50,7 +50,7 @@ def _ask(config: "Path | None", request: "Event") -> "Event":
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "tool") as bus:
-        recorders = [one for one in all_rosters(bus, lab, {"recorder"}) if one.service == "recorder"]
+        recorders = [one for one in list_all_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
             raise OperationError(
                 f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
@@ -59,7 +59,7 @@ def _ask(config: "Path | None", request: "Event") -> "Event":
         has = next((one for one in recorders if request.rig in one.rigs), None)
         has = has or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
         key = CONTROL.key(lab.name, has.service, has.instance)
-        for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
+        for answer in bus.query(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
             if answer.error:
                 # A recorder knows of rigs that were taken away: it is asked first, and a name that is none told after.
                 check_rig(bus, lab, request.rig)

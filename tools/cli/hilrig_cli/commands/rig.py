@@ -11,7 +11,7 @@ from hilrig_cli.options import AsJson, Config, config_for_commands
 if TYPE_CHECKING:
     from hilrig_runtime.bus.api import Bus
     from hilrig_runtime.config.lab import LabConfig, RigSettings
-    from hilrig_schemas import Event, Roster
+    from hilrig_schemas import Event, ServiceInfo
 
 app = typer.Typer(
     help="See which rigs a running lab has; add, take away or reset one.",
@@ -33,7 +33,7 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        rows = _rows(lab, _rosters(bus, lab))
+        rows = _rows(lab, _list_services(bus, lab))
     if as_json:
         print(json.dumps(rows))
         return
@@ -70,10 +70,10 @@ def add(
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        rosters = _rosters(bus, lab)
-        new = _settings(rosters, rig, port, settings)
-        simulation = _least_loaded(rosters, "sim", lab)
-        edge = _least_loaded(rosters, "edge", lab)
+        infos = _list_services(bus, lab)
+        new = _settings(infos, rig, port, settings)
+        simulation = _least_loaded(infos, "sim", lab)
+        edge = _least_loaded(infos, "edge", lab)
         request = Event(kind=Event.RIG_ADDED, rig=rig)
         request.configuration_data.text = new.model_dump_json()
         _ask(bus, lab, simulation, request)
@@ -97,13 +97,13 @@ def remove(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        owners = [roster for roster in _rosters(bus, lab) if rig in roster.rigs and roster.service in SERVING]
+        owners = [info for info in _list_services(bus, lab) if rig in info.rigs and info.service in SERVING]
         if not owners:
             check_rig(bus, lab, rig)
             raise OperationError(f"no running service has {rig}: hilrig rig list shows those that there are")
         # The edge first: its last word is that there is no torque.
-        for roster in sorted(owners, key=lambda roster: roster.service):
-            print(_ask(bus, lab, roster, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
+        for info in sorted(owners, key=lambda info: info.service):
+            print(_ask(bus, lab, info, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
 
 
 @app.command()
@@ -117,45 +117,45 @@ def reset(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        for roster in _rosters(bus, lab):
-            if roster.service == "edge" and rig in roster.rigs:
-                print(_ask(bus, lab, roster, Event(kind=Event.RESET, rig=rig)).text)
+        for info in _list_services(bus, lab):
+            if info.service == "edge" and rig in info.rigs:
+                print(_ask(bus, lab, info, Event(kind=Event.RESET, rig=rig)).text)
                 return
         check_rig(bus, lab, rig)
     raise OperationError(f"no edge serves {rig}: hilrig rig list shows those that there are")
 
 
-def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
-    from hilrig_cli.client import all_rosters
+def _list_services(bus: "Bus", lab: "LabConfig") -> "list[ServiceInfo]":
+    from hilrig_cli.client import list_all_services
     from hilrig_runtime.errors import OperationError
 
-    found = all_rosters(bus, lab, {"sim", "edge"})
+    found = list_all_services(bus, lab, {"sim", "edge"})
     if not found:
         raise OperationError(f"nothing is heard of lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
     return found
 
 
-def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
+def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
     in_file = [rig.name for rig in lab.rigs]
-    names = dict.fromkeys([*in_file, *(rig for roster in rosters if roster.service == "edge" for rig in roster.rigs)])
+    names = dict.fromkeys([*in_file, *(rig for info in infos if info.service == "edge" for rig in info.rigs)])
     rows = []
     for name in names:
         row: dict[str, Any] = {"rig": name, "in_file": name in in_file, "address": "", "sim": "", "edge": ""}
-        for roster in rosters:
-            if name in roster.rigs and roster.service in row:
-                row[roster.service] = f"{roster.instance} on {roster.host}"
-                row["address"] = row["address"] or roster.addresses[list(roster.rigs).index(name)]
+        for info in infos:
+            if name in info.rigs and info.service in row:
+                row[info.service] = f"{info.instance} on {info.host}"
+                row["address"] = row["address"] or info.addresses[list(info.rigs).index(name)]
         rows.append(row)
     return rows
 
 
-def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
+def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
     import tomllib
 
     from hilrig_runtime.config.lab import read_lab_text, read_rig
     from hilrig_runtime.errors import InputError
 
-    if any(rig in roster.rigs for roster in rosters if roster.service in ("sim", "edge")):
+    if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
         raise InputError(f"the lab has a rig called {rig!r} already")
     try:
         said = {} if settings is None else tomllib.loads(read_lab_text(settings))
@@ -166,24 +166,24 @@ def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Pat
     return read_rig(json.dumps(said | {"name": rig}))
 
 
-def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "Roster":
+def _least_loaded(infos: "list[ServiceInfo]", service: str, lab: "LabConfig") -> "ServiceInfo":
     from hilrig_runtime.errors import OperationError
 
-    able = [roster for roster in rosters if roster.service == service]
+    able = [info for info in infos if info.service == service]
     if not able:
         raise OperationError(f"no {service} of lab {lab.name!r} is heard: is it running?")
-    return min(able, key=lambda roster: len(roster.rigs))
+    return min(able, key=lambda info: len(info.rigs))
 
 
-def _ask(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
+def _ask(bus: "Bus", lab: "LabConfig", info: "ServiceInfo", request: "Event") -> "Event":
     from hilrig_cli.client import ANSWER_WITHIN_S
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import Event, topics
 
-    key = topics.CONTROL.key(lab.name, roster.service, roster.instance)
-    answers = bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_WITHIN_S)
+    key = topics.CONTROL.key(lab.name, info.service, info.instance)
+    answers = bus.query(key, request.SerializeToString(), timeout_s=ANSWER_WITHIN_S)
     if not answers:
-        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} does not answer")
+        raise OperationError(f"{info.service}/{info.instance} on {info.host} does not answer")
     if answers[0].error:
-        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} refused: {answers[0].error}")
+        raise OperationError(f"{info.service}/{info.instance} on {info.host} refused: {answers[0].error}")
     return Event.FromString(answers[0].payload)

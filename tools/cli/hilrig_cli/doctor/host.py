@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from hilrig_cli.doctor import Finding, good, notice, wrong
 from hilrig_cli.local.local_lab import why_not_free
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
 OWN_FILES = 200
 """Handles that a service needs beside its connections."""
@@ -82,7 +82,7 @@ def check_open_files(lab: LabConfig) -> Iterator[Finding]:
 
 def check_punctuality(lab: LabConfig) -> Iterator[Finding]:
     """A sleep ends in time, as far as that shows in a moment; `hilrig jitter` looks longer."""
-    prefer_latency()
+    set_short_slice()
     lates = []
     for _ in range(SLEEPS):
         deadline_ns = time.monotonic_ns() + 1_000_000

@@ -67,7 +67,7 @@ def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S
     with (
         ZenohBus(lab.bus, identity) as bus,
         bus.subscribe(HEALTH.key(lab.name, "*", "*"), on_health),
-        bus.watch(alive_key(lab.name, "*", "*"), on_alive),
+        bus.subscribe_liveliness(alive_key(lab.name, "*", "*"), on_alive),
     ):
         deadline_s = time.monotonic() + for_s
         while time.monotonic() < deadline_s:
@@ -109,8 +109,8 @@ def check_services(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
     if not missing and not silent:
         yield good("services", f"{', '.join(sorted(heard.alive))} live")
     for name, (health, _) in sorted(heard.healths.items()):
-        if health.trouble:
-            yield wrong("services", f"{name}: {health.trouble}", "see what it says, and its log")
+        if health.alert:
+            yield wrong("services", f"{name}: {health.alert}", "see what it says, and its log")
         if health.lost_transport or health.lost_recorder:
             lost = health.lost_transport + health.lost_recorder
             yield notice("services", f"{name}: {lost} messages lost since it started", "see the sizing in the docs")

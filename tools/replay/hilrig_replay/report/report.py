@@ -22,7 +22,7 @@ from hilrig_replay.report.html_figures import picture
 from hilrig_replay.rerun_view.scene import parameters_of
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.process.process_pool import all_cores
+from hilrig_runtime.process.process_pool import process_pool
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 _GRAVE: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
@@ -169,7 +169,7 @@ def _pages(
     if workers == 1 or len(paths) < _WORTH_PROCESSES:
         yield from map(_page_or_reason, *tasks)
     else:
-        with all_cores(len(paths), workers) as executor:
+        with process_pool(len(paths), workers) as executor:
             yield from executor.map(_page_or_reason, *tasks)
 
 

@@ -127,7 +127,7 @@ class Follower:
             self._view.draw(drawn)
 
     def _ask(self) -> Drawn | None:
-        for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_ASK_S):
+        for answer in self._bus.query(CONFIG.key(self._lab, self._rig), timeout_s=_ASK_S):
             if answer.payload and not answer.error:
                 config = CONFIG.decode(answer.payload)
                 return Drawn.of(config.urdf, config.parameters_json, config.step_ns, self._task)
