@@ -61,7 +61,7 @@ class Protocol(asyncio.BufferedProtocol):
         self.paused = False
         self.lost: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
 
-    def get_buffer(self, sizehint: int) -> bytearray:
+    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002
         return self.buffer
 
     def buffer_updated(self, nbytes: int) -> None:
