@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hilrig_recorder.mcap_format.channels import encode_message, file_descriptor_set
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.export.urdf_geometry import Solid, fixed_joints, solids_of
 from hilrig_replay.io.columns import Names, Rows
@@ -123,7 +123,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
             summary = reader.get_summary()
             if summary is None:
                 raise InputError(f"{run.path}: has no index; `hilrig recover` makes one")
-            writer = RunWriter(path, part=draft, schemas=(), channels=(), library="hilrig export")
+            writer = RecordingWriter(path, temporary_path=draft, schemas=(), channels=(), library="hilrig export")
             try:
                 drawing = _Drawing(writer, run, arm, solids, max(summary.schemas, default=0), max(summary.channels))
                 for schema in summary.schemas.values():
@@ -139,7 +139,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
                     )
                 _copy(run, writer, drawing, {channel.topic: channel.id for channel in summary.channels.values()})
                 writer.finish()
-                if writer.given_up:
+                if writer.dropped_count:
                     raise OperationError(f"{path}: can't be written: no space is left for it")
                 writer.publish()
             except BaseException:
@@ -150,7 +150,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
     return path
 
 
-def _copy(run: Run, writer: RunWriter, drawing: "_Drawing", channel_ids: dict[str, int]) -> None:
+def _copy(run: Run, writer: RecordingWriter, drawing: "_Drawing", channel_ids: dict[str, int]) -> None:
     messages = run.file.messages(ALL)
     while block := list(islice(messages, BLOCK_ROWS)):
         drawing.expect(block)
@@ -167,7 +167,13 @@ class _Drawing:
     """What is added to the messages, as they go by in the order of the file."""
 
     def __init__(
-        self, writer: RunWriter, run: Run, arm: ArmPicture, solids: list[Solid], last_schema: int, last_channel: int
+        self,
+        writer: RecordingWriter,
+        run: Run,
+        arm: ArmPicture,
+        solids: list[Solid],
+        last_schema: int,
+        last_channel: int,
     ) -> None:
         self._writer = writer
         self._arm = arm
