@@ -97,9 +97,7 @@ class Follower:
             try:
                 self._decoder.add(topic, payload, 0, arrived_ns)
             except DecodeError:
-                self._log(
-                    f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig"
-                )
+                self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
         records = self._decoder.take()
         # Only states count: the edge keeps repeating its command after the simulation has stopped.
         if len(records.states):
