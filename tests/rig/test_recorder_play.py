@@ -1,4 +1,4 @@
-"""`hilrig play` on the real bus: subscribers receive a recording like a running rig."""
+"""`hilrig play` on the zenoh bus: tools receive a played recording like a running rig."""
 
 import signal
 import subprocess
@@ -17,7 +17,7 @@ from support.waiting import eventually
 
 
 @pytest.mark.rig
-def test_played_recording_looks_like_a_running_rig(tmp_path: Path) -> None:
+def test_played_recording_is_received_like_a_running_rig(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path)
     made = recordings.make(recordings.Script(seconds=2))
     path = recordings.write(tmp_path / "run.mcap", made, script=recordings.Script(seconds=2))
@@ -31,11 +31,11 @@ def test_played_recording_looks_like_a_running_rig(tmp_path: Path) -> None:
             assert RigConfig.FromString(answers[0].payload).urdf
             eventually(lambda: len(received) > 80)
         player.send_signal(signal.SIGINT)
-        _, output = player.communicate(timeout=10)
+        _, errors = player.communicate(timeout=10)
     finally:
         player.kill()
     assert player.returncode == 0
-    assert "played" in output
+    assert "played" in errors
     states = [JointState.FromString(payload) for _, payload in received]
     assert {state.rig for state in states} == {"rig7"}
     # 50 states per second, as recorded.
@@ -44,7 +44,7 @@ def test_played_recording_looks_like_a_running_rig(tmp_path: Path) -> None:
 
 
 @pytest.mark.rig
-def test_play_is_refused_while_a_lab_runs(tmp_path: Path) -> None:
+def test_play_is_rejected_while_a_lab_runs(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path)
     path = recordings.record(tmp_path / "run.mcap", recordings.Script(seconds=1))
     with sending(lab, ["rig1"]) as senders:
