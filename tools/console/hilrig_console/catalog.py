@@ -64,9 +64,9 @@ class Reporter:
             InputError: the recording can't be reported.
         """
         # Each report has a process of its own, which loads what draws only then.
-        from hilrig_replay.report.report import report
+        from hilrig_replay.report.report import build_report
 
-        page.write_text(report([recording]).html, encoding="utf-8")
+        page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
 class Shelf:
