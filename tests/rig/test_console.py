@@ -19,9 +19,9 @@ from typing import Any
 
 import pytest
 
-from hilrig_console.app import BROWSERS
-from hilrig_console.auth import Guard
-from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
+from hilrig_console.app import MAX_BROWSERS
+from hilrig_console.auth import AccessPolicy
+from hilrig_console.serving import Address, ConsoleServer, TlsFiles, check_health
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.errors import OperationError
 from support.browser import CHROMIUM, Browser
@@ -283,7 +283,7 @@ def test_there_are_only_so_many_places_and_who_leaves_makes_room(beside: Beside)
 
     try:
         eventually(is_full, every_s=0)
-        assert len(crowd) > BROWSERS
+        assert len(crowd) > MAX_BROWSERS
     finally:
         for connection in crowd:
             connection.close()
@@ -373,7 +373,7 @@ def test_with_a_certificate_it_speaks_https(tmp_path: Path) -> None:
     authority = make_bus_folder(tmp_path / "certs", ["console"])
     trusting = ssl.create_default_context(cadata=authority.certificate_pem.decode())
     tls = TlsFiles(tmp_path / "certs/console.pem", tmp_path / "certs/console.key")
-    with ConsoleServer(load_lab(write_lab(tmp_path)), Address.of("127.0.0.1:0"), Guard(), tls) as server:
+    with ConsoleServer(load_lab(write_lab(tmp_path)), Address.of("127.0.0.1:0"), AccessPolicy(), tls) as server:
         assert server.url.startswith("https://127.0.0.1:")
         address = Address.of(server.url.removeprefix("https://").rstrip("/"))
         eventually(lambda: answers(address, tls))
@@ -384,7 +384,7 @@ def test_with_a_certificate_it_speaks_https(tmp_path: Path) -> None:
 
 def answers(address: Address, tls: TlsFiles | None) -> bool:
     try:
-        ask_health(address, tls)
+        check_health(address, tls)
     except OperationError:
         return False
     return True

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from hilrig_cli.commands.console import console
-from hilrig_console.auth import Guard, is_loopback, own_names
+from hilrig_console.auth import AccessPolicy, host_name_set, is_loopback
 from hilrig_console.serving import Address
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 
-GUARD = Guard(names=own_names(["Lab-PC", "", "wall.example."]))
+POLICY = AccessPolicy(names=host_name_set(["Lab-PC", "", "wall.example."]))
 
 
 @pytest.mark.parametrize(
@@ -28,14 +28,14 @@ GUARD = Guard(names=own_names(["Lab-PC", "", "wall.example."]))
     ],
 )
 def test_addresses_and_own_names_are_ours(host: str) -> None:
-    assert GUARD.is_ours(host)
+    assert POLICY.allows_host(host)
 
 
 @pytest.mark.parametrize(
     "host", ["", "evil.example", "evil.example:8050", "127.0.0.1.evil.example", "localhost.evil.example", "[evil]:80"]
 )
 def test_a_name_that_somebody_else_leads_here_is_not(host: str) -> None:
-    assert not GUARD.is_ours(host)
+    assert not POLICY.allows_host(host)
 
 
 def basic(text: str) -> str:
@@ -43,13 +43,13 @@ def basic(text: str) -> str:
 
 
 def test_whoever_has_the_password_is_known_whatever_his_name() -> None:
-    guard = Guard(password="sésame ouvre-toi")
-    assert guard.knows(basic("teacher:sésame ouvre-toi"))
-    assert guard.knows(basic(":sésame ouvre-toi"))
+    policy = AccessPolicy(password="sésame ouvre-toi")
+    assert policy.knows(basic("teacher:sésame ouvre-toi"))
+    assert policy.knows(basic(":sésame ouvre-toi"))
     for wrong in ("", "Basic", "Basic !!!", "Basic é", basic("sésame ouvre-toi"), basic("a:sésame"), "Bearer x"):
-        assert not guard.knows(wrong), wrong
-    assert not guard.knows(basic("a:sésame ouvre-toi").replace("Basic", "Bearer"))
-    assert Guard().knows("")
+        assert not policy.knows(wrong), wrong
+    assert not policy.knows(basic("a:sésame ouvre-toi").replace("Basic", "Bearer"))
+    assert AccessPolicy().knows("")
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_whoever_has_the_password_is_known_whatever_his_name() -> None:
 )
 def test_where_to_listen(text: str, host: str, port: int, private: bool) -> None:
     address = Address.of(text)
-    assert (address.host, address.port, address.is_private) == (host, port, private)
+    assert (address.host, address.port, address.is_loopback) == (host, port, private)
 
 
 @pytest.mark.parametrize("text", ["8050", "127.0.0.1", "127.0.0.1:web", "127.0.0.1:70000", "a:²"])

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilrig_console.arm_picture import AT_STOP, HOLDS, MAGNET, pose_of, scene_of
-from hilrig_console.events import KEPT, EventLog
-from hilrig_console.poses import Poses
-from hilrig_console.view_model import Frame, Page, Seen
+from hilrig_console.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, pose_of, scene_of
+from hilrig_console.events import MAX_EVENTS, EventBuffer
+from hilrig_console.poses import PoseCache
+from hilrig_console.view_model import ClientState, Frame, ViewModel
 from hilrig_monitoring.lab_view import FORGOTTEN_S, SILENT_S, LabView
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
@@ -34,8 +34,8 @@ def config(parameters: RigParameters = RIG) -> RigConfig:
     return RigConfig(parameters_json=parameters.to_json())
 
 
-def poses(*rigs: str, now_s: float = 0.0) -> Poses:
-    made = Poses()
+def poses(*rigs: str, now_s: float = 0.0) -> PoseCache:
+    made = PoseCache()
     made.hear([batch(**dict.fromkeys(rigs, state()))], now_s)
     for rig in rigs:
         made.learn(rig, config())
@@ -54,8 +54,12 @@ def test_a_pose_has_the_tool_where_the_kinematics_have_it(joints: tuple[float, .
 def test_flags_tell_of_magnet_part_and_stop() -> None:
     shown = pose_of(ArmParameters(), state(magnet=True, held_part="red", limit_flags=1))
     assert shown is not None
-    assert shown[5] == MAGNET | HOLDS | AT_STOP
-    for said, flag in (({"magnet": True}, MAGNET), ({"held_part": "red"}, HOLDS), ({"limit_flags": 256}, AT_STOP)):
+    assert shown[5] == MAGNET_ON | HOLDS_PART | AT_STOP
+    for said, flag in (
+        ({"magnet": True}, MAGNET_ON),
+        ({"held_part": "red"}, HOLDS_PART),
+        ({"limit_flags": 256}, AT_STOP),
+    ):
         one = pose_of(ArmParameters(), state(**said))
         assert one is not None
         assert one[5] == flag
@@ -72,7 +76,7 @@ def test_a_scene_has_the_parts_in_the_order_of_the_states() -> None:
 
 
 def test_a_rig_is_drawn_when_it_is_known_what_it_looks_like() -> None:
-    made = Poses()
+    made = PoseCache()
     made.hear([batch(rig1=state())], 0.0)
     assert made.unknown() == ["rig1"]
     assert made.drawn(0.0) == {}
@@ -86,7 +90,7 @@ def test_a_rig_is_drawn_when_it_is_known_what_it_looks_like() -> None:
 
 
 def test_an_answer_that_is_not_understood_is_not_asked_for_again() -> None:
-    made = Poses()
+    made = PoseCache()
     made.hear([batch(rig1=state())], 0.0)
     made.learn("rig1", RigConfig(parameters_json="{}"))
     assert made.unknown() == []
@@ -138,19 +142,19 @@ def test_a_rig_that_is_silent_is_drawn_no_more_and_garbage_changes_nothing() -> 
 
 
 def test_events_are_numbered_and_old_ones_are_dropped() -> None:
-    log = EventLog(1000)
-    for number in range(KEPT + 5):
+    log = EventBuffer(1000)
+    for number in range(MAX_EVENTS + 5):
         log.hear(Event(rig="rig1", kind=Event.LIMIT_HIT, severity=Event.WARNING, text=f"{number}").SerializeToString())
     log.hear(b"\xff no event")
     kept = log.all()
-    assert len(kept) == KEPT
-    assert [number for number, _ in kept] == list(range(1006, 1006 + KEPT))
+    assert len(kept) == MAX_EVENTS
+    assert [number for number, _ in kept] == list(range(1006, 1006 + MAX_EVENTS))
     last = json.loads(kept[-1][1])
-    assert (last["id"], last["kind"], last["severity"]) == (1000 + KEPT + 5, "limit_hit", "warning")
+    assert (last["id"], last["kind"], last["severity"]) == (1000 + MAX_EVENTS + 5, "limit_hit", "warning")
 
 
 def test_a_kind_of_event_that_is_newer_than_this_version_is_shown_by_its_number() -> None:
-    log = EventLog(0)
+    log = EventBuffer(0)
     event = Event(text="x" * 10_000)
     event.kind = 99  # type: ignore[assignment]
     log.hear(event.SerializeToString())
@@ -160,20 +164,20 @@ def test_a_kind_of_event_that_is_newer_than_this_version_is_shown_by_its_number(
 
 def test_a_browser_gets_what_is_new_to_it_and_a_slow_one_misses_no_event() -> None:
     first = Frame("{1}", "{a}", ((5, "e5"),))
-    text, seen = first.news(Seen())
+    text, seen = first.news(ClientState())
     assert text == "event: lab\ndata: {1}\n\nevent: event\nid: 5\ndata: e5\n\nevent: poses\ndata: {a}\n\n"
     assert first.news(seen) == ("", seen)
     later = Frame("{3}", "{a}", ((5, "e5"), (6, "e6"), (7, "e7")))
     text, seen = later.news(seen)
     assert text == "event: lab\ndata: {3}\n\nevent: event\nid: 6\ndata: e6\n\nevent: event\nid: 7\ndata: e7\n\n"
     assert seen.event == 7
-    returned, _ = later.news(Seen(event=6))
+    returned, _ = later.news(ClientState(event=6))
     assert "id: 6" not in returned
     assert "id: 7" in returned
 
 
-def page() -> Page:
-    made = Page("lab", ("rig1", "rig2"), 0)
+def page() -> ViewModel:
+    made = ViewModel("lab", ("rig1", "rig2"), 0)
     sim = [RigReport(rig="rig1", loop_us=[20_000, 30_000]), RigReport(rig="rig2", safe=True)]
     edge = [RigReport(rig="rig1", controller="192.0.2.7:9", session="s"), RigReport(rig="rig2")]
     made.view.hear(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
@@ -199,7 +203,7 @@ def test_the_page_has_each_rig_with_its_address_session_loop_and_tick() -> None:
 
 
 def test_without_a_lab_the_page_says_so_and_why() -> None:
-    made = Page("lab", ("rig1",), 0)
+    made = ViewModel("lab", ("rig1",), 0)
     made.link("no zenoh router answers")
     lab = json.loads(made.frame(0.0, {}).lab)
     assert (lab["services"], lab["link"]) == ([], "no zenoh router answers")
@@ -215,7 +219,7 @@ def test_the_lab_is_told_once_a_second() -> None:
 
 
 def test_a_page_hears_of_a_lab_in_which_nothing_happens() -> None:
-    made, seen = Page("lab", (), 0), Seen()
+    made, seen = ViewModel("lab", (), 0), ClientState()
     for second in range(3):
         text, seen = made.frame(float(second), {}).news(seen)
         assert text.startswith("event: lab\n")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from hilrig_console import worker as worker_module
-from hilrig_console.catalog import Librarian, Shelf
+from hilrig_console.catalog import ListWorker, RecordingCatalog
 from hilrig_console.worker import Worker
 from hilrig_runtime.errors import InputError, OperationError
 from support.recordings import Script, record
@@ -104,22 +104,22 @@ def test_a_worker_that_is_closed_while_it_starts_ends_too(monkeypatch: pytest.Mo
 
 
 def test_only_what_is_listed_and_still_there_is_given_out(tmp_path: Path) -> None:
-    with Shelf(tmp_path) as shelf:
+    with RecordingCatalog(tmp_path) as catalog:
         path = record(tmp_path / "run.mcap", Script(seconds=0.5))
         with pytest.raises(InputError, match=r"no recording 'run\.mcap' is listed"):
-            shelf.file("run.mcap")
-        shelf.look()
-        assert shelf.version == 1
-        assert (shelf.file("run.mcap"), shelf.listed("")["total"]) == (path, 1)
-        assert [shelf.listed(words)["found"] for words in ("RUN", "run nobody's")] == [1, 0]
+            catalog.file("run.mcap")
+        catalog.refresh()
+        assert catalog.version == 1
+        assert (catalog.file("run.mcap"), catalog.search("")["total"]) == (path, 1)
+        assert [catalog.search(words)["found"] for words in ("RUN", "run nobody's")] == [1, 0]
         path.unlink()
         with pytest.raises(InputError):
-            shelf.file("run.mcap")
+            catalog.file("run.mcap")
         for other in ("../run.mcap", str(path), "", "."):
             with pytest.raises(InputError):
-                shelf.file(other)
+                catalog.file(other)
 
 
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
-        Librarian(tmp_path / "none").entries()
+        ListWorker(tmp_path / "none").entries()

@@ -19,15 +19,15 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, Guard, Guarded
-from hilrig_console.catalog import Shelf
-from hilrig_console.subscriber import Feed
-from hilrig_console.view_model import Frame, Seen
+from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, AccessPolicy, AuthMiddleware
+from hilrig_console.catalog import RecordingCatalog
+from hilrig_console.subscriber import LabSubscriber
+from hilrig_console.view_model import ClientState, Frame
 from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 0.2
 """Between frames."""
-BROWSERS: Final = 64
+MAX_BROWSERS: Final = 64
 """That follow the lab at once."""
 FILES: Final = Path(__file__).with_name("static")
 PAGE_FILES: Final = ("console.css", "console.js", "icon.svg")
@@ -58,7 +58,7 @@ class Broadcast:
 
     async def stream(self, event: int) -> AsyncIterator[str]:
         """What one browser gets that has seen the events up to a number."""
-        seen = Seen(event=event)
+        seen = ClientState(event=event)
         self.browsers += 1
         try:
             while not self.closed:
@@ -73,9 +73,9 @@ class Broadcast:
 class Console:
     """The pages of one lab."""
 
-    def __init__(self, feed: Feed, shelf: Shelf, guard: Guard) -> None:
-        self._feed = feed
-        self._shelf = shelf
+    def __init__(self, subscriber: LabSubscriber, catalog: RecordingCatalog, policy: AccessPolicy) -> None:
+        self._subscriber = subscriber
+        self._catalog = catalog
         self._page = (FILES / "index.html").read_text(encoding="utf-8")
         self.broadcast: Broadcast | None = None
         routes = [
@@ -89,7 +89,7 @@ class Console:
             *(Route(f"/{name}", self._file) for name in PAGE_FILES),
         ]
         app = Starlette(routes=routes, lifespan=self._life, exception_handlers={HilrigError: _sorry})  # type: ignore[dict-item]
-        self.app: ASGIApp = Guarded(app, guard)
+        self.app: ASGIApp = AuthMiddleware(app, policy)
 
     @asynccontextmanager
     async def _life(self, app: Starlette) -> AsyncIterator[None]:
@@ -103,12 +103,12 @@ class Console:
             await asyncio.gather(*tasks)
 
     def _frame(self) -> Frame:
-        return self._feed.frame({"runs": self._shelf.version})
+        return self._subscriber.frame({"runs": self._catalog.version})
 
     async def _look(self) -> None:
         """Keep the list of recordings fresh while somebody looks."""
         if self._stream.browsers:
-            await asyncio.to_thread(self._shelf.look)
+            await asyncio.to_thread(self._catalog.refresh)
 
     @property
     def _stream(self) -> Broadcast:
@@ -127,25 +127,25 @@ class Console:
         return PlainTextResponse("well\n")
 
     async def _live(self, request: Request) -> Response:
-        if self._stream.browsers >= BROWSERS:
-            return PlainTextResponse(f"{BROWSERS} browsers look already\n", HTTPStatus.SERVICE_UNAVAILABLE)
+        if self._stream.browsers >= MAX_BROWSERS:
+            return PlainTextResponse(f"{MAX_BROWSERS} browsers look already\n", HTTPStatus.SERVICE_UNAVAILABLE)
         last = request.headers.get("last-event-id", "")
         stream = self._stream.stream(int(last) if last.isascii() and last.isdigit() else 0)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
     async def _scenes(self, request: Request) -> Response:
         del request
-        return JSONResponse(self._feed.scenes())
+        return JSONResponse(self._subscriber.scenes())
 
     async def _runs(self, request: Request) -> Response:
-        return JSONResponse(self._shelf.listed(request.query_params.get("words", "")))
+        return JSONResponse(self._catalog.search(request.query_params.get("words", "")))
 
     async def _recording(self, request: Request) -> Response:
-        file = self._shelf.file(request.path_params["path"])
+        file = self._catalog.file(request.path_params["path"])
         return FileResponse(file, filename=file.name, media_type="application/octet-stream")
 
     async def _report(self, request: Request) -> Response:
-        page = await asyncio.to_thread(self._shelf.report, request.path_params["path"])
+        page = await asyncio.to_thread(self._catalog.report, request.path_params["path"])
         text = await asyncio.to_thread(page.read_text, "utf-8")
         return HTMLResponse(text, headers={"Content-Security-Policy": REPORT_POLICY})
 

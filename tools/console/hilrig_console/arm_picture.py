@@ -10,9 +10,9 @@ from hilrig_replay.rerun_view.scene import Floats, reach_outline
 from hilrig_schemas import JointState
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 
-MAGNET: Final = 1
+MAGNET_ON: Final = 1
 """Bits of a pose's flags: the magnet is on."""
-HOLDS: Final = 2
+HOLDS_PART: Final = 2
 """The magnet holds a part."""
 AT_STOP: Final = 4
 """A joint is on its stop, or the tool on what lies below."""
@@ -64,7 +64,11 @@ def pose_of(arm: ArmParameters, state: JointState) -> Pose | None:
         return None
     elbow_x, elbow_y = arm.l2 * math.cos(theta1), arm.l2 * math.sin(theta1)
     x, y = elbow_x + arm.l3 * math.cos(theta1 + theta2), elbow_y + arm.l3 * math.sin(theta1 + theta2)
-    flags = (MAGNET if state.magnet else 0) | (HOLDS if state.held_part else 0) | (AT_STOP if state.limit_flags else 0)
+    flags = (
+        (MAGNET_ON if state.magnet else 0)
+        | (HOLDS_PART if state.held_part else 0)
+        | (AT_STOP if state.limit_flags else 0)
+    )
     return [_mm(elbow_x), _mm(elbow_y), _mm(x), _mm(y), _mm(arm.l1 - d3), flags]
 
 

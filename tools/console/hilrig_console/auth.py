@@ -17,10 +17,10 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from hilrig_console.login_throttle import Patience
+from hilrig_console.login_throttle import LoginThrottle
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 
-SHORTEST_PASSWORD: Final = 8
+MIN_PASSWORD_CHARS: Final = 8
 PAGE_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -42,7 +42,7 @@ HEALTH_PATH: Final = "/health"
 
 
 @dataclass(frozen=True, slots=True)
-class Guard:
+class AccessPolicy:
     """Whom a console answers."""
 
     password: str = ""
@@ -50,7 +50,7 @@ class Guard:
     names: frozenset[str] = frozenset()
     """Names of this host, beside `localhost` and every address."""
 
-    def is_ours(self, host: str) -> bool:
+    def allows_host(self, host: str) -> bool:
         """Whether a Host header, "name", "name:port" or "[address]:port", names this host."""
         name, bracket, _ = host.removeprefix("[").partition("]")
         if not bracket:
@@ -71,13 +71,13 @@ class Guard:
         return kind.lower() == "basic" and hmac.compare_digest(given, self.password.encode())
 
 
-class Guarded:
-    """An application behind a guard, with the headers that keep its pages to themselves."""
+class AuthMiddleware:
+    """An application behind a policy, with the headers that keep its pages to themselves."""
 
-    def __init__(self, app: ASGIApp, guard: Guard, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, app: ASGIApp, policy: AccessPolicy, clock: Clock = SYSTEM_CLOCK) -> None:
         self._app = app
-        self._guard = guard
-        self._patience = Patience()
+        self._policy = policy
+        self._throttle = LoginThrottle()
         self._monotonic_ns = clock.monotonic_ns
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -99,8 +99,8 @@ class Guarded:
         await (refusal or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, path: str, headers: Headers, address: str) -> PlainTextResponse | None:
-        guard = self._guard
-        if not guard.is_ours(headers.get("host", "")):
+        policy = self._policy
+        if not policy.allows_host(headers.get("host", "")):
             what = "this console is not called so; ask for it by its address, or start it with --name\n"
             return PlainTextResponse(what, HTTPStatus.MISDIRECTED_REQUEST)
         # Browsers say where a question comes from; what another site's page embeds is not for it.
@@ -110,14 +110,14 @@ class Guarded:
 
     def _stranger(self, authorization: str, address: str) -> PlainTextResponse | None:
         now_ns = self._monotonic_ns()
-        if authorization and (wait_ns := self._patience.wait_ns(address, now_ns)):
+        if authorization and (wait_ns := self._throttle.wait_ns(address, now_ns)):
             later = {"Retry-After": str(-(-wait_ns // 1_000_000_000))}
             what = "too many wrong passwords from this address; try again later\n"
             return PlainTextResponse(what, HTTPStatus.TOO_MANY_REQUESTS, later)
-        if self._guard.knows(authorization):
+        if self._policy.knows(authorization):
             return None
         if authorization:
-            self._patience.wrong(address, now_ns)
+            self._throttle.record_failure(address, now_ns)
         asks = {"WWW-Authenticate": 'Basic realm="hilrig console", charset="UTF-8"'}
         return PlainTextResponse("a password is needed\n", HTTPStatus.UNAUTHORIZED, asks)
 
@@ -129,7 +129,7 @@ def is_loopback(host: str) -> bool:
     return _is_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback
 
 
-def own_names(names: Iterable[str]) -> frozenset[str]:
+def host_name_set(names: Iterable[str]) -> frozenset[str]:
     """Names as they are compared, without those that are empty."""
     return frozenset(name.lower().rstrip(".") for name in names if name)
 

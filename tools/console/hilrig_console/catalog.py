@@ -18,19 +18,19 @@ from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 2.0
 """Between looks at the folder, while somebody looks at the page."""
-REST: Final = 10
+LIST_REST_FACTOR: Final = 10
 """So many times as long as the work of a look took is rested from it."""
-MEASURED_S: Final = 0.5
+MEASURE_BUDGET_S: Final = 0.5
 """How long a look may read recordings for their latency; the next one goes on."""
 LIST_TIMEOUT_S: Final = 120.0
 REPORT_TIMEOUT_S: Final = 180.0
-REPORTS: Final = 50
+MAX_CACHED_REPORTS: Final = 50
 """Reports that are kept, count; one takes some 300 KB."""
-SHOWN: Final = 100
+MAX_LISTED: Final = 100
 """Recordings of one answer."""
 
 
-class Librarian:
+class ListWorker:
     """What is done in the process that lists."""
 
     def __init__(self, folder: Path) -> None:
@@ -46,14 +46,14 @@ class Librarian:
         entries = self._index.load()
         spent_s, listed_s = time.process_time() - begun_s, time.monotonic()
         for number, entry in enumerate(entries):
-            if time.monotonic() - listed_s > MEASURED_S:
+            if time.monotonic() - listed_s > MEASURE_BUDGET_S:
                 break
             (entries[number],) = self._index.measure([entry])
         self._index.save()
         return entries, spent_s
 
 
-class Reporter:
+class ReportWorker:
     """What is done in the process that reports."""
 
     def write(self, recording: Path, page: Path) -> None:
@@ -68,7 +68,7 @@ class Reporter:
         page.write_text(report([recording]).html, encoding="utf-8")
 
 
-class Shelf:
+class RecordingCatalog:
     """The recordings below a folder; a context manager. Its methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
@@ -80,30 +80,30 @@ class Shelf:
         self._entries: list[RunEntry] = []
         self._by_path: dict[str, RunEntry] = {}
         self._due_s = 0.0
-        self._librarian = Worker(Librarian, folder)
-        self._reporter = Worker(Reporter)
+        self._list_worker = Worker(ListWorker, folder)
+        self._report_worker = Worker(ReportWorker)
         self._reporting = threading.Lock()
         self._reports: OrderedDict[tuple[str, int, int], Path] = OrderedDict()
         self._cache = tempfile.TemporaryDirectory(prefix="hilrig-console-", ignore_cleanup_errors=True)
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """List the folder anew, if it is time."""
         if time.monotonic() < self._due_s:
             return
         spent_s, trouble = 0.0, ""
         try:
-            entries, spent_s = self._librarian.call("entries", timeout_s=LIST_TIMEOUT_S)
+            entries, spent_s = self._list_worker.call("entries", timeout_s=LIST_TIMEOUT_S)
         except InputError as error:
             entries, trouble = [], str(error)
         except HilrigError as error:
             entries, trouble = self._entries, f"the recordings can't be listed: {error}"
-        self._due_s = time.monotonic() + max(PERIOD_S, REST * spent_s)
+        self._due_s = time.monotonic() + max(PERIOD_S, LIST_REST_FACTOR * spent_s)
         if (entries, trouble) != (self._entries, self.trouble):
             self._entries, self.trouble = entries, trouble
             self._by_path = {entry.path: entry for entry in entries}
             self.version += 1
 
-    def listed(self, words: str) -> dict[str, Any]:
+    def search(self, words: str) -> dict[str, Any]:
         """The newest recordings whose rig, session, controller or ending has all of the words, as plain values."""
         wanted = words.lower().split()
         found = [entry for entry in self._entries if all(word in _text(entry) for word in wanted)]
@@ -112,7 +112,7 @@ class Shelf:
             "trouble": self.trouble,
             "total": len(self._entries),
             "found": len(found),
-            "runs": [_row(entry) for entry in found[:SHOWN]],
+            "runs": [_row(entry) for entry in found[:MAX_LISTED]],
         }
 
     def file(self, path: str) -> Path:
@@ -143,24 +143,24 @@ class Shelf:
                 return page
             page = Path(tempfile.mkstemp(dir=self._cache.name, suffix=".html")[1])
             try:
-                self._reporter.call("write", recording, page, timeout_s=REPORT_TIMEOUT_S)
+                self._report_worker.call("write", recording, page, timeout_s=REPORT_TIMEOUT_S)
             except HilrigError:
                 page.unlink()
                 raise
             finally:
                 # Its memory is given back.
-                self._reporter.end()
+                self._report_worker.end()
             self._reports[key] = page
-            if len(self._reports) > REPORTS:
+            if len(self._reports) > MAX_CACHED_REPORTS:
                 self._reports.popitem(last=False)[1].unlink(missing_ok=True)
             return page
 
-    def __enter__(self) -> "Shelf":
+    def __enter__(self) -> "RecordingCatalog":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._librarian.close()
-        self._reporter.close()
+        self._list_worker.close()
+        self._report_worker.close()
         self._cache.cleanup()
 
 

@@ -9,12 +9,12 @@ from google.protobuf.message import DecodeError
 from hilrig_schemas import Event
 from hilrig_schemas.topics import EVENT
 
-KEPT: Final = 200
-LONGEST: Final = 500
+MAX_EVENTS: Final = 200
+MAX_TEXT_CHARS: Final = 500
 """Characters of an event's text that are shown."""
 
 
-class EventLog:
+class EventBuffer:
     """What happened, the oldest first.
 
     Numbers go on from `start`; taken from a clock, they are larger than those of an earlier run, so that a page that
@@ -23,7 +23,7 @@ class EventLog:
 
     def __init__(self, start: int) -> None:
         self.last = start
-        self._events: deque[tuple[int, str]] = deque(maxlen=KEPT)
+        self._events: deque[tuple[int, str]] = deque(maxlen=MAX_EVENTS)
 
     def hear(self, payload: bytes) -> None:
         """Take an encoded event; what is none is left out."""
@@ -46,7 +46,7 @@ def _row(number: int, event: Event) -> dict[str, Any]:
         "rig": event.rig,
         "kind": _name(Event.Kind, event.kind),
         "severity": _name(Event.Severity, event.severity),
-        "text": event.text[:LONGEST],
+        "text": event.text[:MAX_TEXT_CHARS],
         "source": event.source,
     }
 

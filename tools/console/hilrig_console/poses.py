@@ -32,7 +32,7 @@ class _Rig:
         self.asked_for = 0
 
 
-class Poses:
+class PoseCache:
     """What is drawn of each rig."""
 
     def __init__(self) -> None:

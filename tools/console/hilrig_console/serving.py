@@ -12,9 +12,9 @@ from typing import Final
 import uvicorn
 
 from hilrig_console.app import Console
-from hilrig_console.auth import HEALTH_PATH, Guard, is_loopback
-from hilrig_console.catalog import Shelf
-from hilrig_console.subscriber import Feed
+from hilrig_console.auth import HEALTH_PATH, AccessPolicy, is_loopback
+from hilrig_console.catalog import RecordingCatalog
+from hilrig_console.subscriber import LabSubscriber
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
 
@@ -44,7 +44,7 @@ class Address:
         return cls(host.removeprefix("[").removesuffix("]"), int(port))
 
     @property
-    def is_private(self) -> bool:
+    def is_loopback(self) -> bool:
         """Whether only this machine reaches it."""
         return is_loopback(self.host)
 
@@ -96,14 +96,14 @@ class ConsoleServer:
         OperationError: the address can't be had.
     """
 
-    def __init__(self, lab: LabConfig, address: Address, guard: Guard, tls: TlsFiles | None = None) -> None:
+    def __init__(self, lab: LabConfig, address: Address, policy: AccessPolicy, tls: TlsFiles | None = None) -> None:
         if tls is not None:
             tls.check()
         self._socket = address.listening()
         self.url = address.url(self._socket.getsockname()[1], "http" if tls is None else "https")
-        self._feed = Feed(lab)
-        self._shelf = Shelf(lab.recorder.folder)
-        self._console = Console(self._feed, self._shelf, guard)
+        self._subscriber = LabSubscriber(lab)
+        self._catalog = RecordingCatalog(lab.recorder.folder)
+        self._console = Console(self._subscriber, self._catalog, policy)
         config = uvicorn.Config(
             self._console.app,
             log_config=None,
@@ -123,8 +123,8 @@ class ConsoleServer:
         self._server.run(sockets=[self._socket])
 
     def __enter__(self) -> "ConsoleServer":
-        self._feed.__enter__()
-        self._shelf.__enter__()
+        self._subscriber.__enter__()
+        self._catalog.__enter__()
         self._thread.start()
         return self
 
@@ -132,13 +132,13 @@ class ConsoleServer:
         if self._console.broadcast is not None:
             self._console.broadcast.close()
         self._server.should_exit = True
-        self._shelf.__exit__()
-        self._feed.__exit__()
+        self._catalog.__exit__()
+        self._subscriber.__exit__()
         self._thread.join(timeout=5.0)
         self._socket.close()
 
 
-def ask_health(address: Address, tls: TlsFiles | None) -> None:
+def check_health(address: Address, tls: TlsFiles | None) -> None:
     """Ask whether a console answers at an address of this host.
 
     Raises:

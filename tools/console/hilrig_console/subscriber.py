@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_console.view_model import Frame, Page
+from hilrig_console.view_model import Frame, ViewModel
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
@@ -25,7 +25,7 @@ from hilrig_schemas.topics import CONFIG, EVENT, HEALTH, STATES
 RETRY_S: Final = 2.0
 """Between tries to join the bus."""
 TURN_S: Final = 0.2
-"""How often the feed looks whether there is something to ask."""
+"""How often the subscriber looks whether there is something to ask."""
 ROSTERS_S: Final = 10.0
 """How often it is asked where the rigs are reached."""
 NEWCOMERS_S: Final = 1.0
@@ -39,16 +39,16 @@ _BATCHES: Final = 64
 logger = logging.getLogger(__name__)
 
 
-class Feed:
+class LabSubscriber:
     """Keeps a page up to date from a thread of its own; a context manager."""
 
     def __init__(self, lab: LabConfig) -> None:
         self._lab = lab
-        self._page = Page(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
+        self._page = ViewModel(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
         self._states: deque[bytes] = deque(maxlen=_BATCHES)
         self._looked_s = -LEFT_S
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def frame(self, more: dict[str, Any]) -> Frame:
         """What there is to show now; as long as it is asked for, somebody looks."""
@@ -64,7 +64,7 @@ class Feed:
         with self._page.lock:
             return list(self._page.poses.scenes)
 
-    def __enter__(self) -> "Feed":
+    def __enter__(self) -> "LabSubscriber":
         self._thread.start()
         return self
 

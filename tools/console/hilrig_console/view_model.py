@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hilrig_console.events import EventLog
-from hilrig_console.poses import Poses
+from hilrig_console.events import EventBuffer
+from hilrig_console.poses import PoseCache
 from hilrig_monitoring.lab_view import LabView
 from hilrig_schemas import Roster
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ClientState:
     """What a browser has."""
 
     lab: str = ""
@@ -33,7 +33,7 @@ class Frame:
     poses: str
     events: tuple[tuple[int, str], ...]
 
-    def news(self, seen: Seen) -> tuple[str, Seen]:
+    def news(self, seen: ClientState) -> tuple[str, ClientState]:
         """What is new to a browser, as server-sent events, and what it has then; an empty text: nothing."""
         parts = []
         if self.lab != seen.lab:
@@ -44,17 +44,17 @@ class Frame:
         if self.poses != seen.poses:
             parts.append(f"event: poses\ndata: {self.poses}\n\n")
         last = self.events[-1][0] if self.events else 0
-        return "".join(parts), Seen(self.lab, self.poses, max(seen.event, last))
+        return "".join(parts), ClientState(self.lab, self.poses, max(seen.event, last))
 
 
-class Page:
+class ViewModel:
     """A lab as it is shown; `lock` is held while it is changed or read."""
 
     def __init__(self, lab: str, rigs: tuple[str, ...], start: int) -> None:
         self.lock = threading.Lock()
         self.view = LabView(rigs)
-        self.poses = Poses()
-        self.events = EventLog(start)
+        self.poses = PoseCache()
+        self.events = EventBuffer(start)
         self._lab = lab
         self._trouble = ""
         self._addresses: dict[str, str] = {}

@@ -7,7 +7,7 @@ const EVENTS_KEPT = 200;
 const QUIET_MS = 4000;
 const CARDS_AT_MOST = 60;
 const GLIDE_MS = 200;
-const HOLDS = 2, MAGNET = 1;
+const HOLDS_PART = 2, MAGNET_ON = 1;
 const LEVELS = {"in use": "good", "free": "", "no command": "warn", "watchdog tripped": "bad", "no edge": "bad", "no simulation": "bad"};
 const SEVERITIES = {info: "", warning: "warn", error: "bad"};
 const stillness = matchMedia("(prefers-reduced-motion: reduce)");
@@ -93,7 +93,7 @@ class Arm {
   take(scene, pose, parts) {
     if (scene !== this.scene) this.build(scene);
     if (parts.length) this.place(parts);
-    this.tool.setAttribute("class", `tool${pose[5] & HOLDS ? " holds" : pose[5] & MAGNET ? " on" : ""}`);
+    this.tool.setAttribute("class", `tool${pose[5] & HOLDS_PART ? " holds" : pose[5] & MAGNET_ON ? " on" : ""}`);
     this.from = this.shown || pose;
     this.wanted = pose;
     this.since = performance.now();
