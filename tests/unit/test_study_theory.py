@@ -70,7 +70,7 @@ def test_uncoupled_model_has_diagonal_input_matrix() -> None:
 
 @pytest.mark.parametrize(
     ("pose", "expected"),
-    [((0.0, 0.0, 0.0, 0.0), "d3"), ((9.0, 0.0, 0.1, 0.0), "theta1"), ((0.0, 0.1), "four joint positions")],
+    [((0.0, 0.0, 0.0, 0.0), "d3"), ((9.0, 0.0, 0.1, 0.0), "theta1"), ((0.0, 0.1), "four joint")],
 )
 def test_rejects_pose_at_or_beyond_stop(pose: tuple[float, ...], expected: str) -> None:
     with pytest.raises(InputError, match=expected):

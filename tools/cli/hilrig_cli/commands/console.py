@@ -42,8 +42,8 @@ def console(
     import secrets
     import threading
 
-    from hilrig_console.auth import AccessPolicy, host_name_set
-    from hilrig_console.serving import Address, ConsoleServer, TlsFiles, check_health
+    from hilrig_console.auth import AccessPolicy, normalize_host_names
+    from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
@@ -52,7 +52,7 @@ def console(
     if (certificate is None) != (key is None):
         raise InputError("--certificate and --key belong together: give both")
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
-    address = Address.of(listen)
+    address = ListenAddress.parse(listen)
     if check:
         check_health(address, tls)
         return
@@ -61,7 +61,7 @@ def console(
     invented = not password and not address.is_loopback
     if invented:
         password = secrets.token_urlsafe(12)
-    names = host_name_set([platform.node(), address.host, *(name or [])])
+    names = normalize_host_names([platform.node(), address.host, *(name or [])])
     server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
     yield_to_others()
     stopping = threading.Event()
