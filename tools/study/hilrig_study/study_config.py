@@ -183,7 +183,7 @@ class AxisConfig(Section):
 
 
 class PointConfig(Section):
-    """Selected point of the plane, for a trace plot or a live measurement."""
+    """Selected point of the plane, whose trace is plotted or which is measured live."""
 
     x: Number
     y: Number

@@ -53,12 +53,12 @@ class LoopTiming:
             )
 
     def basis(self, poll: int, state_delay_ns: int = 0) -> int:
-        """Return the step of the state served to a poll, for a constant delay of the state link, ns."""
+        """Return the step of the state served to a poll under a constant delay of the state link, ns."""
         read_ns = self.phase_ns + poll * self.period_ns
         return (read_ns - self.transport_ns - state_delay_ns) // self.step_ns
 
     def acts(self, poll: int, command_delay_ns: int = 0) -> int:
-        """Return the tick from which the command of a poll acts, for a constant delay of the command link, ns."""
+        """Return the tick from which the command of a poll acts under a constant delay of the command link, ns."""
         arrival_ns = self.phase_ns + poll * self.period_ns + self.compute_ns + self.transport_ns + command_delay_ns
         return -(-arrival_ns // self.step_ns)
 
