@@ -22,6 +22,8 @@ from hilrig_study.simulation.simulated_loop import Scenario
 
 TICK_OBSERVATION_S: Final = 0.5
 """Duration of the tick phase measurement, s."""
+MIN_TICKS: Final = 3
+"""Fewest observed ticks of a valid measurement."""
 _STEP_ADDRESS: Final = 2
 _LATENCY_ADDRESS: Final = 4
 _BUSY_WAIT_NS: Final = 300_000
@@ -94,9 +96,9 @@ def measure_tick_phase(clock_rig: RigClient, step_ns: int) -> int:
             phases.append(time.monotonic_ns())
             before = step
         time.sleep(2e-4)
-    if len(phases) < 3:
+    if len(phases) < MIN_TICKS:
         raise OperationError(
-            f"the simulation does not step: its step counter did not change within {TICK_OBSERVATION_S:g} s"
+            f"the simulation does not step: its step counter changed less than {MIN_TICKS} times in {TICK_OBSERVATION_S:g} s"
         )
     # A change is observed late, by the duration and the spacing of the requests, and never early: use the earliest.
     later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2
