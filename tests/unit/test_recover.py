@@ -13,10 +13,10 @@ from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
 
 from hilrig_recorder.mcap_format.channels import encode_message
+from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_recorder.mcap_format.recover import recover, recovered_path, session_of
 from hilrig_recorder.mcap_format.scan import Chunk, Message, is_whole, open_chunk, scan
 from hilrig_recorder.mcap_format.writer import RunWriter
-from hilrig_recorder.storage.fsutil import lock_file
 from hilrig_runtime.errors import InputError, OperationError
 from support import recordings
 from support.labs import hilrig

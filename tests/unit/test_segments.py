@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_recorder.ingest.recording import EVENT_CHANNEL
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.recover import Tail
 from hilrig_recorder.storage.segments import horizon_of, next_part
 

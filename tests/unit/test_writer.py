@@ -19,9 +19,9 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, CHANNELS, encode_message
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
+from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.scan import scan
 from hilrig_recorder.mcap_format.writer import RunWriter
-from hilrig_recorder.storage.fsutil import part_path
 from hilrig_schemas import JointState
 
 START = 1_767_225_600_000_000_000

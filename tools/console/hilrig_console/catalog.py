@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_console.worker import Worker
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
 from hilrig_replay.io.index import RECORDING, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
@@ -177,7 +178,7 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
-    row["name"] = Path(entry.path).name.removesuffix(".part").removesuffix(".mcap")
+    row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
     row["open"] = entry.ended == RECORDING
     return row

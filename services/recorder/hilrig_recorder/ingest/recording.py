@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, message_head
-from hilrig_schemas.topics import EVENT
+from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL, message_head
 
 SECOND_NS: Final = 1_000_000_000
 POSTROLL_NS: Final = SECOND_NS // 2
 """Messages stamped later than this after a session's end are not in its file."""
-EVENT_CHANNEL: Final = CHANNEL_OF_TOPIC[EVENT.name]
 
 
 @dataclass(slots=True)

@@ -14,9 +14,9 @@ from google.protobuf.message import DecodeError
 
 from hilrig_recorder.ingest.preroll import RigLog
 from hilrig_recorder.ingest.queue import Arrival
-from hilrig_recorder.ingest.recording import EVENT_CHANNEL, SECOND_NS, Recording, Shelf
+from hilrig_recorder.ingest.recording import SECOND_NS, Recording, Shelf
 from hilrig_recorder.ingest.sources import CLOCK_STEP_NS, SETTLING_NS, Source, Sources, Stream
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, encode_message
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL, encode_message
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_schemas import Event, LogBatch
 from hilrig_schemas.topics import is_name, parse_rig_key

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from hilrig_schemas.topics import RECORDED
+from hilrig_schemas.topics import EVENT, RECORDED
 
 SCHEMA_VERSION: Final = "hilrig.v1"
 """The protobuf package of the messages; it changes when a message becomes unreadable for older readers."""
@@ -50,6 +50,7 @@ CHANNELS: Final = tuple(
 )
 CHANNEL_OF_TOPIC: Final = {name: number for number, name in enumerate(RECORDED, start=1)}
 """Channel id of a topic's name."""
+EVENT_CHANNEL: Final = CHANNEL_OF_TOPIC[EVENT.name]
 
 
 class MessageHead(NamedTuple):

@@ -14,6 +14,8 @@ from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, RECOVERING_SUFFIX
+from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_recorder.mcap_format.scan import (
     Chunk,
     Damage,
@@ -25,10 +27,8 @@ from hilrig_recorder.mcap_format.scan import (
     scan,
 )
 from hilrig_recorder.mcap_format.writer import LIBRARY, RunWriter
-from hilrig_recorder.storage.fsutil import PART_SUFFIX, lock_file
 from hilrig_runtime.errors import InputError, OperationError
 
-RECOVERING_SUFFIX: Final = ".recovering"
 _UNFINISHED: Final = "the file had no end: its recorder was killed, or it was cut off; what came last may be missing"
 _DAMAGED: Final = "how it ended stood where the file is damaged"
 _HEAD_BYTES: Final = 64 * 1024
@@ -335,4 +335,4 @@ def recovered_path(source: Path) -> Path:
         raise InputError(f"{source}: is a folder; name the MCAP files in it")
     if source.name.endswith(PART_SUFFIX):
         return source.with_name(source.name.removesuffix(PART_SUFFIX))
-    return source.with_name(f"{source.stem}.recovered{source.suffix or '.mcap'}")
+    return source.with_name(f"{source.stem}.recovered{source.suffix or MCAP_SUFFIX}")

@@ -18,8 +18,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.mcap_format.channels import CHANNELS, SCHEMAS
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES, ChunkNote, Compress, chunks_of, compressor, cut, encode_chunk
+from hilrig_recorder.mcap_format.file_names import part_path
+from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
 from hilrig_recorder.mcap_format.summary_section import Contents, encoded
-from hilrig_recorder.storage.fsutil import lock_file, part_path, sync_folder
 
 LIBRARY: Final = "hilrig"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
-from hilrig_recorder.storage.fsutil import lock_file
+from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_runtime.errors import OperationError
 
 NAMED: Final = 3

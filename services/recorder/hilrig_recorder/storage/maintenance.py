@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from hilrig_recorder.mcap_format.recover import RECOVERING_SUFFIX, recover, recovered_path
-from hilrig_recorder.storage.fsutil import PART_SUFFIX
+from hilrig_recorder.mcap_format.file_names import RECOVERING_SUFFIX, UNFINISHED_SUFFIX
+from hilrig_recorder.mcap_format.recover import recover, recovered_path
 from hilrig_recorder.storage.retention import finished_recordings, to_delete
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.errors import HilrigError
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 def unfinished(folder: Path) -> list[Path]:
     """What recorders before this one left unfinished in a lab's folder."""
-    return sorted(folder.glob(f"*/*.mcap{PART_SUFFIX}"))
+    return sorted(folder.glob(f"*/*{UNFINISHED_SUFFIX}"))
 
 
 class Housekeeping:

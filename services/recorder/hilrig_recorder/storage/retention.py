@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+
 DAY_S = 86_400
 
 
@@ -22,7 +24,7 @@ class Stored:
 def finished_recordings(folder: Path) -> list[Stored]:
     """The finished recordings of a lab's folder: `<folder>/<rig>/<session>.mcap`."""
     found = []
-    for path in folder.glob("*/*.mcap"):
+    for path in folder.glob(f"*/*{MCAP_SUFFIX}"):
         try:
             info = path.stat()
         except OSError:

@@ -8,10 +8,9 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilrig_recorder.ingest.recording import EVENT_CHANNEL
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, part_path
 from hilrig_recorder.mcap_format.recover import Tail, read_tail
-from hilrig_recorder.storage.fsutil import PART_SUFFIX, part_path
 from hilrig_runtime.errors import InputError
 
 
@@ -73,12 +72,12 @@ def horizon_of(tail: Tail) -> dict[int, int]:
 
 def file_name(session: str, number: int) -> str:
     """Name of a session's file; `number` counts from 1."""
-    return f"{session}.mcap" if number == 1 else f"{session}.{number}.mcap"
+    return f"{session}{MCAP_SUFFIX}" if number == 1 else f"{session}.{number}{MCAP_SUFFIX}"
 
 
 def _number(name: str, session: str) -> int:
     """Which file of a session is called so; 0: none."""
-    stem = name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
+    stem = name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     if stem == session:
         return 1
     number = stem.removeprefix(f"{session}.")

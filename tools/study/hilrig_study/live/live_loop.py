@@ -98,7 +98,8 @@ def measure_tick_phase(clock_rig: RigClient, step_ns: int) -> int:
         time.sleep(2e-4)
     if len(phases) < MIN_TICKS:
         raise OperationError(
-            f"the simulation does not step: its step counter changed less than {MIN_TICKS} times in {TICK_OBSERVATION_S:g} s"
+            "the simulation does not step: its step counter changed less than "
+            f"{MIN_TICKS} times in {TICK_OBSERVATION_S:g} s"
         )
     # A change is observed late, by the duration and the spacing of the requests, and never early: use the earliest.
     later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2

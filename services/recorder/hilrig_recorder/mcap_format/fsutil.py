@@ -1,19 +1,11 @@
-"""Files that are being written: how they are called meanwhile, how others see it, how a name survives a power cut."""
+"""File system helpers: advisory file locks and durable renames."""
 
 import os
 import sys
 from pathlib import Path
-from typing import Final
 
 if sys.platform != "win32":
     import fcntl
-
-PART_SUFFIX: Final = ".part"
-
-
-def part_path(path: Path) -> Path:
-    """What a recording is called while it is written."""
-    return path.with_name(path.name + PART_SUFFIX)
 
 
 def sync_folder(folder: Path) -> None:
