@@ -65,9 +65,9 @@ class ReportWorker:
             InputError: the recording can't be read.
         """
         # Imported here: each report runs in a new process, and the process of the console must not load matplotlib.
-        from hilrig_replay.report.report import report
+        from hilrig_replay.report.report import build_report
 
-        page.write_text(report([recording]).html, encoding="utf-8")
+        page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
 class RecordingCatalog:
