@@ -299,7 +299,7 @@ def test_a_simulation_that_starts_anew_is_seen_to_go_and_to_come(beside: Beside)
         try:
             eventually(lambda: watcher.rig("rig2")["state"] == "no simulation")
             eventually(lambda: watcher.pose("rig2") is None)
-            assert any("sim/1" in trouble for trouble in watcher.newest["lab"]["troubles"])
+            assert any("sim/1" in alert for alert in watcher.newest["lab"]["alerts"])
         finally:
             os.kill(sim, signal.SIGKILL)
         eventually(lambda: watcher.rig("rig2")["state"] == "free" and watcher.pose("rig2"))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_cli.local.demo import judge
+from hilrig_cli.local.demo import check_placement
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
 from support.labs import RunningLab, write_lab
@@ -65,7 +65,7 @@ def test_with_a_loop_of_60_ms_every_part_is_placed_within_2_mm(attempt: int, tmp
     report = measure(run)
     assert report.loop_ms is not None
     assert report.loop_ms.p50 == pytest.approx(60, abs=12)
-    result = judge(run)
+    result = check_placement(run)
     assert result.placed == len(result.parts) == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0

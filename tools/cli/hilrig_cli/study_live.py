@@ -1,4 +1,4 @@
-"""The live points of a study: a lab with a rig for each, a controller on one after the other, each beside its twin."""
+"""Live points of a study: runs a lab with one rig per point, drives each rig, and compares it with its twin."""
 
 import json
 import shutil
@@ -23,13 +23,13 @@ from hilrig_study.study_config import PointConfig, StudyConfig
 from hilrig_study.sweep import cell_at
 
 CLOCK: Final = "clock"
-"""The rig that nothing is injected into."""
+"""Name of the rig without impairment, which the phase of the ticks is measured on."""
 _LEAD_NS: Final = 200_000_000
 _RECORDED_TIMEOUT_S: Final = 20.0
 
 
-def run_live_points(study: StudyConfig, folder: Path, out: Path, say: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Run every live point of a study and compare it with virtual time; plain values, one entry a point.
+def run_live_points(study: StudyConfig, folder: Path, out: Path, log: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Run every live point of a study and compare it with the simulation; return plain values, one entry per point.
 
     Raises:
         InputError: a point can't be run live.
@@ -42,36 +42,38 @@ def run_live_points(study: StudyConfig, folder: Path, out: Path, say: Callable[[
     recordings = out / "recordings"
     shutil.rmtree(recordings, ignore_errors=True)
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
-        mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
+        indices = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        _write_lab(config, study, step_ms, {f"point{i + 1}": _ways(study, cells[i]) for i in mine}, recordings)
+        _write_lab(config, study, step_ms, {f"point{i + 1}": _ways(study, cells[i]) for i in indices}, recordings)
         lab = load_lab(config)
-        with running_lab(lab, config, say, threading.Event()) as supervisor:
-            for index in mine:
+        with running_lab(lab, config, log, threading.Event()) as supervisor:
+            for index in indices:
                 point, number = points[index]
-                say(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
+                log(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
                 run = _run_point(study, folder, lab, f"point{index + 1}", cells[index], supervisor)
                 comparison = compare_with_twins(study, cells[index], run, folder)
-                compared.append(_said(point, names[number], run) | comparison.as_dict())
+                compared.append(_describe(point, names[number], run) | comparison.as_dict())
     return compared
 
 
-def _said(point: PointConfig, controller: str, run: Run) -> dict[str, Any]:
+def _describe(point: PointConfig, controller: str, run: Run) -> dict[str, Any]:
     return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
 def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
-    """What is injected at a point.
+    """Impairment of a point: the study's own, or the delay, jitter and loss that the sweep adds.
 
     Raises:
-        InputError: the study's own impairment and what the sweep adds are both on the command's way.
+        InputError: both impair the command link.
     """
     base = study.ways(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base
     if not base.command.does_nothing:
-        raise InputError("a live point can't add to a command's way that is impaired already: leave one of them out")
+        raise InputError(
+            "live point: the study's impairment and the sweep both impair the command link: remove one of them"
+        )
     delay = (
         UniformDelay(low_ms=delay_ms, high_ms=delay_ms + jitter_ms) if jitter_ms else ConstantDelay(delay_ms=delay_ms)
     )
@@ -80,18 +82,18 @@ def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
 
 
 def _write_lab(config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[str, Ways], recordings: Path) -> None:
-    made = study.lab(step_ms)
+    template = study.lab(step_ms)
     ports = free_ports(5020, len(rigs) + 1)
     lines = [
-        "# The lab of a study's live points: a rig each, and one that nothing is injected into.",
+        "# The lab of a study's live points: one rig per point, and one without impairment.",
         'name = "study"',
-        f"sim = {_toml(made.sim.model_dump())}",
+        f"sim = {_toml(template.sim.model_dump())}",
         f"edge = {_toml({'first_port': ports, 'session_grace_ms': 0.0})}",
         f"bus = {_toml({'first_port': free_ports(7447, 3)})}",
         f"recorder = {_toml({'folder': str(recordings.resolve())})}",
         f"scene = {_toml({'trays': [], 'parts': []})}",
     ]
-    arm = _toml(made.rigs[0].arm.model_dump())
+    arm = _toml(template.rigs[0].arm.model_dump())
     for name, ways in {CLOCK: Ways(), **rigs}.items():
         impairment = {"seed": study.seed, **ways.model_dump()}
         lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {_toml(impairment)}"]
@@ -102,7 +104,7 @@ def _write_lab(config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[s
 
 
 def _toml(value: Any) -> str:
-    """Numbers, texts, lists and tables as TOML writes them inside a line."""
+    """Format a number, string, list or dict as an inline TOML value."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
@@ -118,10 +120,10 @@ def _run_point(
     cell: np.ndarray[Any, np.dtype[np.void]],
     supervisor: Supervisor,
 ) -> Run:
-    """Drive one rig; its recording.
+    """Drive the rig of a point; return its recording.
 
     Raises:
-        OperationError: nothing was recorded.
+        OperationError: the recording is missing.
     """
     timing = study.loop.timing(float(cell["step_ms"][0]), float(cell["poll_ms"][0]))
     gain = np.ascontiguousarray(cell["gain"])
@@ -131,7 +133,7 @@ def _run_point(
     listener, client = RigClient(lab.edge.host, lab.ports[CLOCK]), RigClient(lab.edge.host, lab.ports[rig])
     try:
         tick_ns = listen_for_ticks(listener, timing.step_ns)
-        # The state gets to the edge a transport after its tick; the phase counts from the tick.
+        # A state reaches the edge one transport time after its tick; the phase counts from the tick.
         first_ns = tick_ns + timing.phase_ns - timing.transport_ns
         first_ns += -((first_ns - time.monotonic_ns() - _LEAD_NS) // timing.step_ns) * timing.step_ns
         drive(client, controller, study.task.scenario(), first_ns, timing.period_ns, study.live_duration_s)
@@ -145,4 +147,4 @@ def _run_point(
         if found:
             return open_run(found[-1])
         time.sleep(POLL_S)
-    raise OperationError(f"{lab.recorder.folder}: nothing was recorded of {rig}")
+    raise OperationError(f"{lab.recorder.folder}: no recording of rig {rig!r} after {_RECORDED_TIMEOUT_S:g} s")

@@ -131,7 +131,7 @@ class Feed:
         except DecodeError:
             return
         with self._page.lock:
-            self._page.view.hear(health, time.monotonic())
+            self._page.view.update(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
         del key

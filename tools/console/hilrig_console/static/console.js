@@ -218,7 +218,7 @@ function showLab(lab) {
   if (alarms) sums.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
   at("sums").replaceChildren(...sums.map(([number, what]) =>
     made("li", what.startsWith("alarm") ? {class: "alarm"} : {}, made("b", {}, String(number)), ` ${what}`)));
-  const troubles = lab.troubles.map((text) => ["warn", text]);
+  const troubles = lab.alerts.map((text) => ["warn", text]);
   if (lab.link) troubles.unshift(["bad", lab.link]);
   else if (!runs) {
     troubles.unshift(["bad", `Nothing is heard of the lab “${lab.lab}”: is it running (hilrig up), with this lab.toml?`]);
@@ -241,7 +241,7 @@ function showServices(services) {
     const cells = [service.host, service.rigs, service.cpu_percent.toFixed(0), service.memory_mib.toFixed(0),
       service.lateness_p99_ms.toFixed(2), service.overruns, service.lost_transport + service.lost_recorder,
       service.clock_peer ? `${service.clock_offset_ms < 0 ? "−" : "+"}${Math.abs(service.clock_offset_ms).toFixed(1)} ± ${service.clock_uncertainty_ms.toFixed(1)}` : "–"];
-    const row = made("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
+    const row = made("tr", service.silent || service.alert ? {"data-level": "bad"} : {},
       made("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
     row.append(...cells.map((cell, number) => made("td", number ? {class: "n"} : {}, String(cell))));
     return row;
