@@ -11,7 +11,8 @@ from hilrig_cli.options import AsJson
 
 def check(
     file: Annotated[
-        Path | None, typer.Argument(metavar="LAB.TOML", help="Configuration file of the lab; default: the defaults.")
+        Path | None,
+        typer.Argument(metavar="LAB.TOML", help="Configuration file of the lab; default: default settings."),
     ] = None,
     template: Annotated[
         bool, typer.Option("--template", help="Print a template with every key, its meaning and its default instead.")

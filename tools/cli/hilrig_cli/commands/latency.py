@@ -30,7 +30,7 @@ def latency(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the loop latency of recordings: six stages, percentiles, jitter, and a diagnosis of their causes.
+    """Measure the loop latency of recordings: six stages, percentiles, jitter, losses, and a diagnosis.
 
     Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
