@@ -366,7 +366,7 @@ def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with
             assert running.process.wait(PATIENT_S) == 0
             eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
-        assert "can be overheard" in running.process.stderr.read()
+        assert "the password is sent unencrypted" in running.process.stderr.read()
 
 
 def test_with_a_certificate_it_speaks_https(tmp_path: Path) -> None:

@@ -52,5 +52,5 @@ def test_where_a_lab_runs_a_recording_is_not_played_over_it(tmp_path: Path) -> N
         eventually(lambda: senders.count("rig1"))
         answer = hilrig("play", path, "--config", config)
     assert answer.returncode == 3
-    assert "a lab runs here already" in answer.stderr
+    assert "a lab is already running on this host" in answer.stderr
     assert "Traceback" not in answer.stderr

@@ -85,9 +85,9 @@ def test_only_loopback_is_private() -> None:
     ("options", "error", "why"),
     [
         ({"listen": "here"}, InputError, "expected HOST:PORT"),
-        ({"password_file": Path("none")}, InputError, "none can't be read: No such file"),
+        ({"password_file": Path("none")}, InputError, "none: can't be read: No such file"),
         ({"password_file": Path("short")}, InputError, "at least 8 characters"),
-        ({"certificate": Path("torn.pem")}, InputError, "give both"),
+        ({"certificate": Path("torn.pem")}, InputError, "must be given together"),
         ({"certificate": Path("torn.pem"), "key": Path("torn.pem")}, InputError, "no certificate with its key"),
         ({"check": True, "listen": "127.0.0.1:1"}, OperationError, "no console answers at http://127.0.0.1:1/"),
     ],

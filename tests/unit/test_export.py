@@ -211,7 +211,7 @@ def test_the_command_prints_what_it_wrote_and_refuses_to_write_over(recording: P
     assert "exists" in again.stderr
     nothing = hilrig("export", recording)
     assert nothing.returncode == 2
-    assert "nothing to write" in nothing.stderr
+    assert "no output given" in nothing.stderr
 
 
 def test_the_answer_of_runs_is_json_of_which_every_path_exists(recording: Path) -> None:

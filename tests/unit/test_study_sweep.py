@@ -280,9 +280,9 @@ def test_a_students_file_can_be_named_on_the_command_line(tmp_path: Path) -> Non
 def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     path = write(tmp_path)
     for arguments, said in (
-        ([], "name a study's file"),
-        ([str(path), "--live"], "names none"),
-        ([str(path), "--live", "--from", "x.mcap"], "choose one"),
+        ([], "STUDY.TOML or --from RUN.MCAP is required"),
+        ([str(path), "--live"], "the study has none"),
+        ([str(path), "--live", "--from", "x.mcap"], "can't be combined"),
     ):
         done = CliRunner().invoke(app, ["study", *arguments])
         assert isinstance(done.exception, InputError), done.output

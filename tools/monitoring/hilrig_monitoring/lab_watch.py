@@ -45,7 +45,7 @@ class LabWatch:
         with self.lock:
             if not self.view.services():
                 raise OperationError(
-                    f"no health report from lab {self.lab.name!r}: is it running (hilrig up), with this lab.toml?"
+                    f"no service of lab {self.lab.name!r} found: is it running (hilrig up), with this lab.toml?"
                 )
 
     def _on_health(self, key: str, payload: bytes) -> None:  # noqa: ARG002

@@ -91,7 +91,7 @@ def _password(file: Path) -> str:
         password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"--password-file: {file} can't be read: {reason}") from error
+        raise InputError(f"--password-file: {file}: can't be read: {reason}") from error
     if len(password) < SHORTEST_PASSWORD:
         raise InputError(
             f"--password-file: {file}: the password in the first line must have at least {SHORTEST_PASSWORD} "
