@@ -45,8 +45,8 @@ def console(
     import secrets
     import threading
 
-    from hilrig_console.auth import Guard, own_names
-    from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
+    from hilrig_console.auth import AccessPolicy, normalize_host_names
+    from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
@@ -55,17 +55,17 @@ def console(
     if (certificate is None) != (key is None):
         raise InputError("--certificate and --key must be given together")
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
-    address = Address.of(listen)
+    address = ListenAddress.parse(listen)
     if check:
-        ask_health(address, tls)
+        check_health(address, tls)
         return
     lab = load_lab(config)
     password = _password(password_file) if password_file is not None else ""
-    generated = not password and not address.is_private
+    generated = not password and not address.is_loopback
     if generated:
         password = secrets.token_urlsafe(12)
-    names = own_names([platform.node(), address.host, *(name or [])])
-    server = ConsoleServer(lab, address, Guard(password, names), tls)
+    names = normalize_host_names([platform.node(), address.host, *(name or [])])
+    server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
     yield_to_others()
     stopping = threading.Event()
     stop_on_signals(stopping)
@@ -74,7 +74,7 @@ def console(
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if generated:
             print(f"password: {password} (any user name)", flush=True)
-        if tls is None and not address.is_private:
+        if tls is None and not address.is_loopback:
             print(
                 "hilrig: warning: without --certificate and --key the password is sent unencrypted",
                 file=sys.stderr,
@@ -84,7 +84,7 @@ def console(
 
 
 def _password(file: Path) -> str:
-    from hilrig_console.auth import SHORTEST_PASSWORD
+    from hilrig_console.auth import MIN_PASSWORD_CHARS
     from hilrig_runtime.errors import InputError
 
     try:
@@ -92,9 +92,9 @@ def _password(file: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError(f"--password-file: {file}: can't be read: {reason}") from error
-    if len(password) < SHORTEST_PASSWORD:
+    if len(password) < MIN_PASSWORD_CHARS:
         raise InputError(
-            f"--password-file: {file}: the password in the first line must have at least {SHORTEST_PASSWORD} "
+            f"--password-file: {file}: the password in the first line must have at least {MIN_PASSWORD_CHARS} "
             f"characters, got {len(password)}"
         )
     return password

@@ -41,7 +41,8 @@ def latency(
 
     paths = recordings(runs)
     if plot is not None:
-        from hilrig_replay.plots.latency_plot import check_plot_path, save_plot
+        from hilrig_replay.plots.latency_plot import save_plot
+        from hilrig_replay.plots.output import check_plot_path
 
         if len(paths) > 1:
             raise InputError(f"--plot: expected one recording, got {len(paths)}")

@@ -40,7 +40,7 @@ def report(
     from hilrig_replay.grading.task_loading import read_task
     from hilrig_replay.io.paths import recordings
     from hilrig_replay.io.recording_file import refuse_recording
-    from hilrig_replay.report.report import report as make_report
+    from hilrig_replay.report.report import build_report
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():
@@ -50,11 +50,11 @@ def report(
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
-        result = make_report(
+        result = build_report(
             recordings(runs),
             verified=verify,
             task=graded_by,
-            tick=lambda share: progress.update(bar, completed=share),
+            on_progress=lambda share: progress.update(bar, completed=share),
             workers=None,
         )
     try:
@@ -62,12 +62,16 @@ def report(
     except OSError as error:
         raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
     if as_json:
-        print(json.dumps({"page": str(out), "runs": result.runs, "left_out": result.left_out, "alike": result.alike}))
+        print(
+            json.dumps(
+                {"page": str(out), "runs": result.runs, "left_out": result.left_out, "alike": result.same_torques}
+            )
+        )
     else:
         print(out)
         for reason in result.left_out:
             print(f"skipped: {reason}", file=sys.stderr)
-        for pair in result.alike:
+        for pair in result.same_torques:
             print(f"same torques: {pair}", file=sys.stderr)
     if result.left_out:
         raise typer.Exit(1)
