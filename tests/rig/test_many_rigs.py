@@ -187,7 +187,7 @@ def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab,
         if b"rig1,rig2" in Path(f"/proc/{pid}/cmdline").read_bytes() and _is(pid, "edge")
     )
     os.kill(first, signal.SIGKILL)
-    eventually(lambda: "edge is started again" in lab.output())
+    eventually(lambda: "edge restarted" in lab.output())
     assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
 
     def back() -> bool:
