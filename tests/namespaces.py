@@ -36,7 +36,8 @@ def _missing() -> str | None:
             network.run("near", ["getent", "hosts", "far"], capture_output=True, text=True)
     except subprocess.CalledProcessError as error:
         said = " ".join((error.stderr or "").split()) or f"exit code {error.returncode}"
-        return f"needs network namespaces (CAP_SYS_ADMIN, CAP_NET_ADMIN); `{' '.join(error.cmd)}` failed: {said}"
+        need = "network namespaces and veth pairs (CAP_SYS_ADMIN, CAP_NET_ADMIN)"
+        return f"needs {need}; `{' '.join(error.cmd)}` failed: {said}"
     return None
 
 
