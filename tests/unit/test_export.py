@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export.export import TABLES, TEMPORARY_SUFFIX, export_foxglove, export_tables, table
 from hilrig_replay.geometry.quaternion import rotate
@@ -95,14 +95,14 @@ def test_leftover_of_a_killed_export_is_replaced(recording: Path, tmp_path: Path
 
 
 def test_export_on_a_full_disk_leaves_no_file(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    append = RunWriter._append
+    append = RecordingWriter._append
 
-    def full(writer: RunWriter, data: bytes) -> None:
+    def full(writer: RecordingWriter, data: bytes) -> None:
         if writer.size + len(data) > 200_000:
             raise OSError(errno.ENOSPC, "No space left on device")
         append(writer, data)
 
-    monkeypatch.setattr(RunWriter, "_append", full)
+    monkeypatch.setattr(RecordingWriter, "_append", full)
     with pytest.raises(OperationError, match=r"fox\.mcap: can't be written: [Nn]o space"):
         export_foxglove(open_run(recording), tmp_path / "fox.mcap")
     assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hilrig_recorder.mcap_format.channels import encode_message, file_descriptor_set
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
@@ -126,7 +126,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
             summary = reader.get_summary()
             if summary is None:
                 raise InputError(f"{run.path}: has no index; create one with `hilrig recover`")
-            writer = RunWriter(path, part=temporary, schemas=(), channels=(), library="hilrig export")
+            writer = RecordingWriter(path, temporary_path=temporary, schemas=(), channels=(), library="hilrig export")
             try:
                 visualization = _Visualization(
                     writer, run, arm, shapes, max(summary.schemas, default=0), max(summary.channels)
@@ -144,7 +144,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
                     )
                 _copy(run, writer, visualization, {channel.topic: channel.id for channel in summary.channels.values()})
                 writer.finish()
-                if writer.given_up:
+                if writer.dropped_count:
                     raise OperationError(f"{path}: can't be written: no space left on device")
                 writer.publish()
             except BaseException:
@@ -155,7 +155,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
     return path
 
 
-def _copy(run: Run, writer: RunWriter, visualization: "_Visualization", channel_ids: dict[str, int]) -> None:
+def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization", channel_ids: dict[str, int]) -> None:
     messages = run.file.messages(ALL)
     while block := list(islice(messages, BLOCK_ROWS)):
         visualization.prepare(block)
@@ -173,7 +173,7 @@ class _Visualization:
 
     def __init__(
         self,
-        writer: RunWriter,
+        writer: RecordingWriter,
         run: Run,
         arm: ArmGeometry,
         shapes: list[VisualShape],
