@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilrig_modbus_edge.impairment.model import Impairment, way_seed
+from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run, open_run
@@ -164,7 +164,7 @@ def test_each_command_has_the_delay_that_its_seed_gives_it(sessions: dict[str, S
     commands = sessions[rig].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
     way = WayImpairment.model_validate(COMMAND_RIGS[rig])
-    drawn, _ = Impairment(way, way_seed(SEED, rig, "command")).draw(2000)
+    drawn, _ = Impairment(way, link_seed(SEED, rig, "command")).draw(2000)
     expected = drawn[(commands["seq"] - commands["seq"][0]).astype(int)]
     assert commands["command_injected_ns"].tolist() == expected.tolist()
 
@@ -191,7 +191,7 @@ def test_injected_on_the_states_way_is_what_was_asked_for(sessions: dict[str, Se
     assert_stages_add_up(session)
     assert session.report.samples > 250
     table = session.report.table[5:-5]
-    drawn, _ = Impairment(WayImpairment.model_validate(STATE_WAY), way_seed(SEED, "state-way", "state")).draw(3000)
+    drawn, _ = Impairment(WayImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
     (first,) = np.flatnonzero(drawn == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
     assert table["injected"].tolist() == drawn[first + after].tolist()

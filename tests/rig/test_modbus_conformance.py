@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from generate_conformance import NAMED, RULES, Rule, as_markdown
-from hilrig_modbus_edge.server.listener import Connection
+from hilrig_modbus_edge.server.connection import Connection
 from support.edge_rig import EdgeRig, RawClient, counts, running_edge
 from support.waiting import eventually
 

@@ -42,7 +42,7 @@ class Wire:
         self._states: Handle | None = None
 
     def watch(self, deadline_ns: int) -> None:
-        """See `Outlet.watch`."""
+        """See `DeviceOutput.watch`."""
         loop = asyncio.get_running_loop()
         if self._timer is not None:
             self._timer.cancel()
@@ -50,13 +50,13 @@ class Wire:
         self._timer = loop.call_later(max(0, delay_ns) * 1e-9, self._on_deadline)
 
     def send_at(self, deadline_ns: int) -> None:
-        """See `Outlet.send_at`."""
+        """See `DeviceOutput.send_at`."""
         if self._send_ns is None or deadline_ns < self._send_ns:
             self._send_ns = deadline_ns
             asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
 
     def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
-        """See `Outlet.follow_states`."""
+        """See `DeviceOutput.follow_states`."""
         if self._states is not None:
             self._states.close()
             self._states = None
@@ -143,7 +143,7 @@ class Seat:
         server = self._server
         self.device.check(now_ns)
         if server.connections:
-            self.device.look()
+            self.device.refresh_state()
             server.close_idle(now_ns)
         if server.traffic.count and (now_ns >= self.traffic_due_ns or server.traffic.count >= MOST):
             late_ns = max(0, now_ns - self.traffic_due_ns)
@@ -163,7 +163,7 @@ class Seat:
 
     def shut(self, reason: str) -> None:
         """No torque, no lease, no session, no connection; `reason` is for people."""
-        self.device.shut(reason)
+        self.device.stop(reason)
         self._wire.follow_states(None)
         self._server.close(reason)
         if self._server.traffic.count:

@@ -10,7 +10,12 @@ from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge.command_scheduler import Departures
-from hilrig_modbus_edge.control_api import answer_control, answer_impairment, answer_lease, serve_on_loop
+from hilrig_modbus_edge.control_api import (
+    handle_control_query,
+    handle_impairment_query,
+    handle_lease_query,
+    serve_on_loop,
+)
 from hilrig_modbus_edge.rig_endpoint import Seat
 from hilrig_modbus_edge.server.event_loop import DirectLoop
 from hilrig_runtime.config.lab import RigSettings
@@ -91,9 +96,9 @@ class Edge:
                 raise
             self._state_sessions()
             for seat in self._seats.values():
-                seat.device.begin()
+                seat.device.start()
                 self._answer_people(seat)
-            answer = partial(answer_control, self, service.emit)
+            answer = partial(handle_control_query, self, service.emit)
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
             self._closing.enter_context(serve_on_loop(service.bus, key, self._loop, answer))
             await self._first_states()
@@ -125,7 +130,7 @@ class Edge:
             undo.pop_all()
         self._seats[rig.name] = seat
         self._answer_people(seat)
-        seat.device.begin()
+        seat.device.start()
         listening = self._loop.create_task(seat.listen())
         seat.closing.callback(listening.cancel)
         self._changed((*self._service.rigs, rig))
@@ -181,7 +186,7 @@ class Edge:
 
     def _answer_people(self, seat: Seat) -> None:
         bus, lab, device = self._service.bus, self._service.lab, seat.device
-        for topic, answer in ((topics.LEASE, answer_lease), (topics.IMPAIRMENT, answer_impairment)):
+        for topic, answer in ((topics.LEASE, handle_lease_query), (topics.IMPAIRMENT, handle_impairment_query)):
             key = topic.key(lab.name, device.rig)
             seat.closing.enter_context(serve_on_loop(bus, key, self._loop, partial(answer, device)))
 

@@ -14,7 +14,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
 from hilrig_modbus_edge.registers import codec
-from hilrig_modbus_edge.registers import map as registers
+from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
 from hilrig_runtime.errors import OperationError
 from hilrig_study.controllers.controllers import Controller, Measured
 from hilrig_study.simulation.simulated_loop import Scenario
@@ -53,14 +53,14 @@ class RigClient:
 
     def position(self) -> tuple[float, float, float, float]:
         """Joint positions as registers 5-8 say them; rad, rad, m, rad."""
-        words = self._read(lambda: self._client.read_holding_registers(registers.POSITION, count=4))
+        words = self._read(lambda: self._client.read_holding_registers(POSITION_ADDRESS, count=4))
         return codec.position_of(b"".join(word.to_bytes(2, "big") for word in words))
 
     def write(self, effort: list[float]) -> None:
         """Write registers 1-4; N·m, N·m, N, N·m."""
         data, _ = codec.words_of_effort(effort)
         words = [int.from_bytes(data[at : at + 2], "big") for at in range(0, 8, 2)]
-        self._read(lambda: self._client.write_registers(registers.TORQUE, words))
+        self._read(lambda: self._client.write_registers(TORQUE_ADDRESS, words))
 
     def close(self) -> None:
         """End the connection."""
