@@ -117,5 +117,5 @@ def test_parameters_come_back_as_they_were() -> None:
     parameters = RigParameters(arm=ArmParameters(l2=0.25))
     assert parameters_of(parameters.to_json()) == parameters
     assert parameters_of("") == RigParameters()
-    with pytest.raises(InputError, match="parameters are not understood"):
+    with pytest.raises(InputError, match="invalid rig parameters"):
         parameters_of("{}")

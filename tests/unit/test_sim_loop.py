@@ -11,9 +11,9 @@ from hilrig_runtime.errors import InputError
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event
 from hilrig_sim.arm.model import RigParameters
-from hilrig_sim.events import Reporter
+from hilrig_sim.events import SimulationEvents
 from hilrig_sim.parameters import rig_parameters
-from hilrig_sim.plant.limits import Happening, PlantEvent
+from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 from support.virtual_rig import VirtualRig
 
@@ -42,7 +42,7 @@ def test_the_state_is_sent_before_the_step_with_the_effort_that_acts_from_then_o
     assert list(applied.position[:2]) == [0.0, 0.0]
     following = rig.tick()
     plant = Plant([rig.parameters[0]])
-    plant.place(0, applied.position, applied.velocity)
+    plant.set_state(0, applied.position, applied.velocity)
     plant.step(np.array([applied.effort]).T, np.array([False]))
     assert list(following.position) == plant.position[:, 0].tolist()
     assert list(following.velocity) == plant.velocity[:, 0].tolist()
@@ -127,7 +127,7 @@ def test_a_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
     # Late for the deadline that was meant, not for the one that was taken up again.
     behind_ns = state.lateness_ns + 5 * 20_000_000
     assert overrun.overrun_data.lateness_ns == behind_ns
-    assert overrun.text == f"the simulation came {behind_ns / 1e6:.1f} ms late and gave up 5 steps"
+    assert overrun.text == f"simulation overrun: up to {behind_ns / 1e6:.1f} ms late, 5 steps skipped"
     rig.tick()
     assert rig.states[-1].missed_steps == 0
     assert rig.service.counters.overruns == 1
@@ -165,16 +165,16 @@ def test_a_states_lateness_is_that_of_its_stamp_not_of_the_tick_s_begin(rig: Vir
 
 def test_a_joint_that_rattles_at_its_stop_is_told_of_once_and_again_when_it_had_been_quiet() -> None:
     told: list[Event] = []
-    reporter = Reporter(told.append, ["rig1"], Plant([RigParameters()]))
-    hit = PlantEvent(Happening.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
+    reporter = SimulationEvents(told.append, ["rig1"], Plant([RigParameters()]))
+    hit = PlantEvent(PlantEventKind.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
     for now_ms in (0, 100, 300, 520, 800):
-        reporter.tell_of_plant([hit], now_ms, now_ms * 1_000_000, ["session"])
+        reporter.report_plant_events([hit], now_ms, now_ms * 1_000_000, ["session"])
     # From 520 to 800 ms it was quiet; the lower stop and the other joints have quiets of their own.
     assert [event.step for event in told] == [0, 800]
-    reporter.tell_of_plant([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
+    reporter.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
     assert [event.text for event in told[2:]] == [
-        "joint 1 came to its lower stop at 29 °/s",
-        "joint 2 came to its upper stop at 29 °/s",
+        "joint 1 hit its lower stop at 29 °/s",
+        "joint 2 hit its upper stop at 29 °/s",
     ]
 
 
@@ -210,7 +210,7 @@ def test_parameters_come_back_from_json_exactly() -> None:
     assert RigParameters.from_json(parameters.to_json()) == parameters
     assert json.loads(parameters.to_json())["scene"]["parts"][0]["name"] == "red"
     for text in ("", "{}", "[]", '{"arm": {}, "sim": {}, "scene": {"parts": [{"name": 1}], "trays": []}}'):
-        with pytest.raises(InputError, match="not understood"):
+        with pytest.raises(InputError, match="invalid rig parameters"):
             RigParameters.from_json(text)
 
 

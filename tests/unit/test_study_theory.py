@@ -48,7 +48,7 @@ def test_the_linear_step_is_the_derivative_of_the_arms_own_step(
             moved = np.zeros(12)
             moved[index] = sign * small
             arm = Plant([rig])
-            arm.place(0, tuple(np.array(pose) + moved[:4]), tuple(moved[4:8]))
+            arm.set_state(0, tuple(np.array(pose) + moved[:4]), tuple(moved[4:8]))
             arm.step((np.array(plant.holding) + moved[8:])[:, np.newaxis], np.zeros(1, dtype=np.bool_))
             ends.append(np.concatenate([arm.position[:, 0], arm.velocity[:, 0]]))
         found[:, index] = (ends[0] - ends[1]) / (2 * small)

@@ -16,7 +16,7 @@ from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import JointState, RigReport, topics
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import StepTimes
-from hilrig_sim.events import Reporter
+from hilrig_sim.events import SimulationEvents
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.state_encoder import RigState, loop_bytes, motion_bytes
 
@@ -45,7 +45,7 @@ class Simulation:
         self._step = 0
         self._effort = np.zeros((4, len(parameters)))
         self._magnet = np.zeros(len(parameters), dtype=np.bool_)
-        self._reporter = Reporter(service.emit, [rig.name for rig in service.rigs], self._plant)
+        self._events = SimulationEvents(service.emit, [rig.name for rig in service.rigs], self._plant)
         self._rigs = [
             self._rig_state(index, rig.name, values, self._plant)
             for index, (rig, values) in enumerate(zip(service.rigs, parameters, strict=True))
@@ -111,15 +111,15 @@ class Simulation:
         self._after_sending(latencies_ns)
         events = plant.step(self._effort, self._magnet)
         if events:
-            self._reporter.tell_of_plant(events, step + 1, sampled_ns, [rig.follower.session for rig in rigs])
+            self._events.report_plant_events(events, step + 1, sampled_ns, [rig.follower.session for rig in rigs])
         if not isfinite(plant.velocity.sum()):
             self._catch(step + 1)
         self._see()
         self._counters.count_tick(tick, self._step_ns)
         if overrun:
-            self._reporter.note_overrun(tick, step, self._step_ns)
-        if self._reporter.overran:
-            self._reporter.tell_of_overruns(sampled_ns)
+            self._events.record_overrun(tick, step, self._step_ns)
+        if self._events.overran:
+            self._events.report_overruns(sampled_ns)
 
     def _after_sending(self, latencies_ns: Mapping[int, int]) -> None:
         """Hand the efforts to the plant, and tell of commands that were lost."""
@@ -130,7 +130,7 @@ class Simulation:
             if follower.changed:
                 changed.append((rig.index, follower.effort, follower.magnet))
             if follower.lost or follower.back or follower.reset:
-                self._reporter.tell_of_commands(rig.index, follower, self._step)
+                self._events.report_command_changes(rig.index, follower, self._step)
         if changed:
             indices, efforts, magnets = zip(*changed, strict=True)
             self._effort[:, indices] = np.array(efforts).T
@@ -144,7 +144,7 @@ class Simulation:
     def add(self, name: str, plant: Plant) -> None:
         """Simulate one more rig, the last one of `plant`; the others of it are those that are simulated now."""
         count = len(self._rigs)
-        plant.adopt(self._plant, range(count), range(count))
+        plant.copy_state_from(self._plant, range(count), range(count))
         self._rigs.append(self._rig_state(count, name, plant.rigs[count], plant))
         self._effort = np.hstack([self._effort, np.zeros((4, 1))])
         self._magnet = np.append(self._magnet, False)
@@ -154,7 +154,7 @@ class Simulation:
     def remove(self, index: int, plant: Plant) -> None:
         """Simulate a rig no more; `plant` has all the others."""
         kept = [number for number in range(len(self._rigs)) if number != index]
-        plant.adopt(self._plant, range(len(kept)), kept)
+        plant.copy_state_from(self._plant, range(len(kept)), kept)
         del self._rigs[index]
         self._effort, self._magnet = self._effort[:, kept].copy(), self._magnet[kept]
         self._states.remove(index)
@@ -174,7 +174,7 @@ class Simulation:
         self._plant = plant
         for index, rig in enumerate(self._rigs):
             rig.move_to(index, plant)
-        self._reporter.regroup([rig.name for rig in self._rigs], plant)
+        self._events.set_rigs([rig.name for rig in self._rigs], plant)
         self._see()
 
     def _rig_reports(self) -> list[RigReport]:
@@ -185,7 +185,7 @@ class Simulation:
         for rig in self._rigs:
             if not np.isfinite(self._plant.velocity[:, rig.index]).all():
                 self._plant.reset(rig.index)
-                self._reporter.tell_of_escape(rig.index, rig.follower.session, step)
+                self._events.report_divergence(rig.index, rig.follower.session, step)
 
     def _warm_up(self) -> None:
         """Take the first steps, which are slow, before time counts."""

@@ -8,7 +8,7 @@ from hilrig_runtime.timing.rate import Rate
 from hilrig_runtime.timing.realtime import freeze_garbage
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
-from hilrig_sim.rig_registry import Membership
+from hilrig_sim.rig_registry import RigRegistry
 
 
 def run(service: Service) -> None:
@@ -22,7 +22,7 @@ def run(service: Service) -> None:
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
     turns = Turns()
-    with Membership(service, simulation, turns):
+    with RigRegistry(service, simulation, turns):
         rate = Rate(step_ns, service.clock)
         freeze_garbage()
         service.ready()

@@ -15,7 +15,7 @@ from hilrig_schemas import JointState, PartState, RigReport
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import CommandFollower, StepTimes
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.plant.world import NONE
+from hilrig_sim.plant.world import NO_PART
 
 ALL_PARTS_PERIOD_NS: Final = 1_000_000_000
 """All parts are stated at least so often, ns."""
@@ -183,6 +183,6 @@ class RigState:
             strict=False,
         )
         held = int(world.held[index])
-        self._held_part = self._part_names[held] if held != NONE else ""
+        self._held_part = self._part_names[held] if held != NO_PART else ""
         parts = [PartState(name=name, x=x, y=y, z=z, yaw=yaw) for name, x, y, z, yaw in poses]
         return JointState(parts=parts).SerializeToString()
