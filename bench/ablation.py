@@ -67,6 +67,7 @@ def loop(client: Path, step_ms: float, seconds: float) -> Figures:
     ms = run.samples["loop"] / 1e6
     return {f"{step_ms:g} ms: loop p{p:g}, ms": float(np.percentile(ms, p)) for p in (50, 99, 99.9)} | {
         f"{step_ms:g} ms: cycles, 1/s": run.figures["cycles_per_s"],
+        f"{step_ms:g} ms: edge processor a cycle, us": run.edge_us,
         f"{step_ms:g} ms: steal": run.stolen,
     }
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import harness
 import numpy as np
-from harness import Report, build_c, percentile, progress, write_lab
+from harness import Report, build_c, cpu_seconds, percentile, progress, write_lab
 from numpy.typing import NDArray
 from stolen import StolenTime
 
@@ -99,18 +99,23 @@ class RigRun:
     figures: dict[str, Any]
     """The controller's own."""
     stolen: float
-    """Taken away by the host, processors."""
+    """CPU steal time, processors."""
+    edge_us: float
+    """Processor time of the edge for one cycle of the controller, µs."""
 
 
 def rig_run(client: Path, step_ms: float, seconds: float) -> RigRun:
     with tempfile.TemporaryDirectory() as folder:
         lab, config, port = write_lab(Path(folder), step_ms=step_ms)
-        with running_lab(lab, config, say, threading.Event()), StolenTime() as stolen:
+        with running_lab(lab, config, say, threading.Event()) as supervisor, StolenTime() as stolen:
+            before_s = cpu_seconds(supervisor.pids["edge"])
             figures = run_client(client, port, seconds)
+            edge_s = cpu_seconds(supervisor.pids["edge"]) - before_s
         (recording,) = Path(folder).rglob("*.mcap")
         found = latency.measure(open_run(recording))
     counts = stolen.undisturbed(found.table["wall_ns"])
-    return RigRun(found.table, counts, found.lost.transport + found.lost.recorder, figures, stolen.share)
+    edge_us = 1e6 * edge_s / (figures["cycles_per_s"] * seconds)
+    return RigRun(found.table, counts, found.lost.transport + found.lost.recorder, figures, stolen.share, edge_us)
 
 
 def add_loop(report: Report, step_ms: float, runs: list[RigRun]) -> None:
@@ -131,6 +136,7 @@ def add_loop(report: Report, step_ms: float, runs: list[RigRun]) -> None:
         report.add(case, f"stage {stage} p50", float(np.median(samples[stage])) / 1e6, "ms")
     report.add(case, "lost", max(run.lost for run in runs), "count")
     report.add(case, "Modbus cycles", statistics.median(run.figures["cycles_per_s"] for run in runs), "1/s")
+    report.add(case, "edge, processor time a cycle", statistics.median(run.edge_us for run in runs), "µs")
     for name, bound in PROMISED[step_ms].items():
         report.bar(f"{step_ms:g} ms step: loop {name} in steps", loop[name] / step_ms, "<=", bound)
 

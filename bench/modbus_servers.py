@@ -22,7 +22,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from hilrig_cli.local.demo import free_ports
-from hilrig_modbus_edge.command_scheduler import GATHER_NS, LAST_NS
+from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.service import run as run_edge
 from hilrig_runtime.bus.api import KEPT, Publisher
 from hilrig_runtime.bus.memory_bus import MemoryBus
@@ -163,7 +163,7 @@ COMMANDS_A_TICK = 400
 
 
 def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
-    """In the edge's place, without Modbus: two departures a step, and one batch for the log stream."""
+    """In the edge's place, without Modbus: two messages of commands a step, and one batch for the log stream."""
     go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
     names = [rig.name for rig in lab.rigs]
@@ -185,9 +185,9 @@ def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
                 time.sleep(0.0002)
                 continue
             shown = state
-            wait_until(state.arrived_ns + GATHER_NS)
+            wait_until(state.arrived_ns + COALESCE_WINDOW_NS)
             put(departure)
-            wait_until(state.arrived_ns + lab.sim.step_ns - LAST_NS)
+            wait_until(state.arrived_ns + lab.sim.step_ns - DEADLINE_MARGIN_NS)
             put(departure)
             service.log.extend([(key, number, time.time_ns(), encoded) for number in range(COMMANDS_A_TICK)])
             service.beat(time.monotonic_ns())

@@ -7,153 +7,49 @@ from typing import Any
 
 def no_coalescing() -> None:
     """Every command is sent at once, in a message of its own."""
-    from hilrig_modbus_edge.command_scheduler import Departures
+    from hilrig_modbus_edge.command_scheduler import CommandScheduler
 
-    def look(self: Any) -> None:
-        self._count = 0
-
-    Departures.look = look
+    CommandScheduler._send_time = lambda self, rig, now_ns: now_ns
 
 
 def fixed_window() -> None:
-    """Commands that come within 2 ms are sent together; no rule about the tick."""
-    from hilrig_modbus_edge import command_scheduler as departures
+    """Commands that arrive within 2 ms are sent together; no deadline."""
+    from hilrig_modbus_edge import command_scheduler
 
-    departures.Departures._waits_ns = lambda self, rig, now_ns: departures.GATHER_NS
+    def send_time(self: Any, rig: str, now_ns: int) -> int:
+        return now_ns + command_scheduler.COALESCE_WINDOW_NS
 
-
-def two_rules() -> None:
-    """First command on a state: 2 ms window, none within 3 ms of the tick. Later ones: 1.5 ms before the tick."""
-    from hilrig_modbus_edge import command_scheduler as departures
-
-    def waits_ns(self: Any, rig: str, now_ns: int) -> int:
-        state = self._newest_state(rig)
-        state_ns = 0 if state is None else state.arrived_ns
-        to_tick_ns = state_ns + self._step_ns - now_ns
-        first = self._said.get(rig) != state_ns
-        self._said[rig] = state_ns
-        if first:
-            return 0 if to_tick_ns < departures.NEAR_NS else departures.GATHER_NS
-        return max(0, to_tick_ns - departures.LAST_NS)
-
-    departures.Departures._waits_ns = waits_ns
+    command_scheduler.CommandScheduler._send_time = send_time
 
 
-def _throttle(window_ns: int, margin_ns: int) -> Callable[[], None]:
-    def disable() -> None:
-        from hilrig_modbus_edge.command_scheduler import Departures
+def no_further_writes() -> None:
+    """All commands of a rig are prompt, however often its controller writes."""
+    from hilrig_modbus_edge import command_scheduler
 
-        flush = Departures.flush
-
-        def flush_and_note(self: Any) -> None:
-            flush(self)
-            self._state_count = self._monotonic_ns()
-
-        def send(self: Any, rig: str, command: bytes) -> None:
-            self._waiting[rig] = command
-            now_ns = self._monotonic_ns()
-            state = self._newest_state(rig)
-            due_ns = getattr(self, "_state_count", 0) + window_ns
-            if state is not None:
-                tick_ns = state.arrived_ns + self._step_ns
-                if tick_ns + self._step_ns > now_ns:
-                    due_ns = min(due_ns, tick_ns - margin_ns)
-            if due_ns <= now_ns:
-                self.flush()
-            else:
-                self._leave_at(due_ns)
-
-        Departures.send, Departures.flush, Departures.look = send, flush_and_note, lambda self: None
-
-    return disable
-
-
-def throttle_2_ms() -> None:
-    """At most a message in 2 ms; nothing waits in the last 1.5 ms before the tick."""
-    _throttle(2_000_000, 1_500_000)()
-
-
-def throttle_1_ms() -> None:
-    """At most a message in 1 ms; nothing waits in the last 1.5 ms before the tick."""
-    _throttle(1_000_000, 1_500_000)()
-
-
-def edge_tick_unaligned() -> None:
-    """The edge's own tick is not moved behind the last command before the simulation's tick."""
-    from hilrig_modbus_edge.command_scheduler import Departures
-
-    Departures.after_last = lambda self, rig, when_ns: when_ns
+    command_scheduler.SEPARATE_WRITES = 1 << 30
 
 
 def edge_tick_whole() -> None:
-    """All rigs are looked after at once in the edge's tick."""
-    from hilrig_modbus_edge import service as bridge
+    """One turn of the event loop maintains all rigs in the edge's tick."""
+    from hilrig_modbus_edge import service
 
-    bridge.MOST_TURNS = 1
+    service.RIGS_PER_TURN = 1 << 30
 
 
 def no_pre_encoding() -> None:
     """States are encoded at the tick."""
     from hilrig_sim.loop import Simulation
 
-    Simulation.look_ahead = lambda self, tick_ns: None
-
-
-def _passes(*parts: int) -> Callable[[], None]:
-    def disable() -> None:
-        from hilrig_sim import loop
-
-        loop.AHEAD = parts
-
-    return disable
-
-
-def one_pass_early() -> None:
-    """States are encoded once, a quarter of a step before the tick."""
-    _passes(4)()
-
-
-def one_pass_late() -> None:
-    """States are encoded once, a twelfth of a step before the tick."""
-    _passes(12)()
-
-
-def asyncio_readers() -> None:
-    """Sockets are served from asyncio's queue: `loop.add_reader` with the same receive call."""
-    from selectors import EVENT_READ, EVENT_WRITE
-
-    from hilrig_modbus_edge.server.event_loop import DirectTransport
-
-    def want(self: Any) -> None:
-        wanted = 0
-        if not self._lost:
-            if self._reading and not self._closing and self._protocol is not None:
-                wanted = EVENT_READ
-            if self._waiting:
-                wanted |= EVENT_WRITE
-        changed, self._wanted = wanted ^ self._wanted, wanted
-        if changed & EVENT_READ:
-            if wanted & EVENT_READ:
-                self._loop.add_reader(self._socket, self._on_event, EVENT_READ)
-            else:
-                self._loop.remove_reader(self._socket)
-        if changed & EVENT_WRITE:
-            if wanted & EVENT_WRITE:
-                self._loop.add_writer(self._socket, self._on_event, EVENT_WRITE)
-            else:
-                self._loop.remove_writer(self._socket)
-
-    DirectTransport._want = want
+    Simulation.pre_encode = lambda self, tick_ns: None
 
 
 def millisecond_timers() -> None:
-    """The loop waits in whole milliseconds, as asyncio does; sockets are served from asyncio's queue too."""
+    """The edge's event loop waits in whole milliseconds, as asyncio does."""
     import selectors
 
-    from hilrig_modbus_edge.server.event_loop import DirectSelector
+    from hilrig_modbus_edge.server.event_loop import ExactSelector
 
-    asyncio_readers()
-    DirectSelector.select = selectors.EpollSelector.select
+    ExactSelector.select = selectors.DefaultSelector.select
 
 
 def no_priorities() -> None:
@@ -207,55 +103,27 @@ def no_state_batch() -> None:
     BatchSender.send = send_each
 
 
-def plain_request_log() -> None:
-    """The kind of each logged request is decoded anew."""
-    from hilrig_modbus_edge import request_log as traffic
-
-    def note(self: Any, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
-        self._add_index(self._index(traffic._kind_of(pdu[:5]), exception, controller))
-        self._add_arrived_ns(arrived_ns)
-        self._add_answered_after_ns(answered_ns - arrived_ns)
-
-    traffic.TrafficRecord.note = note
-
-
 VARIANTS: dict[str, tuple[Callable[[], None], ...]] = {
     "full": (),
+    "full again": (),
     "no coalescing": (no_coalescing,),
-    "coalescing: fixed 2 ms window": (fixed_window,),
-    "coalescing: two rules": (two_rules,),
-    "coalescing: throttle 2 ms": (throttle_2_ms,),
-    "coalescing: throttle 1 ms": (throttle_1_ms,),
-    "edge tick not aligned": (edge_tick_unaligned,),
-    "edge tick in one turn": (edge_tick_whole,),
+    "fixed window": (fixed_window,),
+    "no rule for further writes": (no_further_writes,),
     "no pre-encoding": (no_pre_encoding,),
-    "one pre-encoding pass, early": (one_pass_early,),
-    "one pre-encoding pass, late": (one_pass_late,),
-    "sockets by add_reader": (asyncio_readers,),
-    "add_reader, timers in ms": (millisecond_timers,),
+    "timers in ms": (millisecond_timers,),
+    "edge tick in one turn": (edge_tick_whole,),
     "no priorities": (no_priorities,),
     "receivers not ahead": (receivers_not_ahead,),
     "no batch of the log": (no_log_batch,),
     "no batch of states": (no_state_batch,),
-    "plain request log": (plain_request_log,),
-    "all but coalescing and one pass": (
-        two_rules,
-        edge_tick_unaligned,
-        edge_tick_whole,
-        one_pass_late,
-        asyncio_readers,
-        receivers_not_ahead,
-        plain_request_log,
-    ),
     "all": (
         no_coalescing,
-        edge_tick_unaligned,
-        edge_tick_whole,
         no_pre_encoding,
         millisecond_timers,
+        edge_tick_whole,
         no_priorities,
         no_log_batch,
         no_state_batch,
-        plain_request_log,
     ),
 }
+"""Name → the functions that disable something; `full again` shows the spread of the measurement."""

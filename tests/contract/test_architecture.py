@@ -1,32 +1,43 @@
-"""ARCHITECTURE.md names every module, and names none that is gone."""
+"""ARCHITECTURE.md and the tree agree: each subpackage is described, and each described folder exists."""
 
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "ARCHITECTURE.md").read_text()
-FLOORS = {
-    "runtime": "runtime/hilrig_runtime",
-    "sim": "services/sim/hilrig_sim",
-    "modbus_edge": "services/modbus_edge/hilrig_modbus_edge",
-    "recorder": "services/recorder/hilrig_recorder",
-    "replay": "tools/replay/hilrig_replay",
-    "study": "tools/study/hilrig_study",
-    "monitoring": "tools/monitoring/hilrig_monitoring",
-    "console": "tools/console/hilrig_console",
-}
+PAGE = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+PACKAGES = {path.parent.name: path for path in sorted(ROOT.glob("*/hilrig_*")) + sorted(ROOT.glob("*/*/hilrig_*"))}
+MAX_MODULES = 14
+"""About a dozen modules a folder."""
 
 
-@pytest.mark.parametrize("floor", FLOORS)
-def test_each_module_of_a_package_is_named_and_exists(floor: str) -> None:
-    paragraph = PAGE.partition(f"**{floor}** —")[2].partition("\n\n")[0]
-    named = set(re.findall(r"`([a-z_0-9]+(?:\.[a-z_0-9]+)?)`", paragraph)) - {"lab.toml"}
-    package = ROOT / FLOORS[floor]
-    files = (path.relative_to(package).with_suffix("") for path in package.rglob("*.py") if path.stem != "__init__")
-    modules = {".".join(file.parts) for file in files}
-    assert modules - named == set(), "not in ARCHITECTURE.md"
-    # `hilrig` subcommands may be named beside modules; a word that is neither is a module that is gone.
-    commands = {path.stem for path in (ROOT / "tools/cli/hilrig_cli/commands").glob("*.py")}
-    assert named - modules - commands == set(), "no module of that name any more"
+def subpackages(package: Path) -> set[str]:
+    return {path.parent.name for path in package.glob("*/__init__.py")}
+
+
+def described() -> dict[str, set[str]]:
+    rows, package = {}, ""
+    for line in PAGE.partition("\n## Packages\n")[2].partition("\n## ")[0].splitlines():
+        if match := re.match(r"\| (\w*) ?\| `(\w+)` \|", line):
+            package = match[1] or package
+            rows.setdefault(package, set()).add(match[2])
+    return rows
+
+
+def test_architecture_page_lists_every_subpackage() -> None:
+    assert described() == {name: found for name, path in PACKAGES.items() if (found := subpackages(path))}
+
+
+def test_architecture_page_names_existing_folders() -> None:
+    folders = re.findall(r"`((?:tools|services|runtime|schemas|tests|scripts|bench|examples)[\w/]*/?)`", PAGE)
+    assert folders
+    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
+def test_subpackages_have_about_a_dozen_modules() -> None:
+    counts = {
+        str(folder.relative_to(ROOT)): len([path for path in folder.glob("*.py") if path.stem != "__init__"])
+        for package in PACKAGES.values()
+        for folder in [package, *(package / name for name in subpackages(package))]
+        if folder.name not in ("commands", "v1")
+    }
+    assert {folder: count for folder, count in counts.items() if count > MAX_MODULES} == {}

@@ -47,7 +47,7 @@ class VirtualRig:
     def tick(self, count: int = 1) -> JointState:
         """Let steps pass; the last state sent."""
         for _ in range(count):
-            self.simulation.look_ahead(self._rate.next_ns)
+            self.simulation.pre_encode(self._rate.next_ns)
             self.simulation.tick(self._rate.wait())
         return self.states[-1]
 

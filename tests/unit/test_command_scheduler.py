@@ -1,20 +1,15 @@
-"""When commands leave: at once where they are few; where they are many together, each in time for its tick."""
+"""Scheduling of commands: sent at once where they are rare, coalesced where they are many, in time for the tick."""
 
 import itertools
 
 import pytest
 
-from hilrig_modbus_edge import command_scheduler as departures
 from hilrig_modbus_edge.command_scheduler import (
-    FEW,
-    GATHER_NS,
-    JUST_AFTER_NS,
-    LAST_NS,
-    MANY,
-    NEAR_NS,
-    PARTS,
-    Departures,
+    COALESCE_WINDOW_NS,
+    DEADLINE_MARGIN_NS,
+    CommandScheduler,
 )
+from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
 from hilrig_runtime.messaging.endpoints import LatestOfBatches
 from hilrig_runtime.process.health import Counters
 from hilrig_runtime.timing.clock import ManualClock
@@ -26,7 +21,7 @@ RIGS = ("other", *(f"rig{number}" for number in range(7)))
 
 
 class Call:
-    """What was asked for."""
+    """A scheduled call."""
 
     def __init__(self, at_ns: int, call: object) -> None:
         self.at_ns, self.call, self.cancelled = at_ns, call, False
@@ -36,22 +31,22 @@ class Call:
 
 
 class Edge:
-    """Departures on a clock of their own; `left` is what left, with the time since the last states, ns."""
+    """A scheduler on a clock of its own; `sent` are its messages, with the time since the last states, ns."""
 
     def __init__(self, step_ns: int = STEP_NS) -> None:
         self.clock = ManualClock()
         self.states = LatestOfBatches(self.clock, Counters(), {})
         self.timers: list[Call] = []
-        self.left: list[tuple[int, dict[str, bytes]]] = []
-        self.departures = Departures("edge/1", self._put, self.states.get, step_ns, self.clock, self._call_at)
-        self.send = self.departures.send
-        self.ticked_ns = 0
+        self.sent: list[tuple[int, dict[str, bytes]]] = []
+        scheduler = CommandScheduler("edge/1", self._put, self.states.get, step_ns, self.clock, self._call_at)
+        self.send, self.flush = scheduler.send, scheduler.flush
+        self.clock.advance(10 * STEP_NS)
         self.tick()
 
     def _put(self, payload: bytes) -> None:
         batch = RigBatch.FromString(payload)
         assert batch.source == "edge/1"
-        self.left.append((self.since_tick_ns, dict(zip(batch.rigs, batch.messages, strict=True))))
+        self.sent.append((self.since_tick_ns, dict(zip(batch.rigs, batch.messages, strict=True))))
 
     def _call_at(self, when_s: float, call: object) -> Call:
         self.timers.append(Call(round(when_s * 1e9), call))
@@ -66,13 +61,13 @@ class Edge:
         return [timer for timer in self.timers if not timer.cancelled]
 
     def tick(self, *rigs: str) -> None:
-        """States come, of all rigs if none is named."""
+        """States arrive: those of the named rigs, or of all."""
         self.ticked_ns = self.clock.monotonic_ns()
         batch = RigBatch(rigs=rigs or RIGS, messages=[b""] * len(rigs or RIGS))
         self.states.on_message("", batch.SerializeToString())
 
-    def go_to(self, since_tick_ns: int) -> None:
-        """Let time pass, and what is due be called."""
+    def advance_to(self, since_tick_ns: int) -> None:
+        """Advance the clock, with the scheduled calls that become due."""
         until_ns = self.ticked_ns + since_tick_ns
         while (due := min(self.pending, key=lambda timer: timer.at_ns, default=None)) and due.at_ns <= until_ns:
             self.timers.remove(due)
@@ -80,230 +75,176 @@ class Edge:
             due.call()  # type: ignore[operator]
         self.clock.advance(until_ns - self.clock.monotonic_ns())
 
-    def be_many(self, tick_ns: int = 0) -> None:
-        """So many came that they wait for each other from now on; states have just come."""
-        for _ in range(MANY):
-            self.send("other", b"")
-        self.departures.look()
-        self.left.clear()
-        self.clock.advance(STEP_NS + tick_ns)
-        self.tick()
 
-
-def test_where_there_are_few_each_command_leaves_at_once() -> None:
+def test_sends_rare_commands_at_once() -> None:
     edge = Edge()
-    for _ in range(3):
-        for _ in range(MANY - 1):
-            edge.send("rig1", b"x")
-        edge.departures.look()
-    assert len(edge.left) == 3 * (MANY - 1)
+    for number in range(100):
+        edge.advance_to(number * COALESCE_WINDOW_NS)
+        edge.tick()
+        edge.send("rig1", b"%d" % number)
+        edge.clock.advance(COALESCE_WINDOW_NS)
+    assert [commands for _, commands in edge.sent] == [{"rig1": b"%d" % number} for number in range(100)]
     assert edge.timers == []
 
 
-def test_where_there_are_many_the_first_words_of_a_short_while_leave_together() -> None:
+def test_coalesces_commands_within_the_window() -> None:
     edge = Edge()
-    edge.be_many()
-    edge.go_to(500 * US)
+    edge.advance_to(500 * US)
     edge.send("rig1", b"a")
-    edge.go_to(700 * US)
+    edge.advance_to(700 * US)
     edge.send("rig2", b"b")
-    assert edge.left == []
-    edge.go_to(10_000 * US)
-    assert edge.left == [(500 * US + GATHER_NS, {"rig1": b"a", "rig2": b"b"})]
+    edge.advance_to(900 * US)
+    edge.send("rig3", b"c")
+    assert edge.sent == [(500 * US, {"rig1": b"a"})]
+    edge.advance_to(10_000 * US)
+    assert edge.sent[1:] == [(500 * US + COALESCE_WINDOW_NS, {"rig2": b"b", "rig3": b"c"})]
 
 
-def test_a_first_word_that_comes_near_the_tick_does_not_wait() -> None:
-    edge = Edge()
-    edge.be_many()
-    now_ns = STEP_NS - NEAR_NS + 1
-    edge.go_to(now_ns)
-    edge.send("rig1", b"a")
-    edge.send("rig2", b"b")
-    assert edge.left == []
-    # It is the next thing that the loop does.
-    edge.go_to(now_ns)
-    assert edge.left == [(now_ns, {"rig1": b"a", "rig2": b"b"})]
-
-
-def test_of_a_controller_that_asks_again_and_again_the_newest_word_leaves_in_time_for_the_tick() -> None:
-    edge = Edge()
-    edge.be_many()
-    edge.send("rig1", b"first")
-    edge.go_to(GATHER_NS)
-    assert edge.left == [(GATHER_NS, {"rig1": b"first"})]
-    for number in range(3, 19):
-        edge.go_to(number * 1000 * US)
-        edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS - LAST_NS)
-    assert edge.left[1:] == [(STEP_NS - LAST_NS, {"rig1": b"18"})]
-
-
-def test_what_is_fresh_takes_along_what_can_wait() -> None:
-    edge = Edge()
-    edge.be_many()
-    edge.send("rig1", b"first")
-    edge.go_to(GATHER_NS)
-    edge.send("rig1", b"second")
-    edge.go_to(5_000 * US)
-    edge.send("rig2", b"first")
-    edge.go_to(STEP_NS)
-    assert edge.left[1:] == [(5_000 * US + GATHER_NS, {"rig1": b"second", "rig2": b"first"})]
-
-
-def test_shortly_before_the_tick_the_words_of_one_who_says_few_leave_at_short_distances() -> None:
-    edge = Edge()
-    edge.be_many()
-    first_ns = STEP_NS - LAST_NS
-    edge.go_to(first_ns)
-    for number in range(FEW):
-        edge.go_to(first_ns + number * 100 * US)
-        edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS)
-    times = [at_ns for at_ns, _ in edge.left]
-    assert times[0] == first_ns
-    distances = {after - before for before, after in itertools.pairwise(times)}
-    # The next begins to wait with the first command after a departure.
-    assert max(distances) <= STEP_NS // PARTS + 100 * US
-    assert min(distances) >= STEP_NS // PARTS
-    assert edge.left[-1][1] == {"rig1": b"%d" % (FEW - 1)}
-
-
-def test_shortly_before_the_tick_one_who_asks_again_and_again_waits_for_the_next_states() -> None:
-    edge = Edge()
-    edge.be_many()
-    for number in range(FEW):
-        edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS - LAST_NS)
-    edge.left.clear()
-    for number in range(FEW, 50):
-        edge.go_to(STEP_NS - LAST_NS + number * 10 * US)
-        edge.send("rig1", b"%d" % number)
-    # The tick of the simulation, and its states.
-    edge.go_to(STEP_NS)
-    edge.tick()
-    edge.send("rig1", b"first on the next states")
-    edge.go_to(10_000 * US)
-    assert edge.left == [(GATHER_NS, {"rig1": b"first on the next states"})]
-
-
-def test_what_waits_for_the_next_states_leaves_though_they_do_not_come_and_nobody_writes_again() -> None:
-    edge = Edge()
-    edge.be_many()
-    for _ in range(FEW):
-        edge.send("rig1", b"before")
-    edge.go_to(STEP_NS - 1_000 * US)
-    edge.left.clear()
-    edge.send("rig1", b"last")
-    edge.go_to(2 * STEP_NS)
-    assert edge.left == [(STEP_NS + GATHER_NS, {"rig1": b"last"})]
-
-
-def test_while_the_tick_is_late_commands_leave_at_short_distances() -> None:
-    edge = Edge()
-    edge.be_many()
-    for number in range(FEW):
-        edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS + GATHER_NS)
-    edge.left.clear()
-    for number in range(400):
-        edge.go_to(STEP_NS + GATHER_NS + number * 10 * US)
-        edge.send("rig1", b"%d" % number)
-    edge.go_to(STEP_NS + 8_000 * US)
-    times = [at_ns for at_ns, _ in edge.left]
-    distances = {after - before for before, after in itertools.pairwise(times)}
-    # The next begins to wait with the first command after a departure.
-    assert max(distances) <= STEP_NS // PARTS + 10 * US
-    assert min(distances) >= STEP_NS // PARTS
-    assert edge.left[-1][1] == {"rig1": b"399"}
-
-
-def test_the_moment_after_the_last_departure_is_the_nearest_one() -> None:
-    edge = Edge()
-    just_after_ns = edge.ticked_ns + STEP_NS - LAST_NS + JUST_AFTER_NS
-    for steps in (0, 1, 2, 10):
-        for off_ns in (-STEP_NS // 2 + 1, -1, 0, 1, STEP_NS // 2 - 1):
-            at_ns = just_after_ns + steps * STEP_NS
-            assert edge.departures.after_last("rig1", at_ns + off_ns) == at_ns
-
-
-def test_while_no_state_has_come_every_moment_is_as_good() -> None:
-    assert Edge().departures.after_last("a rig without a state", 12_345) == 12_345
-
-
-@pytest.mark.parametrize("step_ns", [1_000_000, 5_000_000])
-def test_at_a_short_step_a_first_word_leaves_at_once_and_the_newest_a_little_later(step_ns: int) -> None:
+@pytest.mark.parametrize("step_ns", [1_000_000, 5_000_000, STEP_NS])
+def test_delays_no_prompt_command_beyond_the_deadline(step_ns: int) -> None:
     edge = Edge(step_ns)
-    edge.be_many()
-    late_ns = max(0, step_ns - NEAR_NS) + 1
-    edge.go_to(late_ns)
-    edge.send("rig1", b"first")
-    edge.go_to(late_ns)
-    assert edge.left == [(late_ns, {"rig1": b"first"})]
-    edge.send("rig1", b"second")
-    edge.go_to(max(late_ns + step_ns // PARTS, step_ns - LAST_NS))
-    assert edge.left[1][1] == {"rig1": b"second"}
+    deadline_ns = step_ns - DEADLINE_MARGIN_NS
+    edge.advance_to(max(0, deadline_ns - 100 * US))
+    edge.send("rig1", b"a")
+    edge.send("rig2", b"b")
+    edge.advance_to(max(0, deadline_ns))
+    edge.send("rig3", b"c")
+    edge.send("rig4", b"d")
+    edge.advance_to(step_ns)
+    assert [at_ns for at_ns, _ in edge.sent] in (
+        [deadline_ns - 100 * US, deadline_ns, deadline_ns, deadline_ns],
+        [0, 0, 0, 0],
+    )
+    assert {rig for _, commands in edge.sent for rig in commands} == {"rig1", "rig2", "rig3", "rig4"}
 
 
-def test_each_rig_has_the_tick_of_its_own_simulation() -> None:
+def test_separate_writes_before_the_tick_are_sent_at_once() -> None:
     edge = Edge()
-    edge.be_many()
-    edge.go_to(9_000 * US)
-    edge.tick("rig2")
-    # 2 ms before the next tick of rig1's simulation, 11 ms before that of rig2's.
-    edge.go_to(9_000 * US)
-    edge.send("rig2", b"far")
-    edge.send("rig1", b"near")
-    edge.go_to(9_000 * US)
-    assert edge.left == [(9_000 * US, {"rig1": b"near", "rig2": b"far"})]
-    edge.send("rig2", b"far again")
-    edge.send("rig1", b"near again")
-    edge.go_to(STEP_NS)
-    assert edge.left[1:] == [(11_000 * US - LAST_NS, {"rig1": b"near again", "rig2": b"far again"})]
-
-
-def test_while_the_simulation_is_silent_commands_leave_as_seldom_as_they_can() -> None:
-    edge = Edge()
-    edge.be_many()
-    edge.send("rig1", b"first")
-    edge.go_to(2 * STEP_NS)
-    edge.left.clear()
-    for number in range(1, 1001):
-        edge.go_to(2 * STEP_NS + number * 100 * US)
+    edge.advance_to(STEP_NS - DEADLINE_MARGIN_NS)
+    for number in range(SEPARATE_WRITES):
+        edge.advance_to(STEP_NS - DEADLINE_MARGIN_NS + number * 100 * US)
         edge.send("rig1", b"%d" % number)
-    # 100 ms of them.
-    assert 4 <= len(edge.left) <= 6
-    # It comes back.
+    assert [commands["rig1"] for _, commands in edge.sent] == [b"%d" % number for number in range(SEPARATE_WRITES)]
+
+
+def test_replaces_further_commands_on_a_state_until_the_deadline() -> None:
+    edge = Edge()
+    for number in range(180):
+        edge.advance_to(number * 100 * US)
+        edge.send("rig1", b"%d" % number)
+    edge.advance_to(STEP_NS - DEADLINE_MARGIN_NS)
+    assert edge.sent[0] == (0, {"rig1": b"0"})
+    assert edge.sent[-1] == (STEP_NS - DEADLINE_MARGIN_NS, {"rig1": b"179"})
+    # The first command, the end of its window, the deadline.
+    assert len(edge.sent) == 3
+
+
+def test_further_commands_after_the_deadline_wait_for_the_window() -> None:
+    edge = Edge()
+    for number in range(SEPARATE_WRITES):
+        edge.send("rig1", b"%d" % number)
+    edge.advance_to(STEP_NS - DEADLINE_MARGIN_NS)
+    edge.send("rig1", b"near")
+    edge.send("rig1", b"nearer")
+    edge.sent.clear()
+    edge.advance_to(STEP_NS)
+    edge.tick()
+    edge.send("rig1", b"next state")
+    edge.advance_to(10_000 * US)
+    assert edge.sent == [(COALESCE_WINDOW_NS - DEADLINE_MARGIN_NS, {"rig1": b"next state"})]
+
+
+def test_pending_command_is_sent_though_no_state_follows() -> None:
+    edge = Edge()
+    for _ in range(SEPARATE_WRITES):
+        edge.send("rig1", b"before")
+    edge.advance_to(STEP_NS - 1_000 * US)
+    edge.sent.clear()
+    edge.send("rig1", b"last")
+    edge.advance_to(2 * STEP_NS)
+    assert [commands for _, commands in edge.sent] == [{"rig1": b"last"}]
+
+
+def test_prompt_command_carries_the_pending_ones() -> None:
+    edge = Edge()
+    for number in range(SEPARATE_WRITES + 1):
+        edge.send("rig1", b"%d" % number)
+    edge.advance_to(5_000 * US)
+    edge.sent.clear()
+    edge.send("rig1", b"further")
+    edge.send("rig2", b"first")
+    assert edge.sent == [(5_000 * US, {"rig1": b"further", "rig2": b"first"})]
+
+
+def test_each_rig_has_the_deadline_of_its_own_simulation() -> None:
+    edge = Edge()
+    edge.advance_to(9_000 * US)
+    edge.tick("rig2")
+    # rig1's simulation has its next tick in 11 ms, rig2's in 20 ms.
+    for rig in ("rig1", "rig2"):
+        for _ in range(SEPARATE_WRITES):
+            edge.send(rig, b"first")
+    edge.advance_to(5_000 * US)
+    edge.sent.clear()
+    edge.send("rig2", b"far")
+    edge.advance_to(6_000 * US)
+    edge.send("rig1", b"near")
+    edge.advance_to(STEP_NS)
+    assert edge.sent == [(11_000 * US - DEADLINE_MARGIN_NS, {"rig1": b"near", "rig2": b"far"})]
+
+
+def test_sends_once_a_window_while_the_simulation_is_silent() -> None:
+    edge = Edge()
+    edge.advance_to(3 * STEP_NS)
+    for number in range(1, 1001):
+        edge.advance_to(3 * STEP_NS + number * 100 * US)
+        edge.send("rig1", b"%d" % number)
+    distances = {after - before for (before, _), (after, _) in itertools.pairwise(edge.sent)}
+    assert distances == {COALESCE_WINDOW_NS}
     edge.tick()
     edge.send("rig1", b"now")
-    edge.go_to(GATHER_NS)
-    assert edge.left[-1][1] == {"rig1": b"now"}
+    edge.advance_to(COALESCE_WINDOW_NS)
+    assert edge.sent[-1][1] == {"rig1": b"now"}
 
 
-def test_timers_do_not_become_more() -> None:
+def test_sends_at_once_before_the_first_state() -> None:
     edge = Edge()
-    edge.be_many()
-    for step in range(20):
+    edge.send("a rig without a state", b"x")
+    assert edge.sent == [(0, {"a rig without a state": b"x"})]
+
+
+def test_schedules_one_timer_at_most() -> None:
+    edge = Edge()
+    for _ in range(20):
         for number in range(200):
-            edge.go_to(number * 100 * US)
+            edge.advance_to(number * 100 * US)
             edge.send(f"rig{number % 7}", b"%d" % number)
-            assert len(edge.pending) == 1
-        edge.departures.look()
+            assert len(edge.pending) <= 1
         edge.clock.advance(STEP_NS - edge.since_tick_ns)
         edge.tick()
-        # A first word and a last one.
-        assert len(edge.left) <= (step + 1) * 2 + 1
 
 
-def test_when_there_are_few_again_what_waits_leaves_at_once() -> None:
+def test_flush_sends_pending_commands_at_once() -> None:
     edge = Edge()
-    edge.be_many()
     edge.send("rig1", b"a")
-    edge.departures.look()
-    edge.send("rig1", b"b")
-    assert [commands for _, commands in edge.left] == [{"rig1": b"a"}, {"rig1": b"b"}]
+    edge.send("rig2", b"b")
+    edge.flush()
+    assert [commands for _, commands in edge.sent] == [{"rig1": b"a"}, {"rig2": b"b"}]
     assert edge.pending == []
+    edge.flush()
+    assert len(edge.sent) == 2
 
 
-def test_the_moments_fit_each_other() -> None:
-    assert departures.LAST_NS < departures.NEAR_NS
-    assert departures.GATHER_NS < departures.NEAR_NS
+def test_busy_polling_never_delays_another_rig_beyond_a_window() -> None:
+    edge = Edge()
+    waits = []
+    for number in range(370):
+        edge.advance_to(number * 50 * US)
+        edge.send("rig1", b"%d" % number)
+        if number % 37 == 0:
+            begin_ns = edge.since_tick_ns
+            edge.send(f"rig{2 + number // 37 % 5}", b"x")
+            edge.advance_to((number + 40) * 50 * US)
+            sent = next(at_ns for at_ns, commands in edge.sent if at_ns >= begin_ns and b"x" in commands.values())
+            waits.append(sent - begin_ns)
+    assert max(waits) <= COALESCE_WINDOW_NS

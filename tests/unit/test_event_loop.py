@@ -1,115 +1,16 @@
-"""The loop whose selector serves sockets itself: asyncio's own has its turn all the same, however busy they are."""
+"""The edge's event loop: exact timers, and transports whose errors close one connection only."""
 
 import asyncio
+import logging
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from selectors import EVENT_READ
 
 import pytest
 
-from hilrig_modbus_edge.server.event_loop import DirectLoop
+from hilrig_modbus_edge.server.event_loop import HIGH_WATER, SocketTransport, new_event_loop
 
 
-class Flood:
-    """A socket that is ready to be read always; it counts how often it was."""
-
-    def __init__(self, loop: DirectLoop) -> None:
-        self.served = 0
-        self.here, self.there = socket.socketpair()
-        self.there.send(b"x")
-        loop.direct.register(self.here, EVENT_READ, self.serve)
-
-    def serve(self, events: int) -> None:
-        assert events == EVENT_READ
-        self.here.recv(1)
-        self.there.send(b"x")
-        self.served += 1
-        self.asked()
-
-    def asked(self) -> None:
-        """What is asked of asyncio with each event; nothing."""
-
-
-@contextmanager
-def flooded() -> Iterator[tuple[DirectLoop, Flood]]:
-    loop = DirectLoop()
-    flood = Flood(loop)
-    try:
-        with flood.here, flood.there:
-            yield loop, flood
-            loop.direct.unregister(flood.here)
-    finally:
-        loop.close()
-
-
-def test_a_timer_comes_in_its_time() -> None:
-    with flooded() as (loop, flood):
-        loop.call_later(0.01, loop.stop)
-        loop.run_forever()
-        assert flood.served > 1
-
-
-def test_what_an_event_asks_of_asyncio_comes_before_the_next_event() -> None:
-    with flooded() as (loop, flood):
-        done: list[int] = []
-
-        def asked() -> None:
-            loop.call_soon(done.append, flood.served)
-            if flood.served == 10:
-                loop.call_soon(loop.stop)
-
-        flood.asked = asked  # type: ignore[method-assign]
-        loop.run_forever()
-        assert done == list(range(1, 11))
-
-
-def test_a_timer_that_an_event_sets_does_not_wait_for_an_older_one() -> None:
-    with flooded() as (loop, flood):
-
-        def asked() -> None:
-            if flood.served == 1:
-                loop.call_later(0.001, loop.stop)
-
-        flood.asked = asked  # type: ignore[method-assign]
-        loop.call_later(3_600, pytest.fail, "the old one came first")
-        loop.run_forever()
-
-
-def test_another_thread_is_heard() -> None:
-    with flooded() as (loop, _):
-        threading.Timer(0.01, loop.call_soon_threadsafe, (loop.stop,)).start()
-        loop.run_forever()
-
-
-def test_asyncios_own_sockets_have_their_turn() -> None:
-    async def say() -> bytes:
-        here, there = socket.socketpair()
-        with here, there:
-            here.setblocking(False)
-            threading.Timer(0.01, there.send, (b"hello",)).start()
-            return await asyncio.get_running_loop().sock_recv(here, 16)
-
-    with flooded() as (loop, flood):
-        assert loop.run_until_complete(say()) == b"hello"
-        assert flood.served > 1
-
-
-def test_a_loop_without_a_timer_waits_for_what_comes() -> None:
-    loop = DirectLoop()
-    try:
-        here, there = socket.socketpair()
-        with here, there:
-            loop.direct.register(here, EVENT_READ, lambda _: loop.call_soon(loop.stop))
-            threading.Timer(0.01, there.send, (b"x",)).start()
-            loop.run_forever()
-            loop.direct.unregister(here)
-    finally:
-        loop.close()
-
-
-def test_a_timer_is_not_rounded_to_milliseconds() -> None:
+def test_timer_is_not_rounded_to_milliseconds() -> None:
     delay_s, late_s = 0.000_25, list[float]()
 
     async def body() -> None:
@@ -120,23 +21,128 @@ def test_a_timer_is_not_rounded_to_milliseconds() -> None:
             loop.call_at(due_s, lambda called=called: called.set_result(loop.time()))  # type: ignore[misc]
             late_s.append(await called - due_s)
 
-    with asyncio.Runner(loop_factory=DirectLoop) as runner:
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(body())
-    # asyncio takes a timer for due that is so within what its clock resolves.
+    # asyncio calls a timer that is due within the resolution of its clock.
     assert min(late_s) > -1e-6
-    # Of a hundred at least one is not held up by others on the machine.
+    # At least one of a hundred is not delayed by other processes.
     assert min(late_s) < 0.001 - delay_s
 
 
-def test_timers_come_in_their_order() -> None:
+def test_timers_are_called_in_order() -> None:
     async def body() -> list[float]:
         loop = asyncio.get_running_loop()
-        begin_s, came, done = loop.time(), list[float](), asyncio.Event()
+        begin_s, called, done = loop.time(), list[float](), asyncio.Event()
         for delay_s in (0.0041, 0.0012, 0.0003, 0.0012, 0.0007):
-            loop.call_at(begin_s + delay_s, came.append, delay_s)
+            loop.call_at(begin_s + delay_s, called.append, delay_s)
         loop.call_at(begin_s + 0.005, done.set)
         await done.wait()
-        return came
+        return called
 
-    with asyncio.Runner(loop_factory=DirectLoop) as runner:
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
         assert runner.run(body()) == [0.0003, 0.0007, 0.0012, 0.0012, 0.0041]
+
+
+def test_loop_without_timers_waits_for_other_threads() -> None:
+    loop = new_event_loop()
+    try:
+        threading.Timer(0.01, loop.call_soon_threadsafe, (loop.stop,)).start()
+        loop.run_forever()
+    finally:
+        loop.close()
+
+
+class Protocol(asyncio.BufferedProtocol):
+    """Keeps received bytes; raises at the byte `!`."""
+
+    def __init__(self) -> None:
+        self.buffer = bytearray(64)
+        self.received = b""
+        self.paused = False
+        self.lost: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
+
+    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002
+        return self.buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.received += bytes(self.buffer[:nbytes])
+        if b"!" in self.received:
+            raise ValueError("a fault in the protocol")
+
+    def pause_writing(self) -> None:
+        self.paused = True
+
+    def resume_writing(self) -> None:
+        self.paused = False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.lost.set_result(exc)
+
+
+async def connect() -> tuple[SocketTransport, Protocol, socket.socket]:
+    here, there = socket.socketpair()
+    there.setblocking(False)
+    transport, protocol = SocketTransport(asyncio.get_running_loop(), here, "peer"), Protocol()
+    transport.set_protocol(protocol)
+    return transport, protocol, there
+
+
+async def until(is_true: object) -> None:
+    async with asyncio.timeout(10):
+        while not is_true():  # type: ignore[operator]
+            await asyncio.sleep(0.001)
+
+
+def test_internal_error_closes_one_connection_only(caplog: pytest.LogCaptureFixture) -> None:
+    async def body() -> None:
+        loop = asyncio.get_running_loop()
+        (_, broken, one), (_, whole, other) = await connect(), await connect()
+        with one, other, caplog.at_level(logging.ERROR):
+            await loop.sock_sendall(one, b"!")
+            assert isinstance(await broken.lost, ValueError)
+            await loop.sock_sendall(other, b"hello")
+            await until(lambda: whole.received == b"hello")
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(body())
+    assert "connection peer closed: internal error" in caplog.text
+
+
+def test_slow_peer_pauses_the_protocol_and_receives_everything() -> None:
+    async def body() -> None:
+        loop = asyncio.get_running_loop()
+        transport, protocol, peer = await connect()
+        sent = bytes(range(256)) * 4096
+        with peer:
+            for start in range(0, len(sent), 4096):
+                transport.write(sent[start : start + 4096])
+            assert protocol.paused
+            transport.close()
+            received = b""
+            while len(received) < len(sent):
+                received += await loop.sock_recv(peer, HIGH_WATER)
+            assert received == sent
+            assert not protocol.paused
+            assert await protocol.lost is None
+            assert await loop.sock_recv(peer, 1) == b""
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(body())
+
+
+def test_paused_reading_leaves_bytes_in_the_socket() -> None:
+    async def body() -> None:
+        loop = asyncio.get_running_loop()
+        transport, protocol, peer = await connect()
+        with peer:
+            transport.pause_reading()
+            await loop.sock_sendall(peer, b"later")
+            await asyncio.sleep(0.01)
+            assert protocol.received == b""
+            transport.resume_reading()
+            await until(lambda: protocol.received == b"later")
+            transport.abort()
+            await protocol.lost
+
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(body())

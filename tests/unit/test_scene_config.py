@@ -38,7 +38,7 @@ def parameters(text: str) -> None:
         ),
         (
             PART.format(name="a", x=300, y=0) + "mass_kg = 3.5",
-            "part 'a' is too heavy: quill and part weigh 39.2 N, but the force register is limited to 32.767 N; the part must",
+            "part 'a' is too heavy: quill and part weigh 39.2 N, but the force register is limited to 32.767 N",
         ),
         ("[[rigs]]\n[rigs.arm]\nmasses_kg = [1, -1, 0.5]", "masses_kg[1]: expected greater than 0, found -1"),
         ("[[rigs]]\n[rigs.arm]\nj4_kgm2 = 0", "j4_kgm2: expected greater than 0, found 0"),

@@ -220,12 +220,12 @@ def test_a_step_that_would_be_unstable_is_refused_with_the_rig_named() -> None:
         rig_parameters(lab, lab.rigs[0])
 
 
-def test_of_many_rigs_a_command_that_came_shortly_before_the_tick_is_obeyed_and_the_tick_is_punctual() -> None:
+def test_command_after_pre_encoding_acts_at_the_tick() -> None:
     with VirtualRig(parse_lab("[rigs]\ncount = 20\n")) as rig:
         rate = Rate(rig.lab.sim.step_ns, rig.clock)
         for early, late in ((0.25, 0.5), (0.75, 1.0)):
             rig.command((early, 0.0, 0.0, 0.0), rig="rig20")
-            rig.simulation.look_ahead(rate.next_ns)
+            rig.simulation.pre_encode(rate.next_ns)
             rig.command((late, 0.0, 0.0, 0.0), rig="rig20")
             tick = rate.wait()
             rig.simulation.tick(tick)

@@ -8,12 +8,12 @@ import pytest
 
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_schemas import Event, JointState
-from hilrig_sim.loop import MANY
+from hilrig_sim.loop import PRE_ENCODE_MIN_RIGS
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.state_encoder import loop_bytes, motion_bytes
 from support.virtual_rig import VirtualRig
 
-LAB = parse_lab(f"[rigs]\ncount = {MANY}\n")
+LAB = parse_lab(f"[rigs]\ncount = {PRE_ENCODE_MIN_RIGS}\n")
 
 
 def test_motion_is_what_protobuf_reads_and_writes() -> None:
@@ -82,11 +82,11 @@ def test_states_do_not_depend_on_when_before_the_tick_a_command_came(at_ms: floa
     assert any(state.loop_latency_ns for state in early[0])
 
 
-def test_parts_are_stated_on_time_though_a_command_came_after_the_state_was_encoded() -> None:
-    lab = parse_lab(f"[rigs]\ncount = {MANY}\n[[scene.parts]]\nname = 'red'\nposition_mm = [300, 0]\n")
+def test_parts_are_published_on_time_after_a_late_command() -> None:
+    lab = parse_lab(f"[rigs]\ncount = {PRE_ENCODE_MIN_RIGS}\n[[scene.parts]]\nname = 'red'\nposition_mm = [300, 0]\n")
     with VirtualRig(lab) as rig:
         for _ in range(120):
-            rig.simulation.look_ahead(rig._rate.next_ns)
+            rig.simulation.pre_encode(rig._rate.next_ns)
             rig.command((0.1, 0.0, 0.0, 0.0))
             rig.simulation.tick(rig._rate.wait())
         stated = [state.step for state in rig.states if state.rig == "rig1" and state.parts]
@@ -95,14 +95,14 @@ def test_parts_are_stated_on_time_though_a_command_came_after_the_state_was_enco
     assert len(stated) >= 3
 
 
-def test_a_command_that_became_too_old_while_its_tick_was_held_up_does_not_act() -> None:
+def test_command_that_expires_before_a_late_tick_does_not_act() -> None:
     with VirtualRig(LAB) as rig:
         rig.command((3.0, 0.0, 0.0, 0.0))
         rig.tick(2)
-        assert rig.states[-MANY].effort[0] == 3.0
-        rig.simulation.look_ahead(rig._rate.next_ns)
+        assert rig.states[-PRE_ENCODE_MIN_RIGS].effort[0] == 3.0
+        rig.simulation.pre_encode(rig._rate.next_ns)
         rig.clock.advance(LAB.sim.command_timeout_ns)
         rig.simulation.tick(rig._rate.wait())
-        (state,) = [state for state in rig.states[-MANY:] if state.rig == "rig1"]
+        (state,) = [state for state in rig.states[-PRE_ENCODE_MIN_RIGS:] if state.rig == "rig1"]
         assert (list(state.effort), state.safe) == ([0.0] * 4, True)
         assert state.missed_steps or state.lateness_ns > LAB.sim.step_ns

@@ -33,8 +33,6 @@ class TrafficRecord:
         self._add_answered_after_ns = message.answered_after_ns.append
         self._index_of: dict[tuple[_Kind, int, str], int] = {}
         """By what was asked, the exception and who asked: which of the message's kinds it is."""
-        self._seen: dict[tuple[bytes, int, str], int] = {}
-        """The same by the first bytes of a request, in which a value may be that makes no other kind."""
 
     @property
     def count(self) -> int:
@@ -43,11 +41,7 @@ class TrafficRecord:
 
     def note(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
         """Note one request: PDU, when it came and was answered (monotonic clock), exception code or 0, who asked."""
-        seen = pdu[:5], exception, controller
-        index = self._seen.get(seen)
-        if index is None:
-            index = self._seen[seen] = self._index(_kind_of(pdu[:5]), exception, controller)
-        self._add_index(index)
+        self._add_index(self._index(_kind_of(pdu[:5]), exception, controller))
         self._add_arrived_ns(arrived_ns)
         self._add_answered_after_ns(answered_ns - arrived_ns)
 

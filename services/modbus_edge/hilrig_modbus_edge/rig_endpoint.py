@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from hilrig_modbus_edge.command_scheduler import Departures
+from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.request_log import MOST
@@ -26,7 +26,9 @@ TRAFFIC_PERIOD_NS: Final = 200_000_000
 class Wire:
     """A device's outlet: to the bus, to the log stream, and to the loop's timers."""
 
-    def __init__(self, rig: str, service: Service, commands: Departures, sessions_changed: Callable[[], None]) -> None:
+    def __init__(
+        self, rig: str, service: Service, commands: CommandScheduler, sessions_changed: Callable[[], None]
+    ) -> None:
         sender = service.sender(topics.COMMAND, rig, first=partial(commands.send, rig))
         self.send_command = sender.send
         self.repeat_command = sender.repeat
@@ -87,7 +89,7 @@ class Seat:
         rig: RigSettings,
         service: Service,
         states: LatestOfBatches,
-        commands: Departures,
+        commands: CommandScheduler,
         sessions_changed: Callable[[], None],
     ) -> None:
         lab = service.lab

@@ -30,7 +30,7 @@ def run(service: Service) -> None:
         # What can't be computed is dealt with where it shows, not warned of.
         with np.errstate(all="ignore"):
             while not stopping.is_set():
-                simulation.look_ahead(rate.next_ns)
+                simulation.pre_encode(rate.next_ns)
                 tick = rate.wait()
                 simulation.tick(tick)
                 turns.run_waiting()

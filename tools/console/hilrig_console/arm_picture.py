@@ -6,7 +6,8 @@ World frame as everywhere, x forwards, y to the left; here in whole millimetres,
 import math
 from typing import Any, Final
 
-from hilrig_replay.rerun_view.scene import Floats, reach_outline
+from hilrig_replay.geometry.quaternion import Floats
+from hilrig_replay.geometry.scene import workspace_outline
 from hilrig_schemas import JointState
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 
@@ -33,7 +34,7 @@ def scene_of(rig: RigParameters) -> Scene:
         "span": _mm(arm.l2 + arm.l3),
         "top": _mm(arm.l1 - arm.lower[2]),
         "bottom": _mm(arm.l1 - arm.upper[2]),
-        "reach": " ".join(map(_line, reach_outline(arm, 0.0))),
+        "reach": " ".join(map(_line, workspace_outline(arm, 0.0))),
         "trays": [
             {
                 "name": tray.name,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_console.worker import Worker
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
 from hilrig_replay.io.index import RECORDING, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
@@ -63,9 +64,9 @@ class Reporter:
             InputError: the recording can't be reported.
         """
         # Each report has a process of its own, which loads what draws only then.
-        from hilrig_replay.report.report import report
+        from hilrig_replay.report.report import build_report
 
-        page.write_text(report([recording]).html, encoding="utf-8")
+        page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
 class Shelf:
@@ -173,7 +174,7 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
-    row["name"] = Path(entry.path).name.removesuffix(".part").removesuffix(".mcap")
+    row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
     row["open"] = entry.ended == RECORDING
     return row

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from hilrig_replay.plots.latency_plot import save_figure
-from hilrig_replay.plots.palette import INK, RUN_COLORS
+from hilrig_replay.plots.output import save_figure
+from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
 from hilrig_sim.arm.model import JOINT_SCALE
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
@@ -144,9 +144,9 @@ def plane_figure(
             )
     axes.set_xlim(*_ends(study.x))
     axes.set_ylim(*_ends(study.y))
-    axes.set_xlabel(study.x.label, color=INK)
-    axes.set_ylabel(study.y.label, color=INK)
-    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=INK)
+    axes.set_xlabel(study.x.label, color=TEXT_COLOR)
+    axes.set_ylabel(study.y.label, color=TEXT_COLOR)
+    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=TEXT_COLOR)
     axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")
@@ -217,14 +217,14 @@ def _draw_traces(panels: Sequence[Axes], shown: Sequence[Trace], study: StudyCon
                 trace.time_s, trace.error[:, joint], color=RUN_COLORS[joint], linewidth=1.0, label=f"{name}, {unit}"
             )
         where = f"{study.x.label} {trace.point.x:g}; {study.y.label} {trace.point.y:g}"
-        axes.set_title(f"{trace.letter}: {trace.outcome} ({where})", fontsize=8, loc="left", color=INK)
+        axes.set_title(f"{trace.letter}: {trace.outcome} ({where})", fontsize=8, loc="left", color=TEXT_COLOR)
         axes.tick_params(labelsize=7)
         axes.grid(color="#e5e5e5", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         most = float(np.nanmax(np.abs(trace.error[:, :2]), initial=1e-3))
         axes.set_ylim(-1.1 * most, 1.1 * most)
     panels[0].legend(fontsize=7, loc="upper right", title="error", title_fontsize=7)
-    panels[-1].set_xlabel("time, s", fontsize=8, color=INK)
+    panels[-1].set_xlabel("time, s", fontsize=8, color=TEXT_COLOR)
 
 
 def save_pictures(figure: Figure, stem: Path) -> list[Path]:

@@ -115,6 +115,8 @@ DISCRETE_END: Final = 16
 
 _TORQUES: Final = (("tau1", "N·m"), ("tau2", "N·m"), ("tau3", "N"), ("tau4", "N·m"))
 _JOINTS: Final = (("theta1", "°"), ("theta2", "°"), ("d3", "mm"), ("theta4", "°"))
+SEPARATE_WRITES: Final = len(_TORQUES) + 1
+"""Requests of one control cycle of a controller that writes each torque and the magnet alone."""
 
 
 def _map() -> tuple[Register, ...]:

@@ -189,7 +189,7 @@ class RigParameters:
             )
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(
-                f"invalid rig parameters (parameters_json): {error!r}; use the version of hilrig that made the recording"
+                f"invalid rig parameters (parameters_json): {error!r}; use the hilrig version that made the recording"
             ) from error
 
 

@@ -26,9 +26,9 @@ def recover(
     import json
     from dataclasses import asdict
 
+    from hilrig_recorder.mcap_format.file_names import PART_SUFFIX
     from hilrig_recorder.mcap_format.recover import recover as make_whole
     from hilrig_recorder.mcap_format.recover import recovered_path
-    from hilrig_recorder.storage.fsutil import PART_SUFFIX
     from hilrig_runtime.errors import InputError
 
     if output is not None and len(files) > 1:

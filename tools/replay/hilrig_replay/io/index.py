@@ -21,6 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata, MetadataIndex, Statistics
 from mcap.writer import MCAP0_MAGIC
 
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, UNFINISHED_SUFFIX
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.recording_file import DamagedRecordingError
 from hilrig_replay.io.run import open_run
@@ -32,7 +33,6 @@ VERDICT_SUFFIX: Final = ".verified"
 """What `hilrig verify` found stands beside a recording, in a file of the recording's name and this."""
 RECORDING: Final = "recording"
 """How a recording that is being written "ended"."""
-_PART_SUFFIX: Final = ".mcap.part"
 
 _HEAD: Final = struct.Struct("<BQ")
 _FOOTER: Final = struct.Struct("<BQQQI")
@@ -165,7 +165,7 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
     path = folder / relative
     try:
         with path.open("rb") as stream:
-            if relative.endswith(_PART_SUFFIX):
+            if relative.endswith(UNFINISHED_SUFFIX):
                 return _part_entry(blank, stream)
             return _finished_entry(blank, stream, info.st_size)
     except OSError as error:
@@ -232,7 +232,7 @@ def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
             try:
                 if item.is_dir(follow_symlinks=False):
                     waiting.append(relative)
-                elif item.name.endswith((".mcap", _PART_SUFFIX)):
+                elif item.name.endswith((MCAP_SUFFIX, UNFINISHED_SUFFIX)):
                     yield relative, item.stat()
             except OSError:
                 # Renamed or deleted since it was listed.

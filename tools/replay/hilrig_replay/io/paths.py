@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
 from hilrig_runtime.errors import InputError
 
 
@@ -16,9 +17,9 @@ def recordings(given: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for path in given:
         if path.is_dir():
-            inside = sorted(path.rglob("*.mcap"))
+            inside = sorted(path.rglob(f"*{MCAP_SUFFIX}"))
             if not inside:
-                raise InputError(f"{path}: there is no recording (.mcap) in this folder")
+                raise InputError(f"{path}: there is no recording ({MCAP_SUFFIX}) in this folder")
             found.extend(inside)
         else:
             found.append(path)

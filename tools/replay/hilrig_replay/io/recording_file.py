@@ -31,13 +31,13 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
+from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
 from hilrig_replay.io.columns import Rows, Table
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
 
 SCHEMA_PACKAGE: Final = "hilrig.v1"
 """The messages that this version reads."""
-PART_SUFFIX: Final = ".part"
 _NEVER_NS: Final = (1 << 63) - 1
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
@@ -161,7 +161,7 @@ def refuse_recording(output: Path) -> None:
     except OSError:
         # Missing, or not readable: the error of writing it is the one to report.
         return
-    if begins_like_one or output.name.removesuffix(PART_SUFFIX).endswith(".mcap"):
+    if begins_like_one or output.name.removesuffix(PART_SUFFIX).endswith(MCAP_SUFFIX):
         raise InputError(f"{output} is a recording: choose another output name")
 
 
