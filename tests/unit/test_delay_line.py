@@ -144,7 +144,7 @@ def test_override_is_active_until_cleared() -> None:
     assert not schedule.check(600 * MS)
     schedule.start_session(10_000 * MS)
     assert not schedule.check(11_000 * MS)
-    assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["wired"], "hand", 3)
+    assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["wired"], "override", 3)
     schedule.clear_override()
     assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["mobile"], "lab.toml", 9)
     assert not schedule.check(12_000 * MS), "the schedule must restart with the next session only"

@@ -102,8 +102,7 @@ class ImpairmentController:
             samples = Impairment(links.command, link_seed(seed, self._rig, "command")).samples()
         self._commands.set_impairment(samples)
         seed_text = "" if links.do_nothing else f", seed {seed}"
-        origin = "operator" if schedule.source == "hand" else schedule.source
-        text = f"impairment of {self._rig}: {links.describe()}{seed_text} (set by {origin})"
+        text = f"impairment of {self._rig}: {links.describe()}{seed_text} (source: {schedule.source})"
         event = self._events.event(Event.IMPAIRMENT_CHANGED, Event.INFO, text)
         event.configuration_data.text = links.model_dump_json()
         self._events.emit(event)

@@ -4,8 +4,8 @@ from typing import Literal
 
 from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, Ways
 
-Source = Literal["lab.toml", "schedule", "hand"]
-"""Origin of the active impairment; "hand": an operator's override (`hilrig impair`)."""
+Source = Literal["lab.toml", "schedule", "override"]
+"""Origin of the active impairment; "override": set by an operator (`hilrig impair`)."""
 
 
 class ImpairmentSchedule:
@@ -31,7 +31,7 @@ class ImpairmentSchedule:
 
     def set_override(self, config: ImpairmentConfig) -> None:
         """Activate an operator's setting, also for later sessions; it replaces the schedule of lab.toml."""
-        self._activate(config, "hand")
+        self._activate(config, "override")
 
     def clear_override(self) -> None:
         """Activate the setting of lab.toml again; its schedule restarts with the next session."""
@@ -39,7 +39,7 @@ class ImpairmentSchedule:
 
     def start_session(self, now_ns: int) -> None:
         """Restart the schedule: a session started at `now_ns`, monotonic clock."""
-        self._activate(self._config, "hand" if self.source == "hand" else "lab.toml")
+        self._activate(self._config, "override" if self.source == "override" else "lab.toml")
         self._start_ns = now_ns
 
     def check(self, now_ns: int) -> bool:
