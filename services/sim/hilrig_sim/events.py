@@ -7,7 +7,7 @@ from typing import Final
 from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import Event
 from hilrig_schemas.v1.event_pb2 import LimitData, OverrunData, PartData, WatchdogData
-from hilrig_sim.commands import CommandFollower
+from hilrig_sim.commands import CommandLatch
 from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 
@@ -51,22 +51,22 @@ class SimulationEvents:
                 event.step = step
                 self._emit(event)
 
-    def report_command_changes(self, rig: int, follower: CommandFollower, step: int) -> None:
+    def report_command_changes(self, rig: int, command: CommandLatch, step: int) -> None:
         """Emit events for lost and resumed commands, and for resets."""
-        silence = WatchdogData(silent_ns=follower.silent_ns, timeout_ns=follower.timeout_ns)
+        silence = WatchdogData(silent_ns=command.silent_ns, timeout_ns=command.timeout_ns)
         events = []
-        if follower.lost:
+        if command.command_lost:
             text = (
-                f"no command received for {follower.silent_ns / 1e6:.0f} ms: torque set to zero until the next command"
+                f"no command received for {command.silent_ns / 1e6:.0f} ms: torque set to zero until the next command"
             )
             events.append(Event(kind=Event.COMMAND_LOST, severity=Event.WARNING, text=text, watchdog_data=silence))
-        if follower.back:
-            text = f"commands received again after {follower.silent_ns / 1e6:.0f} ms"
+        if command.command_resumed:
+            text = f"commands received again after {command.silent_ns / 1e6:.0f} ms"
             events.append(Event(kind=Event.COMMAND_BACK, severity=Event.INFO, text=text, watchdog_data=silence))
-        if follower.reset:
+        if command.reset:
             events.append(Event(kind=Event.RESET, severity=Event.INFO, text="reset to the start pose"))
         for event in events:
-            event.rig, event.session, event.step = self._rigs[rig], follower.session, step
+            event.rig, event.session, event.step = self._rigs[rig], command.session, step
             self._emit(event)
 
     def report_divergence(self, rig: int, session: str, step: int) -> None:

@@ -1,4 +1,4 @@
-"""The simulation as a service: a tick at each absolute deadline, and between two of them what people asked for."""
+"""Simulation service: a tick at each absolute deadline, and queued calls between two ticks."""
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from hilrig_sim.rig_registry import RigRegistry
 
 
 def run(service: Service) -> None:
-    """Simulate every rig of the lab until the service is to stop.
+    """Simulate every rig of the lab until the service is stopped.
 
     Raises:
-        InputError: the lab's parameters do not fit together.
+        InputError: the parameters of the lab are inconsistent.
     """
     lab = service.lab
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
@@ -27,7 +27,7 @@ def run(service: Service) -> None:
         freeze_garbage()
         service.ready()
         stopping = service.stopping
-        # What can't be computed is dealt with where it shows, not warned of.
+        # Non-finite numbers are detected and handled by the simulation, without warnings.
         with np.errstate(all="ignore"):
             while not stopping.is_set():
                 simulation.pre_encode(rate.next_ns)

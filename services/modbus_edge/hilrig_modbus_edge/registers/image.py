@@ -35,7 +35,7 @@ class StateImage:
         self.arrived_ns = 0
         self.step = 0
         self.basis: StateRef = NO_STATE_REF
-        """Reference to the state, for the writes that are based on it."""
+        """Reference to the state; writes that are based on it carry it."""
         self.position_words = bytes(8)
         self._message = JointState()
         self._saturated = False

@@ -16,7 +16,7 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Request, decode_frames
 from hilrig_modbus_edge.protocol.pdu import exception_response, execute
 from hilrig_modbus_edge.registers.map import UNIT_IDS
-from hilrig_modbus_edge.request_log import TrafficRecord
+from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_runtime.process.health import Counters
 
 BUFFER_BYTES: Final = 2048
@@ -35,7 +35,7 @@ class ConnectionOwner(Protocol):
 
     device: Device
     counters: Counters
-    traffic: TrafficRecord
+    request_log: RequestLog
     monotonic_ns: Callable[[], int]
     connections: "set[Connection]"
 
@@ -52,7 +52,7 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = transport
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
-        self._log_request = server.traffic.note
+        self._log_request = server.request_log.record
         self._counters = server.counters
         self._buffer = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buffer)

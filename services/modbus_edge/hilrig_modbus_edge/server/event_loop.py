@@ -1,7 +1,7 @@
 """The edge's event loop: asyncio with exact timers, and a transport of TCP connections with its own receive call.
 
-asyncio's own transports are not used for plain connections: this one leaves the receive call to us, which kernel
-timestamps need, and costs less for each request (ADR 0027).
+asyncio's own transports are not used for plain connections: this transport has its own receive call, which kernel
+timestamps need, and costs less per request (ADR 0027).
 """
 
 import asyncio
@@ -22,24 +22,24 @@ logger = logging.getLogger(__name__)
 
 
 class ExactSelector(selectors.DefaultSelector):
-    """A selector whose time-outs are exact; the standard library rounds those of epoll up to whole milliseconds."""
+    """Selector with exact timeouts; the standard library rounds timeouts of epoll up to whole milliseconds."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """See `selectors.BaseSelector.select`."""
         if timeout is not None and timeout > 0 and hasattr(select, "epoll"):
-            # The handle of the epoll set is older than those of all connections: `select` can wait for its number.
+            # The epoll handle is older than all connections, so its number is small enough for `select`.
             select.select((self,), (), (), timeout)
             timeout = 0
         return super().select(timeout)
 
 
 def new_event_loop() -> asyncio.SelectorEventLoop:
-    """An asyncio event loop with exact timers."""
+    """Return an asyncio event loop with exact timers."""
     return asyncio.SelectorEventLoop(ExactSelector())
 
 
 class SocketTransport(asyncio.Transport):
-    """Transport of one TCP connection, for an `asyncio.BufferedProtocol` that `set_protocol` names."""
+    """Transport of one TCP connection; its protocol is an `asyncio.BufferedProtocol`, set by `set_protocol`."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, connected: socket.socket, peer: Any) -> None:
         super().__init__({"socket": connected, "peername": peer})
@@ -186,7 +186,7 @@ class SocketTransport(asyncio.Transport):
 
 
 async def accept_connections(listening: socket.socket, on_accept: Callable[[SocketTransport], None]) -> None:
-    """Pass each accepted connection to `on_accept`, until cancelled."""
+    """Pass each accepted connection to `on_accept`, until the task is canceled."""
     loop = asyncio.get_running_loop()
     listening.setblocking(False)
     while True:
@@ -194,7 +194,12 @@ async def accept_connections(listening: socket.socket, on_accept: Callable[[Sock
             connected, peer = await loop.sock_accept(listening)
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
-            logger.warning("connection not accepted on %s: %s", listening.getsockname(), error)
+            logger.warning(
+                "can't accept a connection on %s: %s; retrying every %g s",
+                listening.getsockname(),
+                error,
+                ACCEPT_RETRY_S,
+            )
             await asyncio.sleep(ACCEPT_RETRY_S)
             continue
         on_accept(SocketTransport(loop, connected, peer))

@@ -11,7 +11,7 @@ from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.events import repeat_suffix
 from hilrig_modbus_edge.device.rate_limiter import RateLimiter
-from hilrig_modbus_edge.request_log import TrafficRecord
+from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
 from hilrig_modbus_edge.server.event_loop import SocketTransport, accept_connections
@@ -35,7 +35,7 @@ class RigServer:
         self.device = device
         self._idle_ns = limits.idle_ns
         self.counters = counters
-        self.traffic = TrafficRecord(device.rig)
+        self.request_log = RequestLog(device.rig)
         self.connections: set[Connection] = set()
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters)

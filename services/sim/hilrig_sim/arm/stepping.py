@@ -115,7 +115,7 @@ class FixedStep:
         velocity[:] = result4
 
     def accelerations(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
-        """Return the joint accelerations, (4, N), for a state and effort, (4, N) each; valid until the next call."""
+        """Return the joint accelerations, (4, N), of a state and effort, (4, N) each; valid until the next call."""
         self._dynamics.drive(effort, self._drive)
         self._states[0, :4] = velocity
         self._states[0, 4] = position[1]

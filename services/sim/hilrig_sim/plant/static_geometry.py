@@ -1,4 +1,4 @@
-"""Static geometry of the scenes: floor, table and trays, and the height of the surface under a disc."""
+"""Static geometry of the scenes: ground, table and trays, and the height of the surface under a disc."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -17,11 +17,11 @@ FAR_AWAY: Final = 1e9
 TOUCHING: Final = 1e-9
 """Largest distance of two surfaces that touch, m."""
 GROUND_BELOW_TABLE: Final = 0.75
-"""Height of the table top above the floor, m."""
+"""Height of the table top above the ground, m."""
 
 
 class StaticGeometry:
-    """Floor, tables and trays of N rigs."""
+    """Ground, tables and trays of N rigs."""
 
     def __init__(self, scenes: Sequence[SceneParameters], reach: float) -> None:
         count = len(scenes)
