@@ -175,7 +175,7 @@ def _decode(payload: bytes) -> _Command | None:
 
 
 def _bounded(first: float, second: float, third: float, fourth: float) -> Effort:
-    top = LARGEST_EFFORT
+    limit = LARGEST_EFFORT
     # Fast path for efforts within the limits: this runs for each rig at each step.
     if (
         -limit <= first <= limit

@@ -111,7 +111,7 @@ def inverse(arm: ArmParameters, pose: ArrayLike) -> Floats:
         Joint vectors, (n, 4) with n ≥ 1: both elbow solutions, each with every θ4 + k·360° within its limits.
 
     Raises:
-        UnreachableError: the pose has no solution; the message has the cause: too far, too near, too high, too low, or the joint
+        UnreachableError: the pose has no solution; the message has the cause: too far, near, high or low, or the joint
             limit.
     """
     x, y, z, yaw = (float(value) for value in np.asarray(pose, dtype=np.float64))
