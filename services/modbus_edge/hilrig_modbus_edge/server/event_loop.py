@@ -195,7 +195,7 @@ async def accept_connections(listening: socket.socket, on_accept: Callable[[Sock
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
             logger.warning(
-                "can't accept a connection on %s: %s; retrying every %g s",
+                "can't accept a connection on %s: %s; retrying in %g s",
                 listening.getsockname(),
                 error,
                 ACCEPT_RETRY_S,
