@@ -502,7 +502,7 @@ def test_incomplete_authority_prevents_any_change(tmp_path: Path, missing: str) 
     before = {path: path.read_bytes() for path in folder.rglob("*.*")}
     done = hilrig("certs", folder, "--renew")
     assert done.returncode == 2
-    assert f"has no {Path(missing).name} beside it" in done.stderr
+    assert f"has no {Path(missing).name} in the same folder" in done.stderr
     assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
 
 

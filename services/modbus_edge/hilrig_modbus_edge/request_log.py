@@ -35,6 +35,9 @@ class RequestLog:
         self._add_answered_after_ns = message.answered_after_ns.append
         self._index_of: dict[tuple[_RequestKind, int, str], int] = {}
         """By request kind, exception code and client: index in the kinds of the message."""
+        self._index_of_head: dict[tuple[bytes, int, str], int] = {}
+        """By the first bytes of a request, exception code and client: the same index, found 0.5 µs faster. The bytes
+        may contain a value, so several heads have the same kind."""
 
     @property
     def count(self) -> int:
@@ -43,7 +46,11 @@ class RequestLog:
 
     def record(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
         """Record a request: PDU, arrival and response time (ns, monotonic clock), exception code or 0, and client."""
-        self._add_index(self._index(_kind_of(pdu[:5]), exception, controller))
+        head = pdu[:5], exception, controller
+        index = self._index_of_head.get(head)
+        if index is None:
+            index = self._index_of_head[head] = self._index(_kind_of(pdu[:5]), exception, controller)
+        self._add_index(index)
         self._add_arrived_ns(arrived_ns)
         self._add_answered_after_ns(answered_ns - arrived_ns)
 

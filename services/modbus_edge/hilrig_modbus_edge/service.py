@@ -18,7 +18,7 @@ from hilrig_modbus_edge.control_api import (
     serve_on_loop,
 )
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
-from hilrig_modbus_edge.server.event_loop import new_event_loop
+from hilrig_modbus_edge.server.event_loop import DirectEventLoop
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
@@ -45,7 +45,7 @@ def run(service: Service) -> None:
         OperationError: the address of a rig is unavailable.
     """
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(EdgeService(service, runner.get_loop()).run())
 
 

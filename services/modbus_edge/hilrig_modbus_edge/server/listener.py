@@ -14,7 +14,7 @@ from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
-from hilrig_modbus_edge.server.event_loop import SocketTransport, accept_connections
+from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.health import Counters
@@ -44,13 +44,14 @@ class RigServer:
         self._tls_servers: list[asyncio.Server] = []
 
     async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
-        """Accept connections from a listening socket, with TLS if a policy is given.
+        """Accept connections from a listening socket, with TLS if a policy is given; runs on a `DirectEventLoop`.
 
         Connections that are already in the backlog are served at once.
         """
         loop = asyncio.get_running_loop()
+        assert isinstance(loop, DirectEventLoop)
         if policy is None:
-            self._acceptors.append(loop.create_task(accept_connections(listening, self._on_accept)))
+            self._acceptors.append(loop.create_task(accept_connections(loop, listening, self._on_accept)))
         else:
             # TLS runs on asyncio's own transports.
             server = await loop.create_server(
