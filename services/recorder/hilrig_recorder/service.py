@@ -31,15 +31,18 @@ from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
 TICK_PERIOD_NS: Final = SECOND_NS // 10
+"""Period of the housekeeping between received batches."""
 _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
 _REPLY_TIMEOUT_S: Final = 1.0
-_LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
+_LAST_BATCHES_TIMEOUT_NS: Final = 3 * SECOND_NS // 10
 """Time after the stop request in which the recorder still receives the last batches of other services."""
-_DRAIN_NS: Final = SECOND_NS // 2
-_REPEATED_LATE_NS: Final = 5 * SECOND_NS
+_QUEUE_DRAIN_TIMEOUT_NS: Final = SECOND_NS // 2
+"""Maximum time for writing the messages in the ingest queue at shutdown."""
+_MAX_ARRIVAL_DELAY_NS: Final = 5 * SECOND_NS
 """Maximum delay with which an earlier recorder may have received messages that publishers now send again."""
 _FINISH_TIMEOUT_S: Final = 0.3
+"""Time for finishing and syncing files at shutdown; after it, files are finished without syncing."""
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +111,7 @@ class Recorder:
             service.clock,
             self._sync_worker,
             instance=service.instance,
-            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _REPEATED_LATE_NS,
+            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _MAX_ARRIVAL_DELAY_NS,
             emit=self._emit,
             request_config=self._request_config,
             on_failed=self._on_failed,
@@ -151,11 +154,11 @@ class Recorder:
         while not service.stopping.is_set():
             due_ns = self._run_once(due_ns)
         # Receive the last batches for a short time, then write the messages in the queue.
-        deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_NS
+        deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_TIMEOUT_NS
         while self._sessions.recordings and clock.monotonic_ns() < deadline_ns:
             due_ns = self._run_once(due_ns)
         self._stream.close()
-        deadline_ns = clock.monotonic_ns() + _DRAIN_NS
+        deadline_ns = clock.monotonic_ns() + _QUEUE_DRAIN_TIMEOUT_NS
         while self._queue.depth > 0 and clock.monotonic_ns() < deadline_ns:
             due_ns = self._run_once(due_ns)
 
@@ -237,7 +240,9 @@ class Recorder:
             raise OperationError("control request can't be decoded") from error
         self._requests.put(request)
         if not request.done.wait(_REPLY_TIMEOUT_S):
-            raise OperationError(f"the recorder did not reply within {_REPLY_TIMEOUT_S:g} s: it is overloaded")
+            raise OperationError(
+                f"the recorder did not reply within {_REPLY_TIMEOUT_S:g} s: it is overloaded; try again"
+            )
         if request.error:
             raise OperationError(request.error)
         return request.reply.SerializeToString()

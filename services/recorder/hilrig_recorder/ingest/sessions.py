@@ -41,7 +41,7 @@ RETRY_PERIOD_NS: Final = 10 * SECOND_NS
 """Time until a session that could not be recorded is tried again."""
 MAX_REJECTIONS: Final = 1000
 """Maximum number of different rejected inputs that are reported."""
-_PHASES: Final = 10
+_BLOCK_PHASES: Final = 10
 _ENDED_SESSION_MEMORY_NS: Final = 120 * SECOND_NS
 _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
 
@@ -161,7 +161,7 @@ class SessionTracker:
         if rig is None:
             # The block times of the rigs are staggered, so that a large lab does not write all blocks at once. The
             # first block is written soon: after a restart it contains cached messages, which may not stay available.
-            phase_ns = BLOCK_PERIOD_NS * (len(self._rigs) % _PHASES) // _PHASES
+            phase_ns = BLOCK_PERIOD_NS * (len(self._rigs) % _BLOCK_PHASES) // _BLOCK_PHASES
             rig = self._rigs[name] = PreRollBuffer(name, now_ns + phase_ns - BLOCK_PERIOD_NS)
         return rig
 

@@ -30,11 +30,11 @@ from hilrig_recorder.mcap_format.scan import (
 from hilrig_recorder.mcap_format.writer import LIBRARY, RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
 
-_UNFINISHED: Final = (
+_REASON_UNFINISHED: Final = (
     "the file was not finished: the recorder was killed, or the file was truncated; the last messages may be missing"
 )
-_DAMAGED: Final = "the summary of the file was damaged"
-_BEGIN_BYTES: Final = 64 * 1024
+_REASON_DAMAGED: Final = "the summary of the file was damaged"
+_MAX_BEGIN_BYTES: Final = 64 * 1024
 
 
 @dataclass(slots=True)
@@ -119,7 +119,7 @@ def read_session_metadata(path: Path) -> dict[str, str]:
     Raises:
         InputError: the file can't be read.
     """
-    for _, item in scan(map_file(path)[:_BEGIN_BYTES]):
+    for _, item in scan(map_file(path)[:_MAX_BEGIN_BYTES]):
         if isinstance(item, Metadata) and item.name == "hilrig.session":
             return dict(item.metadata)
     return {}
@@ -208,14 +208,13 @@ class _Copier:
         self._recovery = recovery
         self._finished = finished
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
         self._declared: set[int] = set()
         self._losses = {"lost_transport": 0, "lost_recorder": 0}
         self._has_summary = False
         self._last_ns = 0
 
     def write(self, path: Path, temporary_path: Path, should_continue: Callable[[], bool]) -> None:
-        header = next((item for _, item in scan(self._view[:_BEGIN_BYTES]) if isinstance(item, Header)), None)
+        header = next((item for _, item in scan(self._view[:_MAX_BEGIN_BYTES]) if isinstance(item, Header)), None)
         if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
             if self._view[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
                 raise InputError(f"{self._recovery.source}: not an MCAP file (bad magic)")
@@ -326,7 +325,7 @@ class _Copier:
         if is_hilrig and not self._has_summary:
             records["hilrig.summary"] = {
                 "ended": "recovered",
-                "reason": _DAMAGED if self._finished else _UNFINISHED,
+                "reason": _REASON_DAMAGED if self._finished else _REASON_UNFINISHED,
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),
                 **{name: str(count) for name, count in self._losses.items()},

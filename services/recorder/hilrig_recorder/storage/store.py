@@ -25,12 +25,12 @@ MAX_ALERTS_IN_REPORT: Final = 3
 """Maximum number of alerts named in a health report; each alert is also an event and a log line."""
 SLOW_SYNC_S: Final = 5.0
 """An alert is raised when written data is not synced within this time."""
-_SPEED: Final = " speed"
+_SPEED_ALERT: Final = " speed"
 """Key of the alert about a slow disk; not a valid rig name."""
-_SPACE: Final = ""
+_SPACE_ALERT: Final = ""
 """Key of the alert about disk space; not a valid rig name."""
 _SPACE_CHECK_PERIOD_NS: Final = SECOND_NS
-_NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
+_NO_SPACE_ERRORS: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class FileStore:
@@ -250,14 +250,14 @@ class FileStore:
     # -- errors -----------------------------------------------------------------------------------------------------
 
     def _on_failure(self, error: OSError) -> None:
-        if error.errno in _NO_SPACE:
+        if error.errno in _NO_SPACE_ERRORS:
             # Every file on this disk is finished now, while the reserved space suffices for all of them.
             self._reserve.mark_exhausted()
 
     def _finish_failed(self, file: SegmentFile, error: OSError) -> None:
         recording = file.recording
         del self._files[recording]
-        end = "disk full" if error.errno in _NO_SPACE else "write failed"
+        end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
         reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
         self._finish(file, end, reason)
         self._report(recording, reason)
@@ -278,19 +278,19 @@ class FileStore:
 
     def _check_speed(self) -> None:
         if self._sync_worker.sync_delay_s < SLOW_SYNC_S:
-            self._alerts.pop(_SPEED, None)
-        elif _SPEED not in self._alerts:
+            self._alerts.pop(_SPEED_ALERT, None)
+        elif _SPEED_ALERT not in self._alerts:
             text = f"{self.folder}: slow disk: a power failure may lose the last {SLOW_SYNC_S:g} s or more"
-            self._alerts[_SPEED] = text
+            self._alerts[_SPEED_ALERT] = text
             self._emit(Event(kind=Event.RECORDING, severity=Event.WARNING, text=text))
 
     def _check_space(self) -> None:
         text = self._reserve.refresh()
         if text:
-            self._alerts[_SPACE] = text
+            self._alerts[_SPACE_ALERT] = text
             self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
         elif not self._reserve.is_exhausted:
-            self._alerts.pop(_SPACE, None)
+            self._alerts.pop(_SPACE_ALERT, None)
 
 
 def machine() -> str:
