@@ -165,13 +165,13 @@ def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDAr
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
     """Return the timeline of each run, all of one controller; runs with equal timing share one object."""
-    ways = study.ways(int(cells["controller"][0]))
+    links = study.link_impairments(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
     known: dict[tuple[float, ...], Timeline] = {}
     lines = []
     for cell in cells:
         delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
-        random = jitter_ms > 0 or loss > 0 or not ways.do_nothing
+        random = jitter_ms > 0 or loss > 0 or not links.do_nothing
         # The draws depend only on the study's seed and the run number: all cells use common random numbers.
         key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
         if key not in known:
@@ -181,8 +181,8 @@ def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, t
                 delay=UniformDelay(low_ms=0, high_ms=jitter_ms) if jitter_ms else ConstantDelay(),
                 loss=BernoulliLoss(rate=loss) if loss else NoLoss(),
             )
-            state_ns, state_lost = Impairment(ways.state, states).draw(ticks)
-            command_ns, command_lost = Impairment(ways.command, commands).draw(polls)
+            state_ns, state_lost = Impairment(links.state, states).draw(ticks)
+            command_ns, command_lost = Impairment(links.command, commands).draw(polls)
             more_ns, more_lost = Impairment(more, added).draw(polls)
             known[key] = timeline(
                 timing, ticks, state_ns, command_ns + more_ns + delay_ns, state_lost, command_lost | more_lost
@@ -250,7 +250,7 @@ def sweep(
 
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
     """Return which runs have no random values, (R,)."""
-    unimpaired = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
+    unimpaired = np.array([study.link_impairments(number).do_nothing for number in range(len(study.controllers))])
     return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & unimpaired[cells["controller"]])
 
 
@@ -280,7 +280,7 @@ def _mean_square_until(study: StudyConfig, key: _TheoryKey) -> float:
     controller, gain, step_ms, poll_ms = key
     config, axes = study.controllers[controller], (study.x, study.y)
     others = [axis for axis in axes if axis.what in ("delay_ms", "jitter_ms", "loss")]
-    random = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
+    random = not study.link_impairments(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
     predicts = config.kind == "lqr" and config.compensate
     if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not random or predicts or poll_ms != step_ms:
         return math.nan
