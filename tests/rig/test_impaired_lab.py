@@ -284,10 +284,10 @@ def test_a_lab_is_impaired_by_command_while_it_runs(tmp_path: Path, sessions: di
             (("rig1", "--command", "constant:-3"), "delay_ms: expected greater than or equal to 0, found '-3'"),
             (("rig1", "--preset", "wlan"), "no preset is called 'wlan': expected one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
-            (("rig1", "--trace", recording, "--command", "constant:1"), "leave out --command"),
-            (("rig1", "--off", "--preset", "vpn"), "--off and --lab stand alone"),
+            (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
+            (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
             (("rig9", "--off"), "no rig is called 'rig9'"),
-            (("--off",), "setting an impairment takes a rig"),
+            (("--off",), "a rig is required to set an impairment"),
         ):
             said = hilrig("impair", *options, "--config", config)
             assert (said.returncode, len(said.stderr.splitlines())) == (2, 1), said.stderr

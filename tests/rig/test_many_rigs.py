@@ -136,9 +136,9 @@ def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusT
 
 def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: RunningLab) -> None:
     for arguments, code, text in [
-        (("add", "rig1"), 2, "the lab has a rig called 'rig1' already"),
+        (("add", "rig1"), 2, "rig 'rig1' already exists in the lab"),
         (("add", "no name"), 2, "name: expected"),
-        (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/[12] .* can't listen on"),
+        (("add", "late", "--port", str(lab.port)), 3, "rig 'late' was not added: edge/[12] .* can't listen on"),
         (("remove", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
         (("reset", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
     ]:
@@ -163,7 +163,7 @@ def test_a_name_that_is_no_rig_s_is_refused_with_those_that_are(lab: RunningLab,
 def test_a_rig_that_is_given_twice_is_refused() -> None:
     done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=PATIENT_S)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.endswith("hilrig: error: --rigs rig1,rig1: 'rig1' stands there 2 times, expected once\n")
+    assert done.stderr.endswith("hilrig: error: --rigs: duplicate rig 'rig1'\n")
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab,
         if b"rig1,rig2" in Path(f"/proc/{pid}/cmdline").read_bytes() and _is(pid, "edge")
     )
     os.kill(first, signal.SIGKILL)
-    eventually(lambda: "edge is started again" in lab.output())
+    eventually(lambda: "edge restarted" in lab.output())
     assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
 
     def back() -> bool:
@@ -209,7 +209,7 @@ def test_a_lab_that_does_not_run_is_said_so(tmp_path: Path) -> None:
     for command in (("top", "--json"), ("rig", "list")):
         done = hilrig(*command, "--config", config)
         assert done.returncode == 3
-        assert "nothing is heard of lab 'lab': is it running" in done.stderr
+        assert "no service of lab 'lab' found: is it running" in done.stderr
 
 
 def test_more_processes_than_rigs_are_refused(tmp_path: Path) -> None:

@@ -506,7 +506,7 @@ def test_where_half_of_an_authority_is_missing_nothing_is_written(tmp_path: Path
     before = {path: path.read_bytes() for path in folder.rglob("*.*")}
     done = hilrig("certs", folder, "--renew")
     assert done.returncode == 2
-    assert f"has no {Path(missing).name} beside it" in done.stderr
+    assert f"has no {Path(missing).name} in the same folder" in done.stderr
     assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
 
 

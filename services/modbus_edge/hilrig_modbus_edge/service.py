@@ -12,7 +12,7 @@ from typing import Final
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.control_api import answer_control, answer_impairment, answer_lease, serve_on_loop
 from hilrig_modbus_edge.rig_endpoint import Seat
-from hilrig_modbus_edge.server.event_loop import new_event_loop
+from hilrig_modbus_edge.server.event_loop import DirectEventLoop
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
@@ -38,7 +38,7 @@ def run(service: Service) -> None:
         OperationError: a rig's address can't be had.
     """
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(Edge(service, runner.get_loop()).run())
 
 

@@ -133,7 +133,7 @@ class LabSubscriber:
         except DecodeError:
             return
         with self._model.lock:
-            self._model.view.hear(health, time.monotonic())
+            self._model.view.update(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
         del key

@@ -22,7 +22,7 @@ from hilrig_modbus_edge.protocol.pdu import answer, exception
 from hilrig_modbus_edge.registers.map import UNIT_IDS
 from hilrig_modbus_edge.request_log import TrafficRecord
 from hilrig_modbus_edge.server.admission import Admission, Limits
-from hilrig_modbus_edge.server.event_loop import SocketTransport, accept_connections
+from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsGate, TlsPolicy
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.health import Counters
@@ -60,13 +60,14 @@ class RigServer:
         self._tls_servers: list[asyncio.Server] = []
 
     async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
-        """Take connections from a socket that listens, with TLS where there is a policy for it.
+        """Take connections from a socket that listens, with TLS where there is a policy for it; on a `DirectEventLoop`.
 
         What has connected already is served now.
         """
         loop = asyncio.get_running_loop()
+        assert isinstance(loop, DirectEventLoop)
         if policy is None:
-            self._doors.append(loop.create_task(accept_connections(listening, self._welcome)))
+            self._doors.append(loop.create_task(accept_connections(loop, listening, self._welcome)))
         else:
             # asyncio's own transports know TLS.
             server = await loop.create_server(

@@ -1,4 +1,4 @@
-"""`hilrig registers`: the map of a rig's registers, for people and for PLC tools."""
+"""`hilrig registers`: prints the register map of a rig as a table, CSV, Markdown or JSON."""
 
 import json
 from typing import Annotated
@@ -9,11 +9,11 @@ from hilrig_cli.options import AsJson
 
 
 def registers(
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print it as CSV, to import into a PLC tool.")] = False,
-    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print it as docs/registers.md has it.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV for import into a PLC tool.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown, as in docs/registers.md.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Print what each register and coil of a rig holds."""
+    """Print the register map: every register and coil of a rig with its type, unit, scale and meaning."""
     from hilrig_modbus_edge.registers import export as register_tables
 
     if as_csv:
@@ -30,7 +30,7 @@ def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "what it is")
+    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "meaning")
     for row in rows:
         table.add_row(
             *(str(row[key]) for key in ("table", "number", "address", "name", "type", "unit", "scale")),

@@ -34,7 +34,7 @@ def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | 
     top = figure.add_subplot(grid[:, 1])
     _draw_workspace(top, parameters, task)
     top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
-    label_axes(top, "Tool path, top view, mm", "x", "y")
+    label_axes(top, "Tool path, top view", "x, mm", "y, mm")
     return figure
 
 
