@@ -282,7 +282,7 @@ class StudyConfig(Section):
         except ValidationError as error:
             raise InputError("; ".join(format_validation_error(error))) from error
 
-    def links(self, controller: int) -> LinkImpairments:
+    def link_impairments(self, controller: int) -> LinkImpairments:
         """Return the link impairments of a controller, without the swept values."""
         own = self.controllers[controller].impairment
         return (self.impairment if own is None else own).links

@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop p50 / p99", "big wide"], ["late", "tick p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
@@ -214,7 +214,7 @@ function showLab(lab) {
   }
   const alarms = [...rigs.values()].filter((rig) => rig.level === "bad").length;
   const totals = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
-    [lab.rigs.filter((rig) => rig.recording).length, "recorded"]];
+    [lab.rigs.filter((rig) => rig.recording).length, "recording"]];
   if (alarms) totals.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
   byId("summary").replaceChildren(...totals.map(([number, label]) =>
     html("li", label.startsWith("alarm") ? {class: "alarm"} : {}, html("b", {}, String(number)), ` ${label}`)));

@@ -75,7 +75,7 @@ def run_live_points(
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
         mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        rigs = {f"point{i + 1}": _links(study, cells[i]) for i in mine}
+        rigs = {f"point{i + 1}": _point_impairments(study, cells[i]) for i in mine}
         _write_lab(config, study, step_ms, rigs, recordings, find_ports)
         lab = load_lab(config)
         with start_lab(lab, config) as check_processes:
@@ -92,13 +92,13 @@ def _point_values(point: PointConfig, controller: str, run: Run) -> dict[str, An
     return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
-def _links(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
+def _point_impairments(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
     """Return the link impairments of a point.
 
     Raises:
         InputError: the command link is impaired by the study and by the swept values.
     """
-    base = study.links(int(cell["controller"][0]))
+    base = study.link_impairments(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base
