@@ -68,7 +68,7 @@ class BusOutput:
             self._send_ns = deadline_ns
             asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """See `DeviceOutput.follow_states`."""
         if self._states is not None:
             self._states.close()
@@ -192,4 +192,4 @@ class RigEndpoint:
 
     def _publish_request_log(self) -> None:
         clock = self._clock
-        self._request_log.send(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
+        self._request_log.publish(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
