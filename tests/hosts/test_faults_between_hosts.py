@@ -150,6 +150,6 @@ def test_two_labs_on_one_router_do_not_see_each_other(lab: LabOfHosts) -> None:
     assert services(lab.config) == ["edge", "recorder", "sim"]
     second = lab.run("sim", "sim", "-c", str(lab.config), "--instance", "2")
     assert second.returncode == 3
-    assert "serves rig1 already; a rig has one sim" in second.stderr
+    assert "already serves rig1; each rig has one sim" in second.stderr
     simulation.terminate()
     assert simulation.wait(PATIENT_S) == 0

@@ -120,7 +120,7 @@ def shown(lab_folder: Path) -> dict[str, Any]:
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
         ports = lab.lab.ports
-        assert f"{ports['constant-way']}, step 10 ms, impaired: state way none; command way constant" in lab.output()
+        assert f"{ports['constant-way']}, step 10 ms, impaired: state link none; command link constant" in lab.output()
         assert f"{ports['free']}, step 10 ms\n" in lab.output()
         controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-way": write_for_each_state}
         threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
@@ -236,7 +236,7 @@ def test_schedule_is_followed_and_recorded(sessions: dict[str, Session]) -> None
         assert len(part) > 20
         assert set(part["command_injected_ns"].tolist()) == {injected_ns}
     assert run.events["text"][run.events["kind"] == "IMPAIRMENT_CHANGED"].tolist() == [
-        f"impairment of scheduled: state way none; command way constant delay 20 ms, seed {SEED} (source: schedule)",
+        f"impairment of scheduled: state link none; command link constant delay 20 ms, seed {SEED} (source: schedule)",
         "impairment of scheduled: none (source: schedule)",
     ]
 
@@ -283,12 +283,12 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
         for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
             assert word in table.stdout
         for options, complaint in (
-            (("rig1", "--command", "constant:-3"), "delay_ms: expected greater than or equal to 0, found '-3'"),
-            (("rig1", "--preset", "wlan"), "no preset is called 'wlan': expected one of none, wired"),
+            (("rig1", "--command", "constant:-3"), "delay_ms: must be ≥ 0, got '-3'"),
+            (("rig1", "--preset", "wlan"), "unknown preset 'wlan'; must be one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
             (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
             (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
-            (("rig9", "--off"), "no rig is called 'rig9'"),
+            (("rig9", "--off"), "unknown rig 'rig9'"),
             (("--off",), "a rig is required to set an impairment"),
         ):
             said = hilrig("impair", *options, "--config", config)

@@ -19,9 +19,9 @@ from support.labs import free_ports
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (MemoryError(), "no more memory or threads"),
-        (RuntimeError("can't start new thread"), "no more memory or threads"),
-        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "no more open files"),
+        (MemoryError(), "out of memory or threads"),
+        (RuntimeError("can't start new thread"), "out of memory or threads"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "too many open files"),
     ],
 )
 def test_what_the_system_does_not_give_is_one_line(
