@@ -154,7 +154,7 @@ def test_invalid_requests_are_rejected_without_effect() -> None:
 
 
 def test_timed_out_call_fails_and_is_not_executed_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilrig_runtime.process.mailbox.TIMEOUT_S", 0.01)
+    monkeypatch.setattr("hilrig_runtime.process.mailbox.CALL_TIMEOUT_S", 0.01)
     turns, done = OwnerThreadExecutor(), []
     with pytest.raises(OperationError, match="too busy"):
         turns.call(lambda: done.append(1))

@@ -24,17 +24,20 @@ def parameters(text: str) -> None:
         (PART.format(name="far", x=900, y=0), "'far' at (900, 0) mm is outside the table, which is 1300 mm by 1300 mm"),
         (
             PART.format(name="a", x=300, y=0) + PART.format(name="b", x=320, y=0),
-            "parts 'a' and 'b' overlap: their middles are 20.0 mm apart and need 40.0 mm",
+            "parts 'a' and 'b' overlap: their centers are 20.0 mm apart and must be 40.0 mm apart",
         ),
         (PART.format(name="a", x=300, y=0) * 2, "duplicate name 'a' of a part or tray"),
         (PART.format(name="tray", x=300, y=0), "duplicate name 'tray' of a part or tray"),
         (PART.format(name="a", x=300, y=0) + "mass_kg = 0", "scene.parts[0].mass_kg: must be > 0, got 0"),
         (PART.format(name="a", x=300, y=0) + 'colour = "red"', "scene.parts[0].colour"),
-        (PART.format(name="a", x=300, y=0) + "size_mm = [40, 30, 30]", "cylinder 'a' has two diameters, 40 and 30"),
+        (
+            PART.format(name="a", x=300, y=0) + "size_mm = [40, 30, 30]",
+            "cylinder 'a': length and width must be equal, got 40 and 30 mm",
+        ),
         (PART.format(name="a", x=300, y=0) + "weight = 1", "scene.parts[0].weight: unknown key"),
         (
             '[[scene.trays]]\nname = "t"\nposition_mm = [300, 0]\nrows = 5',
-            "tray 't' is 150 mm long, its places need 280 mm",
+            "tray 't' is 150 mm long, but its places need 280 mm",
         ),
         (
             PART.format(name="a", x=300, y=0) + "mass_kg = 3.5",
