@@ -16,7 +16,18 @@ from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.types import Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
+from hilrig_runtime.config.types import (
+    Flag,
+    Name,
+    Network,
+    NotNegative,
+    Number,
+    Port,
+    Positive,
+    Section,
+    TableForm,
+    Vector4,
+)
 from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
@@ -222,7 +233,9 @@ class LabConfig(Section):
     task: TaskConfig | None = None
     """Task by which runs are graded."""
     impairment: ImpairmentConfig = ImpairmentConfig()
-    rigs: Annotated[tuple[RigSettings, ...], BeforeValidator(_expand_group), Field(min_length=1)] = (RigSettings(),)
+    rigs: Annotated[
+        tuple[RigSettings, ...], BeforeValidator(_expand_group), TableForm(RigsTable), Field(min_length=1)
+    ] = (RigSettings(),)
     _source: str = PrivateAttr("")
 
     @property

@@ -1,5 +1,6 @@
 """Base class and value types of the tables in `lab.toml`."""
 
+from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Annotated, Final
 
@@ -27,6 +28,13 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Network = Annotated[IPv4Network | IPv6Network, BeforeValidator(ip_network)]
 Vector2 = tuple[Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
+
+
+@dataclass(frozen=True)
+class TableForm:
+    """Marks a list of tables that may also be written as one table of this type."""
+
+    section: type["Section"]
 
 
 class Section(BaseModel):

@@ -7,7 +7,7 @@ from typing import Any, Final, get_args
 
 from pydantic import ValidationError
 
-from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS, Section
+from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS, Section, TableForm
 
 _BOUNDS: Final = {"greater_than_equal": "≥", "greater_than": ">", "less_than_equal": "≤", "less_than": "<"}
 _CONTEXT_KEYS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
@@ -66,10 +66,13 @@ def _flatten(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[A
 def _known_keys(model: str, place: tuple[str | int, ...]) -> list[str]:
     """Return the keys of the table at a place inside the model of that name."""
     tables = [one for one in _all_subclasses(Section) if one.__name__ == model]
-    for part in place:
-        inner = [one.model_fields[part].annotation for one in tables if part in one.model_fields]
-        if inner:
-            tables = [table for annotation in inner for table in _tables_in(annotation)]
+    for part, following in zip(place, (*place[1:], None), strict=True):
+        fields = [one.model_fields[part] for one in tables if part in one.model_fields]
+        forms = [mark.section for field in fields for mark in field.metadata if isinstance(mark, TableForm)]
+        if forms and not isinstance(following, int):
+            tables = forms
+        elif fields:
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
         else:
             # The place of a union's member names its kind; an index names the item of a list.
             chosen = [one for one in tables if "kind" in one.model_fields and one.model_fields["kind"].default == part]
