@@ -20,7 +20,7 @@ from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run, open_run
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 from support.edge_rig import RawClient
 from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import eventually
@@ -163,7 +163,7 @@ def test_injected_delay_has_configured_distribution(sessions: dict[str, Session]
 def test_each_command_has_the_delay_of_its_seed(sessions: dict[str, Session], rig: str) -> None:
     commands = sessions[rig].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
-    way = WayImpairment.model_validate(COMMAND_RIGS[rig])
+    way = LinkImpairment.model_validate(COMMAND_RIGS[rig])
     sampled, _ = Impairment(way, link_seed(SEED, rig, "command")).draw(2000)
     expected = sampled[(commands["seq"] - commands["seq"][0]).astype(int)]
     assert commands["command_injected_ns"].tolist() == expected.tolist()
@@ -191,7 +191,7 @@ def test_injected_state_delay_is_that_of_its_seed(sessions: dict[str, Session]) 
     assert_stages_add_up(session)
     assert session.report.samples > 250
     table = session.report.table[5:-5]
-    sampled, _ = Impairment(WayImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
+    sampled, _ = Impairment(LinkImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
     (first,) = np.flatnonzero(sampled == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
     assert table["injected"].tolist() == sampled[first + after].tolist()

@@ -9,7 +9,7 @@ from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.registers.map import RegisterTable
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
 
@@ -27,8 +27,8 @@ class Bench:
         self.session_changes = 0
         self.deadlines: list[int] = []
         self.sends: list[int] = []
-        self.arrive: Callable[[Arrival], None] | None = None
-        self.arrival: Arrival | None = None
+        self.arrive: Callable[[TimestampedPayload], None] | None = None
+        self.arrival: TimestampedPayload | None = None
         self.device = Device(
             "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
         )
@@ -51,7 +51,7 @@ class Bench:
     def send_at(self, deadline_ns: int) -> None:
         self.sends.append(deadline_ns)
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         self.arrive = arrive
 
     def state(self, step: int, **fields: Any) -> None:
@@ -64,7 +64,7 @@ class Bench:
             effort=fields.pop("effort", (0, 0, 0, 0)),
             **fields,
         )
-        self.arrival = Arrival(message.SerializeToString(), self.clock.monotonic_ns())
+        self.arrival = TimestampedPayload(message.SerializeToString(), self.clock.monotonic_ns())
         if self.arrive is not None:
             self.arrive(self.arrival)
 
