@@ -131,9 +131,9 @@ def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[Edg
 
             def up() -> bool:
                 for name in rigs:
-                    if not rig.step or not watcher.alive(alive):
+                    if not rig.step or not watcher.get_liveliness(alive):
                         rig.state(name)
-                return bool(watcher.alive(alive)) or bool(failures)
+                return bool(watcher.get_liveliness(alive)) or bool(failures)
 
             eventually(up)
             if not failures:

@@ -13,7 +13,7 @@ from hilrig_console.poses import PoseCache
 from hilrig_console.view_model import ClientState, Frame, ViewModel
 from hilrig_monitoring.lab_view import REMOVED_AFTER_S, SILENT_AFTER_S, LabView
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
+from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, ServiceInfo
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_sim.parameters import rig_parameters
@@ -184,10 +184,11 @@ def lab_model() -> ViewModel:
     edge = [RigReport(rig="rig1", controller="192.0.2.7:9", session="s"), RigReport(rig="rig2")]
     model.view.update(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
     model.view.update(Health(service="edge", instance="1", rig_reports=edge), 0.0)
-    model.view.update(
-        Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 0.0
+    recorder = [RigReport(rig="rig1", recording=True)]
+    model.view.update(Health(service="recorder", instance="1", rig_reports=recorder), 0.0)
+    model.set_addresses(
+        [ServiceInfo(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])]
     )
-    model.set_addresses([Roster(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])])
     return model
 
 

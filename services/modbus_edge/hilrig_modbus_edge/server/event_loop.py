@@ -1,8 +1,8 @@
 """The edge's event loop: asyncio whose selector serves plain Modbus connections itself, with exact timers.
 
 asyncio queues a handle for each ready socket, runs it in a context, and asks the transport, then the protocol: as much
-time as a Modbus request takes. Here a ready socket is read and answered inside `select()` (ADR 0027). The receive call
-is ours, which kernel timestamps need.
+time as a Modbus request takes. Here a ready socket is read and answered inside `select()` (ADR 0027). The
+transport has its own receive call, which kernel timestamps need.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 class DirectSelector(selectors.DefaultSelector):
-    """Selector of an asyncio event loop that serves sockets inside `select()` (in-selector I/O), with exact time-outs.
+    """Selector of an asyncio event loop that serves sockets inside `select()` (in-selector I/O), with exact timeouts.
 
     A socket that was registered with a function is served by calling it, and the selector keeps waiting. asyncio gets
     only the events of its own sockets, and control when there is work for it.
@@ -89,7 +89,7 @@ class DirectSelector(selectors.DefaultSelector):
 if hasattr(select, "epoll"):
 
     def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float | None], _Ready]:
-        """Return a function that waits for events, possibly for less than its time-out.
+        """Return a function that waits for events, possibly for less than its timeout.
 
         The standard library makes a key of each event, which takes longer than the system call.
         """
@@ -143,7 +143,7 @@ class DirectEventLoop(asyncio.SelectorEventLoop):
 
 
 class SocketTransport(asyncio.Transport):
-    """Transport of one TCP connection, for an `asyncio.BufferedProtocol` that `set_protocol` names."""
+    """Transport of one TCP connection; its protocol is an `asyncio.BufferedProtocol`, set by `set_protocol`."""
 
     def __init__(self, loop: DirectEventLoop, connected: socket.socket, peer: Any) -> None:
         super().__init__({"socket": connected, "peername": peer})
@@ -298,14 +298,19 @@ class SocketTransport(asyncio.Transport):
 async def accept_connections(
     loop: DirectEventLoop, listening: socket.socket, on_accept: Callable[[SocketTransport], None]
 ) -> None:
-    """Pass each accepted connection to `on_accept`, until cancelled."""
+    """Pass each accepted connection to `on_accept`, until the task is canceled."""
     listening.setblocking(False)
     while True:
         try:
             connected, peer = await loop.sock_accept(listening)
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
-            logger.warning("connection not accepted on %s: %s", listening.getsockname(), error)
+            logger.warning(
+                "can't accept a connection on %s: %s; retrying in %g s",
+                listening.getsockname(),
+                error,
+                ACCEPT_RETRY_S,
+            )
             await asyncio.sleep(ACCEPT_RETRY_S)
             continue
         on_accept(SocketTransport(loop, connected, peer))

@@ -21,7 +21,7 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.plant.world import NONE
+from hilrig_sim.plant.world import NO_PART
 from hilrig_sim.platform_fingerprint import machine_name
 
 OTHER_MACHINE_TOLERANCE: Final = 1e-9
@@ -124,7 +124,7 @@ class _Piece:
     states: Rows
     parts: Rows
     held: Ints
-    """Index of the held part in the scene, or `NONE`."""
+    """Index of the held part in the scene, or `NO_PART`."""
     stated: Ints
     """Row of `parts` at which the state's begin, -1 where it has none."""
     follows: NDArray[np.bool_]
@@ -198,7 +198,7 @@ class _Resimulation:
         plant = Plant([self._parameters] * len(stretches))
         for rig, (begin, _) in enumerate(stretches):
             if begin == 0 and self._goes_on:
-                plant.adopt(self._ongoing, [rig], [0])
+                plant.copy_state_from(self._ongoing, [rig], [0])
             else:
                 self._place(plant, rig, piece, begin)
         begins, ends = (np.array(column) for column in zip(*stretches, strict=True))
@@ -209,7 +209,7 @@ class _Resimulation:
             going = np.flatnonzero(begins + turn < ends)
             wrong = min(wrong, self._compare(piece, plant, going, rows[going] + 1))
             if goes_on and begins[-1] + turn == ends[-1] - 1:
-                self._ongoing.adopt(plant, [0], [len(stretches) - 1])
+                self._ongoing.copy_state_from(plant, [0], [len(stretches) - 1])
         if self._first is None and wrong < len(piece.states):
             self._first = int(piece.states["step"][wrong])
 
@@ -246,7 +246,7 @@ class _Resimulation:
         """First row from `low` on, before `high`, at which all that the next step depends on is recorded."""
         for offset in np.flatnonzero(piece.stated[low:high] >= 0):
             row = low + int(offset)
-            if not any_held and piece.held[row] != NONE:
+            if not any_held and piece.held[row] != NO_PART:
                 continue
             self._place(self._probe, 0, piece, row)
             if self._probe.world.at_rest(0):
@@ -257,7 +257,7 @@ class _Resimulation:
         parts = piece.parts[piece.stated[row] :][: len(self._parameters.scene.parts)]
         poses = list(zip(*(parts[name].tolist() for name in ("x", "y", "z", "yaw")), strict=True))
         state = piece.states[row]
-        plant.place(rig, state["position"], state["velocity"], poses, int(piece.held[row]))
+        plant.set_state(rig, state["position"], state["velocity"], poses, int(piece.held[row]))
 
     def _part_deviation(self, piece: _Piece, plant: Plant, rigs: Ints, rows: Ints) -> Floats:
         """Largest distance of a part from where it was recorded, m, infinite where another part is held, (K,)."""
@@ -274,11 +274,11 @@ class _Resimulation:
 
 
 def _indices(codes: Rows, names: Names, parts: Sequence[str]) -> Ints:
-    """Index of the held part in the scene, or `NONE`, of each state."""
+    """Index of the held part in the scene, or `NO_PART`, of each state."""
     index_of = {part: index for index, part in enumerate(parts)}
-    found = np.full(len(codes), NONE, dtype=np.int64)
+    found = np.full(len(codes), NO_PART, dtype=np.int64)
     for code in np.unique(codes):
-        found[codes == code] = index_of.get(names[code], NONE)
+        found[codes == code] = index_of.get(names[code], NO_PART)
     return found
 
 

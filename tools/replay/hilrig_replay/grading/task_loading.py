@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import RigParameters
@@ -30,7 +30,7 @@ def task_of(run: Run) -> TaskConfig | None:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{run.path}: its lab.toml is no valid TOML: {error}") from error
     except ValidationError as error:
-        said = "; ".join(mistakes_in(error))
+        said = "; ".join(format_validation_error(error))
         raise InputError(f"{run.path}: the task in its lab.toml is not understood: {said}") from error
 
 
