@@ -12,7 +12,7 @@ from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
 from hilrig_replay.rerun_view.rig_view import Drawn, RigView
 from hilrig_replay.rerun_view.sinks import to_file, to_viewer
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import InputError, OperationError
 
 
 def drawn(run: Run) -> Drawn:
@@ -35,7 +35,7 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    _write(to_file(path, _name(chosen), _layout(chosen)), chosen)
+    _write(to_file(path, _name(chosen), _layout(chosen)), chosen, flush_blocks=True)
 
 
 def send_runs(runs: Sequence[Run], grpc_port: int, over: Callable[[], bool]) -> None:
@@ -66,7 +66,19 @@ def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
     return layout(root_names(runs))
 
 
-def _write(stream: rr.RecordingStream, runs: Sequence[Run], over: Callable[[], bool] = lambda: False) -> None:
+def _write(
+    stream: rr.RecordingStream,
+    runs: Sequence[Run],
+    over: Callable[[], bool] = lambda: False,
+    *,
+    flush_blocks: bool = False,
+) -> None:
+    """Write runs block by block.
+
+    rerun encodes and writes on threads of its own, and holds the arrays of all blocks that are not written yet. With
+    `flush_blocks`, each block is written before the next one is read, so the memory does not depend on the length of
+    the run or on the scheduling of those threads. A viewer is not flushed, because it may close at any time.
+    """
     with stream:
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
@@ -75,5 +87,14 @@ def _write(stream: rr.RecordingStream, runs: Sequence[Run], over: Callable[[], b
                 if over():
                     return
                 view.add(block)
+                if flush_blocks:
+                    stream.flush()
             view.end()
     stream.disconnect()
+
+
+def _flush(stream: rr.RecordingStream, file: Path) -> None:
+    try:
+        stream.flush()
+    except RuntimeError as error:
+        raise OperationError(f"{file}: can't be written: {error}") from error
