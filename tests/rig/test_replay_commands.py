@@ -53,7 +53,7 @@ def test_a_folder_is_all_of_its_runs_and_a_bad_one_does_not_hide_the_others(run:
 @pytest.mark.parametrize("command", [["latency"], ["replay", "--save", "out.rrd"]])
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "no MCAP file")],
+    [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "not an MCAP file")],
 )
 def test_a_bad_file_is_one_clear_line(command: list[str], content: bytes | None, words: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
@@ -72,7 +72,7 @@ def test_a_run_without_a_controller_is_shown_and_has_no_latency(tmp_path: Path, 
     path = write(tmp_path / "alone.mcap", make(script), script=script)
     result = hilrig("latency", path)
     assert (result.returncode, result.stderr) == (1, "")
-    assert "nothing closed a loop, for no controller wrote in this session" in " ".join(result.stdout.split())
+    assert "no closed loop: no controller wrote commands in this session" in " ".join(result.stdout.split())
     assert "jitter" not in result.stdout
     assert json.loads(hilrig("latency", path, "--json").stdout)["loop_ms"] is None
     assert hilrig("latency", path, "--plot", tmp_path / "plot.png").returncode == 2

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.compare import Origin, compare, origin_of, save_comparison_plot
-from hilrig_replay.analysis.summary import COURSE_POINTS, summarise
-from hilrig_replay.io.paths import names_of
+from hilrig_replay.analysis.compare import Origin, compare, find_origin, save_comparison_plot
+from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
+from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.report.report import report
 from hilrig_replay.rerun_view.scene import tips
@@ -31,7 +31,7 @@ def named(folder: Path, name: str, script: Script, made: list[Made] | None = Non
 
 def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=10.0)))
-    summary = summarise(run)
+    summary = summarize(run)
     t = np.arange(0, 10.0, 0.001)
     way = tips(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
     assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(way, axis=0), axis=1).sum(), rel=0.01)
@@ -39,8 +39,8 @@ def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
     assert summary.motion.work_j == pytest.approx(work)
     assert summary.motion.saturated_share == (0, 0, 0, 0)
     assert summary.events == {"SESSION_END": 1, "SESSION_START": 1}
-    assert summary.task is not None
-    assert (summary.task.placed, len(summary.task.parts)) == (0, 4)
+    assert summary.placement is not None
+    assert (summary.placement.placed, len(summary.placement.parts)) == (0, 4)
 
 
 def test_saturation_is_the_share_of_steps_at_the_registers_limit(tmp_path: Path) -> None:
@@ -49,16 +49,16 @@ def test_saturation_is_the_share_of_steps_at_the_registers_limit(tmp_path: Path)
     states = [one.message for one in made if isinstance(one.message, JointState)]
     for state in states[:50]:
         state.effort[2] = -32.767
-    summary = summarise(named(tmp_path, "run", script, made))
+    summary = summarize(named(tmp_path, "run", script, made))
     assert summary.motion.saturated_share == (0, 0, 0.25, 0)
     assert summary.motion.peak_effort[2] == 32.767
 
 
 def test_a_course_stays_short_however_long_the_run(tmp_path: Path) -> None:
     script = Script(seconds=10.0, step_ms=1.0, poll_ms=50.0)
-    course = summarise(named(tmp_path, "run", script)).course
-    assert COURSE_POINTS <= len(course.time_s) < 2 * COURSE_POINTS
-    assert np.allclose(np.diff(course.time_s), course.time_s[1], atol=2e-4)
+    trajectory = summarize(named(tmp_path, "run", script)).trajectory
+    assert TRAJECTORY_POINTS <= len(trajectory.time_s) < 2 * TRAJECTORY_POINTS
+    assert np.allclose(np.diff(trajectory.time_s), trajectory.time_s[1], atol=2e-4)
 
 
 def test_a_run_does_not_differ_from_itself(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_a_slower_controller_shows_in_the_comparison(tmp_path: Path) -> None:
 
 def test_what_can_not_be_aligned_is_said(tmp_path: Path) -> None:
     run = named(tmp_path, "run", Script(seconds=2.0))
-    with pytest.raises(InputError, match="has no event PART_PICKED; it has SESSION_END, SESSION_START"):
+    with pytest.raises(InputError, match="no event PART_PICKED; its events: SESSION_END, SESSION_START"):
         compare([run, run], "part_picked")
 
 
@@ -135,11 +135,11 @@ def test_the_torque_zero_that_an_edge_begins_with_is_nobody_s_command(tmp_path: 
         0, Made("command", first.publish_wall_ns, TorqueCommand(rig="rig1", seq=1, effort=[0.0] * 4, safe=True))
     )
     run = named(tmp_path, "alone", silent, made)
-    assert origin_of(run, "motion") == Origin(0, "start")
-    summary = summarise(
+    assert find_origin(run, "motion") == Origin(0, "start")
+    summary = summarize(
         run, parse_lab("[[task.poses]]\nname = 'here'\nposition_mm = [300, 0, 0]\ntolerance_mm = 900\n").task
     )
-    assert summary.latency.reasons == ("nothing closed a loop, for no controller wrote in this session",)
+    assert summary.latency.reasons == ("no closed loop: no controller wrote commands in this session",)
     assert summary.grade is not None
     assert summary.grade.score == 0
 
@@ -153,14 +153,14 @@ def test_a_run_that_can_not_be_aligned_does_not_hide_the_others(tmp_path: Path) 
     comparison = compare(runs, "session-end")
     assert [one.session for one in comparison.differences] == ["two"]
     assert [run.session for run in comparison.runs] == ["one", "two"]
-    assert ["has no event SESSION_END" in reason for reason in comparison.left_out] == [True]
+    assert ["no event SESSION_END" in reason for reason in comparison.left_out] == [True]
 
 
 def test_a_report_of_a_run_without_a_controller_says_that_nothing_closed_a_loop(tmp_path: Path) -> None:
     silent = named(tmp_path, "silent", Script(seconds=2.0, controllers=False))
     alone = report([silent.path])
     page = _Page(alone.html)
-    assert page.text.count("nothing closed a loop, for no controller wrote in this session") == 2
+    assert page.text.count("no closed loop: no controller wrote commands in this session") == 2
     assert alone.html.count("<img") == 2
     assert "tick lateness" in page.text
     among = report([silent.path, named(tmp_path, "quick", Script(seconds=2.0)).path])
@@ -264,7 +264,7 @@ def test_files_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None
         paths.append(named(tmp_path / day, "anna", Script(seconds=1.0)).path)
     third = named(tmp_path, "ben", Script(seconds=1.0)).path
     page = _Page(report([*paths, third]).html)
-    assert set(names_of([*paths, third]).values()) == {
+    assert set(display_names([*paths, third]).values()) == {
         str(tmp_path / "monday/anna"),
         str(tmp_path / "tuesday/anna"),
         "ben",

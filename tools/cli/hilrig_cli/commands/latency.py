@@ -32,11 +32,11 @@ def latency(
     Exit code 1: the recording (or one of them) is not fit for latency claims; the reasons are printed.
     """
     from hilrig_replay.analysis.latency import measure
-    from hilrig_replay.io.paths import names_of, recordings
+    from hilrig_replay.io.paths import display_names, find_recordings
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
-    paths = recordings(runs)
+    paths = find_recordings(runs)
     if plot is not None:
         from hilrig_replay.plots.latency_plot import check_plot_path, save_plot
 
@@ -64,7 +64,7 @@ def latency(
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:
-        names = names_of(paths)
+        names = display_names(paths)
         print_overview({names[path]: each for path, each in reports})
         for bad in unreadable:
             print(bad["reason"], file=sys.stderr)

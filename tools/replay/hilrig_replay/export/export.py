@@ -19,10 +19,10 @@ from hilrig_recorder.mcap_format.channels import encode_message, file_descriptor
 from hilrig_recorder.mcap_format.writer import RunWriter
 from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.export.urdf_geometry import Solid, fixed_joints, solids_of
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.recording_file import RawMessage
-from hilrig_replay.io.records import Decoder, Records, join_records, name_of
-from hilrig_replay.io.run import ALL, BLOCK_ROWS, Run
+from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
+from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.rerun_view.scene import ArmPicture, read_arm
 from hilrig_runtime.errors import InputError, OperationError
@@ -77,7 +77,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
         OperationError: the folder can't be written.
     """
     paths = {name: folder / f"{name}.{kind}" for name in TABLES}
-    nothing = join_records([])
+    nothing = concatenate_records([])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as closing:
@@ -151,7 +151,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
 
 
 def _copy(run: Run, writer: RunWriter, drawing: "_Drawing", channel_ids: dict[str, int]) -> None:
-    messages = run.file.messages(ALL)
+    messages = run.file.messages(ALL_TOPICS)
     while block := list(islice(messages, BLOCK_ROWS)):
         drawing.expect(block)
         for topic, sequence, log_ns, publish_ns, payload in block:
@@ -189,11 +189,11 @@ class _Drawing:
 
     def expect(self, messages: Iterable[RawMessage]) -> None:
         """Find how the arm stands in each of the states that come next."""
-        decoder = Decoder(Names(), Timebase())
+        decoder = Decoder(StringTable(), Timebase())
         for topic, sequence, log_ns, _, payload in messages:
             if topic == "state":
                 decoder.add(topic, payload, sequence, log_ns)
-        states = decoder.take().states
+        states = decoder.drain().states
         frames = (joint.transforms(states["position"][:, number]) for number, joint in enumerate(self._arm.joints))
         self._moved = zip(states["wall_ns"].tolist(), *(zip(*both, strict=True) for both in frames), strict=True)
 
@@ -239,7 +239,7 @@ class _Drawing:
 
     def event(self, log_ns: int, event: Event) -> None:
         """Tell an event."""
-        level = foxglove.LOG_LEVELS.get(name_of(Event.Severity, event.severity), 0)
+        level = foxglove.LOG_LEVELS.get(enum_name(Event.Severity, event.severity), 0)
         message = foxglove.Log(level=level, message=event.text, name=event.source)
         _stamp(message.timestamp, event.wall_ns)
         self._put("/log", log_ns, event.wall_ns, message)

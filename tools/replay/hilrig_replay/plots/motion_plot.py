@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from hilrig_replay.analysis.distribution import tail
-from hilrig_replay.analysis.summary import Course, RunSummary
+from hilrig_replay.analysis.distribution import complementary_cdf
+from hilrig_replay.analysis.summary import RunSummary, Trajectory
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, INK, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
 from hilrig_replay.rerun_view.scene import reach_outline
 from hilrig_runtime.config.task import TaskConfig
@@ -18,15 +18,17 @@ from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
 TASK_COLOR: Final = "#2e9e57"
 
 
-def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
+def motion_figure(trajectory: Trajectory, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
     """One run: positions, efforts, and the tool's way with trays, targets and the reachable area."""
     figure = Figure(figsize=(11, 5), layout="constrained", dpi=110)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     position, effort = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     for joint in range(4):
-        color, values = JOINT_COLORS[joint], course.position[:, joint] * JOINT_SCALE[joint]
-        position.plot(course.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
-        effort.plot(course.time_s, course.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint])
+        color, values = JOINT_COLORS[joint], trajectory.position[:, joint] * JOINT_SCALE[joint]
+        position.plot(trajectory.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
+        effort.plot(
+            trajectory.time_s, trajectory.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint]
+        )
     label(position, "Positions: θ in °, d3 in mm", "", "")
     label(effort, "Efforts: τ1 τ2 τ4 in N·m, τ3 in N", "time in the run, s", "")
     for axes in (position, effort):
@@ -34,7 +36,7 @@ def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | 
         axes.margins(x=0.01)
     top = figure.add_subplot(grid[:, 1])
     _from_above(top, parameters, task)
-    top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
+    top.plot(trajectory.tip[:, 0] * 1e3, trajectory.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
     label(top, "The tool's way from above, mm", "x", "y")
     return figure
 
@@ -46,19 +48,19 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
     for joint in range(4):
         axes = figure.add_subplot(grid[joint, 0])
         for number, summary in enumerate(runs):
-            color, course = RUN_COLORS[number % len(RUN_COLORS)], summary.course
-            values = course.position[:, joint] * JOINT_SCALE[joint]
-            axes.plot(course.time_s, values, color=color, linewidth=1.1, label=summary.session)
+            color, trajectory = RUN_COLORS[number % len(RUN_COLORS)], summary.trajectory
+            values = trajectory.position[:, joint] * JOINT_SCALE[joint]
+            axes.plot(trajectory.time_s, values, color=color, linewidth=1.1, label=summary.session)
         unit = "mm" if joint == 2 else "°"
         label(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")
     figure.axes[0].legend(fontsize=7, frameon=False)
     top, above = figure.add_subplot(grid[:2, 1]), figure.add_subplot(grid[2:, 1])
     for number, summary in enumerate(runs):
-        course = summary.course
+        trajectory = summary.trajectory
         color = RUN_COLORS[number % len(RUN_COLORS)]
-        top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=color, linewidth=0.9)
+        top.plot(trajectory.tip[:, 0] * 1e3, trajectory.tip[:, 1] * 1e3, color=color, linewidth=0.9)
         if summary.latency.samples:
-            loop_ns, share = tail(summary.latency.table.column("loop"))
+            loop_ns, share = complementary_cdf(summary.latency.table.column("loop"))
             above.step(loop_ns / 1e6, share, where="post", color=color, linewidth=1.2)
     top.set_aspect("equal", adjustable="datalim")
     label(top, "The tools' ways from above, mm", "", "")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import Statistics
-from hilrig_replay.analysis.similarity import alike
-from hilrig_replay.analysis.summary import RunSummary, summarise
+from hilrig_replay.analysis.similarity import find_similar
+from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
-from hilrig_replay.grading.task_loading import task_of
-from hilrig_replay.io.paths import names_of
+from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
@@ -135,7 +135,7 @@ def _alike(pages: Sequence[_Page]) -> tuple[str, ...]:
             if runs[one].session == runs[other].session
             else f"{int(100 * share)} % of the torques that the controllers wrote are the same to the last count"
         )
-        for one, other, share in alike([run.torques for run in runs])
+        for one, other, share in find_similar([run.torques for run in runs])
     )
 
 
@@ -164,7 +164,7 @@ def _pages(
     paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
 ) -> Iterator[_Page | InputError]:
     """Each run's page, or why there is none, in the order of `paths`."""
-    names = names_of(paths)
+    names = display_names(paths)
     tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
     if workers == 1 or len(paths) < _WORTH_PROCESSES:
         yield from map(_page_or_reason, *tasks)
@@ -181,10 +181,12 @@ def _page_or_reason(path: Path, name: str, verified: bool, task: TaskConfig | No
 
 
 def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:
-    summary = summarise(run, task)
+    summary = summarize(run, task)
     parameters = parameters_of(run.parameters_json)
-    targets = task or task_of(run)
-    pictures = [picture(motion_figure(summary.course, parameters, targets), "positions, efforts and the tool's way")]
+    targets = task or recorded_task(run)
+    pictures = [
+        picture(motion_figure(summary.trajectory, parameters, targets), "positions, efforts and the tool's way")
+    ]
     if summary.latency.loop_ms is not None:
         pictures.append(picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
     # A class has many runs: the samples of each are let go once they are drawn.
@@ -220,10 +222,11 @@ def _facts(page: _Page) -> str:
     facts = [(f"{summary.duration_s:.1f} s", f"length; {summary.ended or 'how it ended is not said'}")]
     if summary.grade is not None:
         facts.append((f"{summary.grade.percent} %", f"of the task: {summary.grade.headline()}"))
-    if summary.task is not None:
-        error = summary.task.largest_error_mm
+    if summary.placement is not None:
+        placement = summary.placement
+        error = placement.largest_error_mm
         within = "none placed" if error is None else f"within {error:.1f} mm"
-        facts.append((f"{summary.task.placed} of {len(summary.task.parts)}", f"parts in their places, {within}"))
+        facts.append((f"{placement.placed} of {len(placement.parts)}", f"parts in their places, {within}"))
     loop = summary.latency.loop_ms
     if loop is None:
         facts.append(("–", f"loop latency: {summary.latency.reasons[-1]}"))
@@ -326,7 +329,7 @@ def _graded(summary: RunSummary) -> list[str]:
 
 
 def _placed(summary: RunSummary) -> list[str]:
-    task = summary.task
+    task = summary.placement
     return ["–"] * 2 if task is None else [f"{task.placed} of {len(task.parts)}", _or_dash(task.largest_error_mm)]
 
 
@@ -335,7 +338,7 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 
 def _rank(page: _Page) -> tuple[float, ...]:
-    task, grade = page.summary.task, page.summary.grade
+    task, grade = page.summary.placement, page.summary.grade
     # A tool that nobody moved went the shortest way: among equals such a run comes last.
     way = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:

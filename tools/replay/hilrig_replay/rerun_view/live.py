@@ -12,7 +12,7 @@ from typing import Final
 import rerun as rr
 from google.protobuf.message import DecodeError
 
-from hilrig_replay.io.columns import Names
+from hilrig_replay.io.columns import StringTable
 from hilrig_replay.io.records import Decoder
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.rerun_view.rig_view import Drawn, RigView
@@ -56,7 +56,7 @@ class Follower:
         self._say = say
         self._task = task
         self._waiting: deque[tuple[str, bytes, int]] = deque(maxlen=_WAITING)
-        self._names, self._timebase = Names(), Timebase()
+        self._names, self._timebase = StringTable(), Timebase()
         self._decoder = Decoder(self._names, self._timebase)
         self._view: RigView | None = None
         self._incarnation = 0
@@ -99,7 +99,7 @@ class Follower:
                 self._decoder.add(topic, payload, 0, arrived_ns)
             except DecodeError:
                 self._say(f"a message of {self._rig}/{topic} can't be decoded: another version of hilrig sends it")
-        records = self._decoder.take()
+        records = self._decoder.drain()
         # The edge goes on repeating its command when the simulation is gone: states are the sign of life.
         if len(records.states):
             self._heard_ns = now_ns

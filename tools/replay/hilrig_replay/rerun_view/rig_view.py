@@ -17,10 +17,10 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
-from hilrig_replay.analysis.data_quality import behind_ns
-from hilrig_replay.analysis.request_rates import BIN_NS, MOST, OTHERS, Rate, RequestRates
-from hilrig_replay.analysis.samples import STAGES, Matcher, join_commands
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.analysis.data_quality import tick_lateness_ns
+from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
+from hilrig_replay.analysis.samples import STAGES, CommandMatcher, join_commands
+from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.plots.palette import (
@@ -86,7 +86,7 @@ class RigView:
         stream: rr.RecordingStream,
         drawn: Drawn,
         timebase: Timebase,
-        names: Names,
+        names: StringTable,
         *,
         root: str = "",
         color: str | None = None,
@@ -97,7 +97,7 @@ class RigView:
         self._names = names
         self._root = root
         self._color = color
-        self._matcher = Matcher()
+        self._matcher = CommandMatcher()
         self._lanes: dict[str, str] = {}
         self._holder = ""
         self._holders = {_SAFE: "#e45756", _NOBODY: "#3a424c"}
@@ -237,7 +237,7 @@ class RigView:
         self._scalars("position", times, q * JOINT_SCALE)
         self._scalars("velocity", times, states["velocity"] * JOINT_SCALE)
         self._scalars("effort/applied", times, states["effort"])
-        self._scalars("lateness", times, behind_ns(states, self._drawn.step_ns)[:, None] / 1e6)
+        self._scalars("lateness", times, tick_lateness_ns(states, self._drawn.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)
         self._lane("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._lane("part", states, self._names.texts(states["held_part"]))
@@ -338,10 +338,10 @@ class RigView:
     def _tell_apart(self, holders: NDArray[np.object_]) -> None:
         """Give each holder a colour; those beyond the first `MOST` are one, as their requests are."""
         new = sorted(set(holders) - {""} - self._holders.keys())
-        room = max(MOST - len(self._holders), 0)
+        room = max(MAX_CLIENTS - len(self._holders), 0)
         if new[room:]:
-            holders[[holder in new[room:] for holder in holders]] = OTHERS
-            new = new[:room] if OTHERS in self._holders else [*new[:room], OTHERS]
+            holders[[holder in new[room:] for holder in holders]] = OTHER_CLIENTS
+            new = new[:room] if OTHER_CLIENTS in self._holders else [*new[:room], OTHER_CLIENTS]
         if new:
             for holder in new:
                 self._holders[holder] = RUN_COLORS[len(self._holders) % len(RUN_COLORS)]

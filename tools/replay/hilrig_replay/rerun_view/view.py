@@ -6,7 +6,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilrig_replay.grading.task_loading import task_of
+from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
@@ -22,7 +22,7 @@ def drawn(run: Run) -> Drawn:
         InputError: it says something that is not understood.
     """
     try:
-        return Drawn.of(run.urdf, run.parameters_json, run.step_ns, task_of(run))
+        return Drawn.of(run.urdf, run.parameters_json, run.step_ns, recorded_task(run))
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
 
