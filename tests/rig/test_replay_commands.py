@@ -47,7 +47,7 @@ def test_a_folder_is_all_of_its_runs_and_a_bad_one_does_not_hide_the_others(run:
     answer = json.loads(result.stdout)
     assert [each["fit"] for each in answer["runs"]] == [True]
     assert len(answer["unreadable"]) == 1
-    assert "torn" in answer["unreadable"][0]["reason"]
+    assert "truncated" in answer["unreadable"][0]["reason"]
 
 
 @pytest.mark.parametrize("command", [["latency"], ["replay", "--save", "out.rrd"]])
@@ -92,12 +92,12 @@ def test_among_several_runs_a_bad_one_does_not_hide_the_comparison(tmp_path: Pat
     assert done.returncode == 1, done.stderr
     found = json.loads(done.stdout)
     assert (len(found["runs"]), len(found["differences"])) == (2, 1)
-    assert [f"{torn}: torn" in reason for reason in found["left_out"]] == [True]
-    assert f"left out: {torn}: torn" in hilrig("compare", run, run, torn).stderr
+    assert [f"{torn}: truncated" in reason for reason in found["left_out"]] == [True]
+    assert f"left out: {torn}: truncated" in hilrig("compare", run, run, torn).stderr
     for others in ([run, torn], [torn, run, run], [run, torn, torn]):
         refused = hilrig("compare", *others)
         assert (refused.returncode, refused.stdout) == (2, "")
-        assert f"{torn}: torn" in refused.stderr
+        assert f"{torn}: truncated" in refused.stderr
 
 
 def test_replay_writes_a_file_that_rerun_reads(run: Path, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_output_never_replaces_a_recording(run: Path, tmp_path: Path, command: s
     result = hilrig(command, option, other, *inputs)
     assert result.returncode == 2
     if option != "--plot" or name.endswith(".png"):
-        assert f"{other} is a recording: choose another output name" in result.stderr
+        assert f"{other} is a recording and is not overwritten: choose another output name" in result.stderr
     assert other.read_bytes() == run.read_bytes()
 
 

@@ -287,8 +287,8 @@ def test_rejects_an_invalid_task_with_its_key(text: str, says: str) -> None:
 
 def test_reports_an_invalid_recorded_task(tmp_path: Path) -> None:
     script = Script(seconds=1.0)
-    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml="[task]\ncolour = 'red'\n[task.place]\n")
-    with pytest.raises(InputError, match=r"recorded lab\.toml: invalid task: colour: unknown key"):
+    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml="[task]\nshade = 'red'\n[task.place]\n")
+    with pytest.raises(InputError, match=r"recorded lab\.toml: invalid task: shade: unknown key"):
         recorded_task(open_run(path))
 
 

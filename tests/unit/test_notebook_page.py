@@ -28,10 +28,10 @@ def test_runs_all_code_blocks_of_the_page(
         "a step is 20.0 ms",
         "192.0.2.7:40001",
         "SESSION_START",
-        "reads a second",
-        "fit: False",
+        "reads per second",
+        "valid for latency measurements: False",
         "% of the task, ",
-        "J into the arm",
+        "J of mechanical energy into the arm",
     ):
         assert words in printed, words
 
