@@ -15,11 +15,11 @@ from harness import Report, progress, run
 from scipy.integrate import solve_ivp
 
 from hilrig_sim.arm.dynamics import forward_dynamics
-from hilrig_study.controllers.controllers import LawController, Measured
-from hilrig_study.simulation import quantization as quantised
+from hilrig_study.controllers.control_laws import LawController, Measurement
+from hilrig_study.simulation import quantization
 from hilrig_study.simulation.timing import NO_POLL, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
-from hilrig_study.sweep import cells_of, run_cells, sweep
+from hilrig_study.sweep import all_cells, run_cells, sweep
 
 PEERS = ((20.0, 0.3), (60.0, 0.4), (120.0, 0.2))
 """Delays, ms, and gains of the runs that are timed with solve_ivp."""
@@ -34,10 +34,10 @@ def study_of(side: int) -> StudyConfig:
 
 def one_by_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[float, np.ndarray]:
     """Seconds that one run takes, and where the arm is at its end."""
-    timing, rig, near, scenario = study.loop.timing(), study.rig(), study.near(), study.task.scenario()
+    timing, rig, plant_model, scenario = study.loop.timing(), study.rig(), study.linear_plant(), study.task.scenario()
     ticks = round(study.loop.duration_s * 1e9 / timing.step_ns)
     line = timeline(timing, ticks, command_delay_ns=round(delay_ms * 1e6))
-    controller = study.controllers[0].build(rig, near, timing.period_ns * 1e-9, np.array([gain]))
+    controller = study.controllers[0].build(rig, plant_model, timing.period_ns * 1e-9, np.array([gain]))
     assert isinstance(controller, LawController)
     memory = controller.start(1)
     state = np.concatenate([scenario.start, np.zeros(4)])
@@ -45,12 +45,12 @@ def one_by_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[
     seen = np.empty((ticks, 4))
     begin = time.perf_counter()
     for tick in range(ticks):
-        seen[tick] = quantised.position(state[:4, np.newaxis])[:, 0]
-        effort = np.array(near.holding) if line.in_force[tick] == NO_POLL else commands[line.in_force[tick]]
+        seen[tick] = quantization.position(state[:4, np.newaxis])[:, 0]
+        effort = np.array(plant_model.holding) if line.in_force[tick] == NO_POLL else commands[line.in_force[tick]]
         now = np.array([line.poll_ns[tick] * 1e-9])
         known = seen[line.basis[tick], :, np.newaxis]
-        given, memory = controller.law(memory, Measured(now, known, scenario.goal(now), np.zeros(1)))
-        commands.append(quantised.effort(given)[:, 0])
+        given, memory = controller.law(memory, Measurement(now, known, scenario.goal(now), np.zeros(1)))
+        commands.append(quantization.effort(given)[:, 0])
 
         def rates(_: float, y: np.ndarray, tau: np.ndarray = effort) -> np.ndarray:
             return np.concatenate([y[4:], forward_dynamics(rig.arm, y[:4], y[4:], tau)])
@@ -74,7 +74,7 @@ def measure(report: Report, quick: bool) -> None:
     progress("with theory")
     both = sweep(study, Path(), lambda _: None)
     report.add(f"{side} x {side}, with theory", "virtual time and theory", both.seconds, "s")
-    cells = cells_of(study)[:1000]
+    cells = all_cells(study)[:1000]
     begin = time.perf_counter()
     run_cells(study, cells)
     report.add("one batch of 1,000 on one core", "a run", time.perf_counter() - begin, "ms")

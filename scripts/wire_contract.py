@@ -24,7 +24,7 @@ from hilrig_schemas import topics
 PATH = Path(__file__).parents[1] / "schemas/contract.txt"
 HEAD = """\
 # What versions of hilrig promise each other. `make gen` adds what is new; once a release has it, nothing here is
-# changed or taken away (docs/adr/0042-what-may-change-in-a-schema.md). A field that is gone stays here, and reserved.
+# changed or taken away (docs/adr/0042-schema-evolution.md). A field that is gone stays here, and reserved.
 """
 
 

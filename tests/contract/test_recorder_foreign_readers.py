@@ -1,4 +1,4 @@
-"""Recordings read by tools that nobody here wrote: Foxglove's own reader for Node.js, pymcap-cli, rerun's loader."""
+"""Recordings read by third-party tools: the Foxglove reader for Node.js, pymcap-cli, and the rerun loader."""
 
 import json
 import shutil
@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, encode_message
 from hilrig_recorder.mcap_format.recover import recover
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export.export import export_foxglove
 from hilrig_replay.io.run import open_run
 from support import recordings
@@ -48,11 +48,11 @@ console.log(JSON.stringify(found));
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A recording by the recorder's writer, what is recovered of its torn beginning, and its export."""
+    """A recording of the recording writer, the file recovered from its truncated copy, and its export."""
     folder = tmp_path_factory.mktemp("foreign")
     made = recordings.record(folder / "made.mcap", recordings.Script(seconds=5))
-    whole, torn = folder / "whole.mcap", folder / "torn.mcap"
-    writer = RunWriter(whole)
+    complete, truncated = folder / "complete.mcap", folder / "truncated.mcap"
+    writer = RecordingWriter(complete)
     run = open_run(made)
     for name, values in run.metadata.items():
         writer.add_metadata(name, values)
@@ -67,13 +67,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         writer.add_attachment(name, "application/xml", data, log_time=run.file.start_ns)
     writer.finish()
     writer.publish()
-    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
-    recover(torn, folder / "recovered.mcap")
-    return [whole, folder / "recovered.mcap", export_foxglove(open_run(whole), folder / "foxglove.mcap")]
+    truncated.write_bytes(complete.read_bytes()[: complete.stat().st_size * 6 // 10])
+    recover(truncated, folder / "recovered.mcap")
+    return [complete, folder / "recovered.mcap", export_foxglove(open_run(complete), folder / "foxglove.mcap")]
 
 
 def counted(path: Path) -> dict[str, int]:
-    """Messages of each topic, by the stock Python reader."""
+    """Number of messages per topic, by the mcap library."""
     counts: dict[str, int] = {}
     with path.open("rb") as stream:
         for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
@@ -81,35 +81,35 @@ def counted(path: Path) -> dict[str, int]:
     return counts
 
 
-def install(command: list[str], what: str) -> None:
-    """Install a tool for this test; skip with the reason where it can't be had."""
+def install(command: list[str], tool: str) -> None:
+    """Install a tool for this test; skip with the reason if it is unavailable."""
     if shutil.which(command[0]) is None:
         pytest.skip(f"needs {command[0]}")
     try:
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
     except subprocess.TimeoutExpired:
-        pytest.skip(f"{what} can't be installed here: no registry answers")
+        pytest.skip(f"{tool} can't be installed here: no package registry is reachable")
     if done.returncode:
-        pytest.skip(f"{what} can't be installed here: {done.stderr.strip()[-200:]}")
+        pytest.skip(f"{tool} can't be installed here: {done.stderr.strip()[-200:]}")
 
 
-def test_foxglove_s_reader_for_node_finds_the_same(files: list[Path], tmp_path: Path) -> None:
+def test_foxglove_reader_for_node_agrees(files: list[Path], tmp_path: Path) -> None:
     packages = ["@mcap/core", "@mcap/nodejs", "@mcap/support"]
     install(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(tmp_path), *packages], "@mcap/core")
     script = tmp_path / "read.mjs"
     script.write_text(NODE)
-    said = subprocess.run(["node", str(script), *map(str, files)], check=True, capture_output=True, text=True).stdout
-    for path, found in zip(files, json.loads(said), strict=True):
+    output = subprocess.run(["node", str(script), *map(str, files)], check=True, capture_output=True, text=True).stdout
+    for path, found in zip(files, json.loads(output), strict=True):
         assert found["topics"] == counted(path)
         assert found["streamed"] == sum(counted(path).values())
         assert found["done"]
         assert "hilrig.session" in found["metadata"]
-    whole, recovered, exported = json.loads(said)
-    assert whole["attachments"] == exported["attachments"] == ["rig1.urdf"]
+    complete, recovered, exported = json.loads(output)
+    assert complete["attachments"] == exported["attachments"] == ["rig1.urdf"]
     assert "hilrig.recovered" in recovered["metadata"]
 
 
-def test_pymcap_s_doctor_finds_no_fault(files: list[Path], tmp_path: Path) -> None:
+def test_pymcap_doctor_finds_no_errors(files: list[Path], tmp_path: Path) -> None:
     target = tmp_path / "packages"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
     install([*pip, "--target", str(target), "pymcap-cli"], "pymcap-cli")
@@ -122,21 +122,21 @@ def test_pymcap_s_doctor_finds_no_fault(files: list[Path], tmp_path: Path) -> No
             env={"PYTHONPATH": str(target), "PATH": "/usr/bin:/bin"},
         )
         assert done.returncode == 0, done.stdout + done.stderr
-        said = " ".join(done.stdout.split())
-        assert "0 errors, 0 warnings" in said or "passed MCAP doctor checks" in said, done.stdout
+        output = " ".join(done.stdout.split())
+        assert "0 errors, 0 warnings" in output or "passed MCAP doctor checks" in output, done.stdout
 
 
-def test_rerun_s_own_loader_finds_the_arm_in_an_export(files: list[Path], tmp_path: Path) -> None:
+def test_rerun_loader_finds_the_arm_in_an_export(files: list[Path], tmp_path: Path) -> None:
     rerun = Path(sys.executable).with_name("rerun")
     out = tmp_path / "out.rrd"
     done = subprocess.run(
         [str(rerun), "mcap", "convert", str(files[2]), "-o", str(out)], check=False, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    said = subprocess.run(
+    output = subprocess.run(
         [str(rerun), "rrd", "print", "-v", str(out)], check=True, capture_output=True, text=True
     ).stdout
-    assert "Transform3D" in said
-    assert "Points3D" in said
+    assert "Transform3D" in output
+    assert "Points3D" in output
     for link in ("link1", "link2"):
-        assert f"/points/{link}" in said
+        assert f"/points/{link}" in output

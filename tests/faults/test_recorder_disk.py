@@ -1,4 +1,4 @@
-"""A disk that is full, or slow, or fails: the file ends whole, the operator is told, the other rigs' files go on."""
+"""A disk that is full, slow or failing: files are finished, the operator is alerted, other files are not affected."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
-from hilrig_recorder.mcap_format.scan import Chunk, Message, open_chunk, scan
+from hilrig_recorder.mcap_format.scan import Chunk, Message, read_chunk, scan
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Health, JointState
@@ -22,9 +22,9 @@ from support.waiting import eventually
 
 @contextmanager
 def tmpfs(folder: Path, size_kib: int, *, files: int = 0) -> Iterator[Path]:
-    """A file system of so many KiB, and so many files and folders; 0: any number."""
+    """A file system with limited size (KiB) and number of files and folders; 0: no limit."""
     if os.name != "posix" or os.geteuid() != 0 or shutil.which("mount") is None:
-        pytest.skip("needs root, to mount a small file system")
+        pytest.skip("needs root to mount a small file system")
     folder.mkdir()
     mounted = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", f"size={size_kib}k,nr_inodes={files}", "tmpfs", str(folder)],
@@ -48,42 +48,42 @@ def fill(path: Path) -> None:
 
 
 def holds_messages(lab: LabConfig, rig: str) -> bool:
-    """Whether messages of a rig's session are on the disk."""
+    """Whether the disk contains messages of a session of the rig."""
     return any(
         state.session
         for part in files_of(lab, rig, "*.part")
         for _, chunk in scan(part.read_bytes())
         if isinstance(chunk, Chunk)
-        for message in open_chunk(chunk)
+        for message in read_chunk(chunk)
         if isinstance(message, Message) and message.channel_id == CHANNEL_OF_TOPIC["state"]
         for state in (JointState.FromString(message.data),)
     )
 
 
-class Troubles:
-    """What the recorder's health says, as it comes."""
+class Alerts:
+    """Receives the alerts in the recorder's health reports."""
 
     def __init__(self, lab: LabConfig) -> None:
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self._bus = ZenohBus(lab.bus, "tool")
         self._bus.subscribe(HEALTH.key(lab.name, "recorder", "*"), self._on_health)
 
     def _on_health(self, _key: str, payload: bytes) -> None:
-        self.heard.append(Health.FromString(payload).trouble)
+        self.received.append(Health.FromString(payload).trouble)
 
     def close(self) -> None:
         self._bus.close()
 
 
 @pytest.mark.rig
-def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_again(tmp_path: Path) -> None:
+def test_full_disk_finishes_files_and_recording_resumes(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, rigs=2, extra="recorder.min_free_mib = 0")
     rigs = [rig.name for rig in lab.rigs]
     with tmpfs(tmp_path / "recordings", 600) as folder, sending(lab, rigs) as senders:
         ballast = folder / "ballast"
         with RecorderProcess(config) as recorder:
             wait_ready(lab, recorder)
-            troubles = Troubles(lab)
+            alerts = Alerts(lab)
             try:
                 for rig in rigs:
                     senders.begin(rig)
@@ -91,7 +91,7 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
                 fill(ballast)
                 for rig in rigs:
                     eventually(lambda rig=rig: files_of(lab, rig))
-                eventually(lambda: any("No space left" in text for text in troubles.heard))
+                eventually(lambda: any("No space left" in text for text in alerts.received))
                 full = {rig: files_of(lab, rig)[0] for rig in rigs}
                 for rig in rigs:
                     summary = metadata(full[rig])["hilrig.summary"]
@@ -99,24 +99,24 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
                     found = recorded([full[rig]])
                     assert set(found) & set(senders.sent[rig])
                     assert len(found) == len(set(found))
-                # Longer than the pre-roll reaches back.
+                # Longer than the pre-roll.
                 sent = senders.count(rigs[0])
                 eventually(lambda: senders.count(rigs[0]) > sent + 300)
                 ballast.unlink()
-                # Tried again ten seconds after it failed.
+                # Recording is retried ten seconds after the failure.
                 for rig in rigs:
                     eventually(lambda rig=rig: files_of(lab, rig, "*.part"))
-                eventually(lambda: troubles.heard and not troubles.heard[-1])
+                eventually(lambda: alerts.received and not alerts.received[-1])
                 for rig in rigs:
                     senders.end(rig)
                 for rig in rigs:
                     eventually(lambda rig=rig: len(files_of(lab, rig)) == 2)
             finally:
-                troubles.close()
+                alerts.close()
         for rig in rigs:
             last = files_of(lab, rig)[-1]
             assert metadata(last)["hilrig.session"]["previous"] == full[rig].name
-            # The gap between the two files is known, and stands in the second.
+            # The second segment states the gap between the two segments.
             lost = int(metadata(last)["hilrig.summary"]["lost_recorder"])
             found = recorded(files_of(lab, rig))
             numbers = {sequence for channel, sequence, _ in found if channel == "/state"}
@@ -124,13 +124,13 @@ def test_a_full_disk_ends_files_whole_and_recording_goes_on_when_there_is_space_
 
 
 @pytest.mark.rig
-def test_a_disk_that_is_full_before_the_first_chunk_is_written_holds_what_came_until_then(tmp_path: Path) -> None:
+def test_disk_full_before_the_first_chunk_keeps_messages(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, extra="recorder.min_free_mib = 0")
     with tmpfs(tmp_path / "recordings", 600) as folder, sending(lab, ["rig1"]) as senders:
         with RecorderProcess(config) as recorder:
             wait_ready(lab, recorder)
             senders.begin("rig1")
-            # The file has its beginning, and some messages of the session are on their way into its first chunk.
+            # The file has its header, and some messages of the session are pending for its first chunk.
             eventually(lambda: any(part.stat().st_size for part in files_of(lab, "rig1", "*.part")), every_s=0.002)
             before = senders.count("rig1")
             eventually(lambda: senders.count("rig1") > before + 10, every_s=0.002)
@@ -139,12 +139,12 @@ def test_a_disk_that_is_full_before_the_first_chunk_is_written_holds_what_came_u
         found = metadata(path)
         assert found["hilrig.summary"]["ended"] == "disk full"
         assert found["hilrig.session"]["rig"] == "rig1"
-        # What was set aside has room for it.
+        # The reserved space suffices for it.
         assert recorded([path])
 
 
 @pytest.mark.rig
-def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path: Path) -> None:
+def test_recordings_end_below_the_minimum_free_space(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, extra="recorder.min_free_mib = 2")
     with tmpfs(tmp_path / "recordings", 4096) as folder, sending(lab, ["rig1"]) as senders:
         with RecorderProcess(config) as recorder:
@@ -156,37 +156,37 @@ def test_with_little_space_left_recordings_end_before_the_disk_is_full(tmp_path:
             assert recorder.process.poll() is None
         assert metadata(path)["hilrig.summary"]["ended"] == "disk full"
         assert "nearly full" in metadata(path)["hilrig.summary"]["reason"]
-    assert "only" in recorder.log.read_text()
+    assert "recording stopped: " in recorder.log.read_text()
 
 
 @pytest.mark.rig
-def test_a_disk_that_takes_no_more_files_is_told_apart_from_a_full_one(tmp_path: Path) -> None:
+def test_disk_without_free_inodes_is_reported(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, rigs=8, extra="recorder.min_free_mib = 0")
     rigs = [rig.name for rig in lab.rigs]
-    # The folders of all rigs, and files of some.
+    # Enough inodes for the folders of all rigs and the files of some.
     with tmpfs(tmp_path / "recordings", 64 << 10, files=16) as folder, sending(lab, rigs, step_ms=100.0) as senders:
         for rig in rigs:
             (folder / lab.name / rig).mkdir(parents=True)
         with RecorderProcess(config) as recorder:
             wait_ready(lab, recorder)
-            troubles = Troubles(lab)
+            alerts = Alerts(lab)
             try:
                 for rig in rigs:
                     senders.begin(rig)
-                text = eventually(lambda: next((text for text in troubles.heard if " more" in text), ""))
+                text = eventually(lambda: next((text for text in alerts.received if " more" in text), ""))
                 for rig in rigs:
                     senders.end(rig)
-                whole = eventually(lambda: [path for rig in rigs for path in files_of(lab, rig)])
+                complete = eventually(lambda: [path for rig in rigs for path in files_of(lab, rig)])
             finally:
-                troubles.close()
-        assert "can't be recorded: the disk takes no more files (it has no inodes left)" in text
+                alerts.close()
+        assert "can't be recorded: the disk has no free inodes, so it can't store more files" in text
         assert len(text.split("; ")) == 4, text
-        for path in whole:
+        for path in complete:
             assert metadata(path)["hilrig.summary"]["ended"] == "ended"
 
 
 @pytest.mark.rig
-def test_a_disk_that_is_read_only_is_one_line_and_exit_3(tmp_path: Path) -> None:
+def test_read_only_disk_is_one_error_line_and_exit_3(tmp_path: Path) -> None:
     config, _ = make_lab(tmp_path)
     with tmpfs(tmp_path / "recordings", 600) as folder:
         subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
@@ -194,55 +194,55 @@ def test_a_disk_that_is_read_only_is_one_line_and_exit_3(tmp_path: Path) -> None
             assert recorder.process.wait(30) == 3
     errors = [line for line in recorder.log.read_text().splitlines() if "error" in line]
     assert len(errors) == 1
-    assert "recordings can't be written there: Read-only file system" in errors[0]
+    assert "can't write recordings: Read-only file system" in errors[0]
 
 
 @pytest.mark.rig
-def test_a_folder_that_can_not_be_written_is_one_line_and_exit_3(tmp_path: Path) -> None:
+def test_unwritable_folder_is_one_error_line_and_exit_3(tmp_path: Path) -> None:
     config, _ = make_lab(tmp_path)
-    (tmp_path / "recordings").write_text("in the way")
+    (tmp_path / "recordings").write_text("not a folder")
     with RecorderProcess(config) as recorder:
         assert recorder.process.wait(30) == 3
     errors = [line for line in recorder.log.read_text().splitlines() if "error" in line]
     assert len(errors) == 1
-    assert "recordings can't be written there" in errors[0]
+    assert "can't write recordings" in errors[0]
     assert "Traceback" not in recorder.log.read_text()
 
 
 @pytest.mark.rig
-@pytest.mark.skipif(os.name != "posix", reason="elsewhere an open file can't be moved or deleted")
-@pytest.mark.parametrize("what", ["file moved", "file deleted", "folder deleted"])
-def test_a_recording_that_is_moved_or_deleted_while_it_is_written_goes_on_in_a_next_file(
-    tmp_path: Path, what: str
-) -> None:
+@pytest.mark.skipif(os.name != "posix", reason="on other systems an open file can't be moved or deleted")
+@pytest.mark.parametrize("change", ["file moved", "file deleted", "folder deleted"])
+def test_moved_or_deleted_recording_continues_in_new_segment(tmp_path: Path, change: str) -> None:
     config, lab = make_lab(tmp_path)
     elsewhere = tmp_path / "elsewhere.mcap"
     with sending(lab, ["rig1"]) as senders:
         with RecorderProcess(config) as recorder:
             wait_ready(lab, recorder)
-            troubles = Troubles(lab)
+            alerts = Alerts(lab)
             try:
                 senders.begin("rig1")
                 eventually(lambda: holds_messages(lab, "rig1"))
                 [part] = files_of(lab, "rig1", "*.part")
-                if what == "file moved":
+                if change == "file moved":
                     part.rename(elsewhere)
-                elif what == "file deleted":
+                elif change == "file deleted":
                     part.unlink()
                 else:
                     shutil.rmtree(lab.recorder.folder)
                 eventually(lambda: files_of(lab, "rig1", "*.2.mcap.part"))
-                eventually(lambda: any("moved or deleted while it was written" in text for text in troubles.heard))
+                eventually(
+                    lambda: any("moved or deleted while it was being written" in text for text in alerts.received)
+                )
                 sent = senders.count("rig1")
                 eventually(lambda: senders.count("rig1") > sent + 100)
                 senders.end("rig1")
                 [path] = eventually(lambda: files_of(lab, "rig1"))
             finally:
-                troubles.close()
+                alerts.close()
         assert metadata(path)["hilrig.session"]["previous"] == part.name.removesuffix(".part")
         found = recorded([path])
-        if what == "file moved":
-            # Finished where it is now; the two together have everything.
+        if change == "file moved":
+            # The moved file is finished in its new place; both files together contain all messages.
             assert metadata(elsewhere)["hilrig.summary"]["ended"] == "continued"
             found += recorded([elsewhere])
             assert set(senders.sent["rig1"]) <= set(found)

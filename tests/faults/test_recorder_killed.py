@@ -1,4 +1,4 @@
-"""A recorder that is killed at any moment: what it wrote is found again, and what was sent is not lost."""
+"""A recorder that is killed at random times: written messages are recovered, and published messages are not lost."""
 
 import random
 import time
@@ -16,28 +16,28 @@ from support.waiting import Stalls, eventually
 
 KILLS = times("HILRIG_RECORDER_KILLS", 4)
 CACHED_S = LONGEST_KEPT_S - 3
-"""What was sent so long ago its sender still has, with something to spare."""
+"""Messages of at most this age are still in the cache of their publisher, with a margin."""
 LAST_S = 1.0
-"""What a recorder that is killed may not have written yet."""
+"""Maximum age of the messages that a killed recorder has not written yet."""
 STEADY_S = 1.6
-"""A recorder that has been there so long has caught up, and written once since then."""
+"""After this time a recorder has fetched all cached messages and written once since then."""
 STAGES = 3
-"""On a message's way to the disk each of so many processes and threads may be held up by the machine."""
+"""Number of processes and threads between publisher and disk that may stall."""
 
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """One recorder's; wall clock, s."""
+    """The lifetime of one recorder process; wall clock, s."""
 
     ready_s: float
     killed_s: float
     stall_s: float
-    """For how long the machine kept a thread waiting meanwhile, at worst."""
+    """Longest stall of a thread meanwhile."""
 
 
 @pytest.mark.rig
 @pytest.mark.timeout(60 + 15 * KILLS)
-def test_kill_9_at_random_moments_loses_nothing_that_was_sent(tmp_path: Path) -> None:
+def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:
     seed = random.randrange(1 << 30)
     print(f"seed {seed}")
     rng = random.Random(seed)
@@ -67,21 +67,21 @@ def test_kill_9_at_random_moments_loses_nothing_that_was_sent(tmp_path: Path) ->
         paths = files_of(lab, rig)
         found = recorded(paths)
         sent = senders.sent[rig]
-        assert len(found) == len(set(found)), f"{rig}: something was recorded twice"
-        # Byte for byte what was sent; a file begins before its session and ends after it.
+        assert len(found) == len(set(found)), f"{rig}: duplicate messages"
+        # Payloads are unchanged. A file begins before its session and ends after it.
         assert {key for key in found if sent[0][1] <= key[1] <= sent[-1][1]} <= set(sent)
         arrivals = arrivals_of(paths)
-        judge_last_second(rig, lives, arrivals)
+        check_last_second(rig, lives, arrivals)
         gap_s = longest_gap(lives, arrivals)
         missing = set(sent) - set(found)
-        about = f"{rig}: {len(missing)} of {len(sent)} missing; up to {gap_s:.1f} s had to be fetched"
-        print(about)
+        report = f"{rig}: {len(missing)} of {len(sent)} missing; up to {gap_s:.1f} s had to be fetched"
+        print(report)
         if gap_s < CACHED_S:
-            assert not missing, about
-        # A machine so busy that recorders took longer to come back than the senders' caches reach: the files say so.
+            assert not missing, report
+        # On a busy machine a recorder may restart too late for the caches of the publishers: the files state the loss.
         summaries = [metadata(path)["hilrig.summary"] for path in paths]
         stated = sum(int(summary["lost_recorder"]) + int(summary["lost_transport"]) for summary in summaries)
-        assert len(missing) <= stated, f"{about}, {stated} stated"
+        assert len(missing) <= stated, f"{report}, {stated} stated"
         assert metadata(paths[-1])["hilrig.summary"]["ended"] == "ended"
         for before, path in pairwise(paths):
             assert metadata(path)["hilrig.session"]["previous"] == before.name
@@ -89,12 +89,12 @@ def test_kill_9_at_random_moments_loses_nothing_that_was_sent(tmp_path: Path) ->
 
 
 def now_s() -> float:
-    """Wall clock, s: recorder and senders are on this machine."""
+    """Wall clock, s; recorder and publishers are on this machine."""
     return SYSTEM_CLOCK.wall_ns() * 1e-9
 
 
 def arrivals_of(paths: list[Path]) -> list[tuple[float, float]]:
-    """When each message that was recorded arrived, and when it was sent; wall clock, s."""
+    """(arrival time, publish time) of each recorded message, wall clock, s."""
     found = []
     for path in paths:
         with path.open("rb") as stream:
@@ -104,22 +104,22 @@ def arrivals_of(paths: list[Path]) -> list[tuple[float, float]]:
     return found
 
 
-def judge_last_second(rig: str, lives: list[Life], arrivals: list[tuple[float, float]]) -> None:
-    """What a recorder that was killed had not written is younger than a second."""
+def check_last_second(rig: str, lives: list[Life], arrivals: list[tuple[float, float]]) -> None:
+    """Check that the messages that a killed recorder had not written are younger than one second."""
     for life in lives:
         if STEADY_S <= life.killed_s - life.ready_s < float("inf"):
             newest_s = max(sent_s for arrived_s, sent_s in arrivals if arrived_s <= life.killed_s)
-            torn_s = life.killed_s - newest_s
-            assert torn_s <= LAST_S + STAGES * life.stall_s, (
-                f"{rig}: {torn_s:.2f} s torn, stalls of {life.stall_s:.2f} s"
+            lost_s = life.killed_s - newest_s
+            assert lost_s <= LAST_S + STAGES * life.stall_s, (
+                f"{rig}: {lost_s:.2f} s lost, stalls of {life.stall_s:.2f} s"
             )
 
 
 def longest_gap(lives: list[Life], arrivals: list[tuple[float, float]]) -> float:
-    """How old the oldest message was at worst that a recorder which came back had to fetch, s."""
+    """Maximum age of the oldest message that a restarted recorder had to fetch, s."""
     gaps = [
         after.ready_s - max((sent_s for arrived_s, sent_s in arrivals if arrived_s <= before.killed_s), default=0.0)
         for before, after in pairwise(lives)
     ]
-    # Before anything was recorded there is nothing that could be missing.
+    # Before the first recorded message nothing can be missing.
     return max((gap_s for gap_s in gaps if gap_s < 1e6), default=0.0)

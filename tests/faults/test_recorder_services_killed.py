@@ -1,4 +1,4 @@
-"""The simulation or the edge is killed while a session is recorded: its file is whole, with what was on the bus."""
+"""Simulation or edge is killed during a session: the file is complete and contains the messages from the bus."""
 
 import os
 import signal
@@ -18,13 +18,13 @@ from support.labs import RunningLab, write_lab
 from support.recorder_rig import metadata, recorded
 from support.waiting import eventually
 
-BATCH_OF_A_SIM = 50
-"""States that a killed simulation may have published and not yet put on its log stream; it sends one batch in 20 ms."""
+MAX_UNBATCHED_STATES = 50
+"""States that a killed simulation may have published, but not yet on its recording stream (one batch per 20 ms)."""
 
 
 @contextmanager
 def controller(port: int) -> Iterator[None]:
-    """A controller that reads and writes, and connects again when it has to."""
+    """A controller that reads and writes, and reconnects if necessary."""
     stopping = threading.Event()
 
     def body() -> None:
@@ -34,7 +34,7 @@ def controller(port: int) -> Iterator[None]:
                     while not stopping.wait(0.01):
                         client.read_holding_registers(4, count=4)
                         client.write_registers(0, [100, 0, 0, 0])
-                except Exception:  # whatever a dying edge does to a client
+                except Exception:  # any error of a connection to a killed edge
                     stopping.wait(0.1)
 
     thread = threading.Thread(target=body)
@@ -46,8 +46,8 @@ def controller(port: int) -> Iterator[None]:
         thread.join(10)
 
 
-class Witness:
-    """Every state that was on the bus of a session, as bytes."""
+class StateSubscriber:
+    """Receives every state of rig1 from the bus, as bytes."""
 
     def __init__(self, lab: LabConfig) -> None:
         self.states: list[tuple[str, bytes]] = []
@@ -66,27 +66,27 @@ class Witness:
 
 @pytest.mark.rig
 @pytest.mark.parametrize("victim", ["sim", "edge"])
-def test_a_service_that_is_killed_leaves_a_whole_recording(tmp_path: Path, victim: str) -> None:
+def test_killed_service_leaves_a_complete_recording(tmp_path: Path, victim: str) -> None:
     with RunningLab(write_lab(tmp_path, extra="edge.session_grace_ms = 300")) as lab:
-        witness = Witness(lab.lab)
+        subscriber = StateSubscriber(lab.lab)
         try:
             with controller(lab.port):
                 folder = lab.lab.recorder.folder / lab.lab.name / "rig1"
                 eventually(lambda: list(folder.glob("*.part")))
-                before = len(witness.states)
-                eventually(lambda: len(witness.states) > before + 100)
+                before = len(subscriber.states)
+                eventually(lambda: len(subscriber.states) > before + 100)
                 os.kill(lab.service_pid(victim), signal.SIGKILL)
-                count = len(witness.states)
-                eventually(lambda: len(witness.states) > count + 100)
+                count = len(subscriber.states)
+                eventually(lambda: len(subscriber.states) > count + 100)
             eventually(lambda: lab.recordings and not list(folder.glob("*.part")))
         finally:
-            witness.close()
+            subscriber.close()
         paths = lab.recordings
         for path in paths:
             assert metadata(path)["hilrig.summary"]["ended"] == "ended"
         found = {data for channel, _, data in recorded(paths) if channel == "/state"}
         for path in paths:
-            seen = witness.of(metadata(path)["hilrig.session"]["session"])
+            seen = subscriber.of(metadata(path)["hilrig.session"]["session"])
             missing = [payload for payload in seen if payload not in found]
-            assert len(missing) <= (BATCH_OF_A_SIM if victim == "sim" else 0)
-        assert sum(len(witness.of(metadata(path)["hilrig.session"]["session"])) for path in paths) > 50
+            assert len(missing) <= (MAX_UNBATCHED_STATES if victim == "sim" else 0)
+        assert sum(len(subscriber.of(metadata(path)["hilrig.session"]["session"])) for path in paths) > 50

@@ -1,4 +1,4 @@
-"""The report and the web viewer in a browser, as a teacher opens them."""
+"""The report and the web viewer in a browser."""
 
 import os
 import re
@@ -46,33 +46,31 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.mark.parametrize("width", [1200, 420])
-def test_a_report_is_whole_wide_and_narrow_and_asks_the_network_for_nothing(
-    report: Path, browser: Browser, width: int
-) -> None:
+def test_report_layout_and_no_network_requests(report: Path, browser: Browser, width: int) -> None:
     browser.open(report.as_uri(), width=width, height=2400)
     assert browser.errors == []
     assert all(address.startswith(("file:", "data:")) for address in browser.requests)
     assert browser.run("[...document.images].every(image => image.complete && image.naturalWidth > 400)")
     assert browser.run("document.images.length") == 4
     assert browser.run("[...document.images].every(image => image.getBoundingClientRect().right <= innerWidth)")
-    # One below the other where the page is narrow.
+    # On a narrow page the images are below each other.
     rows = browser.run("new Set([...document.images].map(image => image.getBoundingClientRect().top)).size")
     assert rows == (2 if width > 700 else 4)
-    # Nothing else sticks out: wide tables scroll within their sections.
+    # No horizontal overflow: wide tables scroll within their sections.
     assert browser.run("document.documentElement.scrollWidth") <= width
-    words = browser.run("document.body.innerText")
-    for said in ("Task: There", "passed", "register wait", "controlled by 192.0.2.7:40001"):
-        assert said in words, said
+    text = browser.run("document.body.innerText")
+    for expected in ("Task: There", "passed", "register wait", "controlled by 192.0.2.7:40001"):
+        assert expected in text, expected
     picture = browser.picture()
-    # White sections on a grey page, with curves in the joints' colours in them.
+    # White sections on a gray page, with lines in the joints' colors.
     assert (picture > 0.99).all(axis=-1).mean() > 0.3
     for color in JOINT_COLORS:
         near = np.abs(picture - np.array(rgb(color)) / 255).max(axis=-1) < 0.12
         assert near.sum() > 20, color
 
 
-def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, browser: Browser, tmp_path: Path) -> None:
-    page = tmp_path / "class.html"
+def test_group_report_has_ranking_and_expandable_runs(runs: Path, browser: Browser, tmp_path: Path) -> None:
+    page = tmp_path / "group.html"
     assert hilrig("report", runs, "--out", page).returncode == 0
     browser.open(page.as_uri())
     assert browser.errors == []
@@ -82,15 +80,15 @@ def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, brows
     browser.run("document.querySelector('summary').click()")
     assert browser.run("document.querySelector('details').open")
     assert browser.run("document.body.scrollHeight") > before + 500
-    # On a narrow page no picture sticks out of its section, nor has to be moved: its panels stand below each other.
+    # On a narrow page no image overflows its section or scrolls: its panels are below each other.
     browser.open(page.as_uri(), width=420)
     assert browser.run("document.documentElement.scrollWidth") <= 420
     assert browser.run("document.querySelectorAll('.scroll img').length") == 0
-    # Nor does a table: the ranking stands in cards whose figures say what they are.
+    # Tables do not scroll either: the ranking becomes cards with labeled values.
     browser.run("document.querySelectorAll('details').forEach(each => { each.open = true })")
     assert browser.run("[...document.querySelectorAll('.scroll')].every(each => each.scrollWidth <= each.clientWidth)")
-    told = browser.run("getComputedStyle(document.querySelector('.ranking td + td'), '::before').content")
-    assert told.strip('"') in {"goals", "parts placed"}
+    card_label = browser.run("getComputedStyle(document.querySelector('.ranking td + td'), '::before').content")
+    assert card_label.strip('"') in {"goals", "parts placed"}
     browser.run("document.querySelectorAll('details').forEach(each => { each.open = false })")
     panels = browser.run(
         "[...document.querySelector('section').querySelectorAll('img')].map(image => image.getBoundingClientRect())"
@@ -102,24 +100,24 @@ def test_a_class_opens_with_its_ranking_and_each_run_folds_out(runs: Path, brows
 
 
 @pytest.mark.timeout(300)
-def test_the_web_viewer_shows_the_arm_and_asks_this_machine_alone(tmp_path: Path) -> None:
+def test_web_viewer_shows_the_arm_using_loopback_only(tmp_path: Path) -> None:
     run = record(tmp_path / "run.mcap", Script(seconds=6.0))
     process = subprocess.Popen(
         [*HILRIG, "replay", str(run), "--web"], stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
         assert process.stderr is not None
-        told = re.match(r"open (http://127\.0\.0\.1:\S+) ", process.stderr.readline())
-        assert told is not None
+        announced = re.match(r"open (http://127\.0\.0\.1:\S+) ", process.stderr.readline())
+        assert announced is not None
         with Browser(tmp_path / "browser", graphics=True) as browser:
-            browser.open(told[1], width=560, height=336)
+            browser.open(announced[1], width=560, height=336)
 
             def arm_on_its_table(picture: np.ndarray) -> bool:
                 scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
                 table = share_of(scene, (0.75, 1), (0.7, 1), (0.6, 0.9))
                 return table > 0.05 and share_of(scene, (0.6, 1), (0.35, 0.75), (0, 0.45)) > 0.003
 
-            # Drawn in software, beside whatever else runs here.
+            # Rendered in software, possibly on a busy machine.
             picture = browser.until(arm_on_its_table, timeout_s=240)
             curves = picture[:, int(0.6 * picture.shape[1]) :]
             assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10

@@ -1,4 +1,4 @@
-"""The console beside a lab that really runs: what a browser gets, what it does not, and how it begins and ends."""
+"""Console with a running lab: event stream, recordings, access control, start and shutdown."""
 
 import base64
 import http.client
@@ -19,9 +19,9 @@ from typing import Any
 
 import pytest
 
-from hilrig_console.app import BROWSERS
-from hilrig_console.auth import Guard
-from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
+from hilrig_console.app import MAX_BROWSERS
+from hilrig_console.auth import AccessPolicy
+from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.errors import OperationError
 from support.browser import CHROMIUM, Browser
@@ -35,15 +35,15 @@ pytestmark = pytest.mark.rig
 
 @dataclass
 class RunningConsole:
-    """A console as a user starts it, asked over plain HTTP."""
+    """Console process as started by a user."""
 
     process: "subprocess.Popen[str]"
     port: int
-    said: str
+    first_line: str
 
     def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
-        """Status, headers in small letters, body; the path goes out as it is."""
-        # A report is made by a process that steps back behind all others: where these are busy, it takes long.
+        """Return status, headers with lower-case names, and body; the path is sent unmodified."""
+        # A report is created by a process of low priority, which takes long on a busy machine.
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
         try:
             connection.putrequest(method, path, skip_host="host" in headers)
@@ -68,9 +68,9 @@ def console(config: Path, *options: str, listen: str = "127.0.0.1:0") -> Iterato
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        told = re.search(r"https?://\S+:(\d+)/", line)
-        assert told is not None, (line, process.stderr and process.stderr.read())
-        running = RunningConsole(process, int(told[1]), line)
+        match = re.search(r"https?://\S+:(\d+)/", line)
+        assert match is not None, (line, process.stderr and process.stderr.read())
+        running = RunningConsole(process, int(match[1]), line)
         eventually(lambda: is_up(running))
         yield running
     finally:
@@ -93,7 +93,7 @@ def is_up(running: RunningConsole) -> bool:
 
 
 class Watcher:
-    """A browser's event stream, the newest of each kind and every event."""
+    """Client of the event stream: keeps the newest message of each kind, and all events."""
 
     def __init__(self, port: int, **headers: str) -> None:
         self.newest: dict[str, Any] = {}
@@ -144,15 +144,17 @@ class Watcher:
 
 
 @dataclass
-class Beside:
+class ConsoleWithLab:
+    """Console and lab, and the first message of the console before the lab was started."""
+
     lab: RunningLab
     console: RunningConsole
-    said_without_lab: dict[str, Any]
+    message_without_lab: dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
-    """The console first, the lab behind it: it says that there is none, and finds it."""
+def running_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConsoleWithLab]:
+    """Start the console first and the lab later."""
     folder = tmp_path_factory.mktemp("console")
     config = write_lab(folder, rigs=2, extra="edge.session_grace_ms = 0")
     with ExitStack() as closing:
@@ -160,34 +162,34 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
         with Watcher(running.port) as watcher:
             eventually(lambda: "lab" in watcher.newest)
             without = watcher.newest["lab"]
-            eventually(lambda: "no such folder" in running.json("/runs")["trouble"])
+            eventually(lambda: "no such folder" in running.json("/runs")["error"])
         lab = closing.enter_context(RunningLab(config))
-        yield Beside(lab, running, without)
+        yield ConsoleWithLab(lab, running, without)
 
 
-def test_a_console_without_a_lab_says_so_and_finds_the_lab_when_it_comes(beside: Beside) -> None:
-    assert beside.said_without_lab["services"] == []
-    assert [rig["state"] for rig in beside.said_without_lab["rigs"]] == ["no edge", "no edge"]
-    with Watcher(beside.console.port) as watcher:
+def test_console_detects_lab_started_later(running_lab: ConsoleWithLab) -> None:
+    assert running_lab.message_without_lab["services"] == []
+    assert [rig["state"] for rig in running_lab.message_without_lab["rigs"]] == ["no edge", "no edge"]
+    with Watcher(running_lab.console.port) as watcher:
         eventually(
             lambda: [rig["state"] for rig in watcher.newest.get("lab", {}).get("rigs", [])] == ["free", "free"],
             timeout_s=20,
         )
-        eventually(lambda: watcher.rig("rig1")["address"] == f"127.0.0.1:{beside.lab.port}")
+        eventually(lambda: watcher.rig("rig1")["address"] == f"127.0.0.1:{running_lab.lab.port}")
         eventually(lambda: watcher.pose("rig1") and watcher.pose("rig2"))
-    (scene,) = beside.console.json("/scenes")
+    (scene,) = running_lab.console.json("/scenes")
     assert scene["span"] == 600
 
 
-def test_a_rig_in_use_shows_who_holds_it_how_it_moves_and_what_happened(beside: Beside) -> None:
-    port = beside.console.port
-    # One that never reads holds up nobody.
-    with Watcher(port) as watcher, Watcher(port) as other, socket.create_connection(("127.0.0.1", port)) as asleep:
-        asleep.sendall(b"GET /live HTTP/1.1\r\nHost: localhost\r\n\r\n")
+def test_rig_in_use_shows_controller_poses_and_events(running_lab: ConsoleWithLab) -> None:
+    port = running_lab.console.port
+    # A client that never reads does not block the others.
+    with Watcher(port) as watcher, Watcher(port) as other, socket.create_connection(("127.0.0.1", port)) as idle:
+        idle.sendall(b"GET /live HTTP/1.1\r\nHost: localhost\r\n\r\n")
         eventually(lambda: watcher.pose("rig1"))
         before = watcher.pose("rig1")
-        with steady_controller(beside.lab.port):
-            # The recorder and the edge each say it in their own second.
+        with steady_controller(running_lab.lab.port):
+            # Recorder and edge report it independently, once per second.
             held = eventually(lambda: (rig := watcher.rig("rig1"))["recording"] and rig["state"] == "in use" and rig)
             assert held["controller"].startswith("127.0.0.1:")
             assert "-rig1-" in held["session"]
@@ -198,14 +200,14 @@ def test_a_rig_in_use_shows_who_holds_it_how_it_moves_and_what_happened(beside: 
         numbers = [event["id"] for event in watcher.events]
         assert numbers == sorted(set(numbers))
         assert watcher.rig("rig2")["state"] == "free"
-    # A browser that comes back gets what it has not seen.
-    with Watcher(beside.console.port, last_event_id=str(numbers[-2])) as returned:
+    # A browser that reconnects receives the events after its last one.
+    with Watcher(running_lab.console.port, last_event_id=str(numbers[-2])) as returned:
         eventually(lambda: returned.events)
         assert returned.events[0]["id"] == numbers[-1]
 
 
-def test_recordings_are_listed_given_out_and_reported(beside: Beside) -> None:
-    folder = beside.lab.lab.recorder.folder
+def test_recordings_are_listed_served_and_reported(running_lab: ConsoleWithLab) -> None:
+    folder = running_lab.lab.lab.recorder.folder
     shown = folder / "lab" / "rig9"
     shown.mkdir(parents=True)
     good = record(shown / "good <&> run.mcap", Script(seconds=3.0))
@@ -214,25 +216,25 @@ def test_recordings_are_listed_given_out_and_reported(beside: Beside) -> None:
     (shown / "away.mcap").symlink_to(Path(__file__))
 
     def listed() -> dict[str, dict[str, Any]] | None:
-        runs = {run["path"]: run for run in beside.console.json("/runs?words=RIG9")["runs"]}
+        runs = {run["path"]: run for run in running_lab.console.json("/runs?query=RIG9")["runs"]}
         return runs if len(runs) == 3 and runs["lab/rig9/good <&> run.mcap"]["loop_p50_ms"] else None
 
-    with Watcher(beside.console.port):
+    with Watcher(running_lab.console.port):
         runs = eventually(listed, every_s=0.2)
     assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["trouble"]
-    status, headers, body = beside.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
+    status, headers, body = running_lab.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert (status, body) == (200, good.read_bytes())
     assert headers["content-disposition"].startswith("attachment")
-    part = beside.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap", range="bytes=0-7")
+    part = running_lab.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap", range="bytes=0-7")
     assert (part[0], part[2]) == (206, good.read_bytes()[:8])
 
-    status, headers, page = beside.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")
+    status, headers, page = running_lab.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert status == 200
     assert b"<h1>Run 20260101T000000Z-rig1-abcd</h1>" in page
     assert headers["content-security-policy"].startswith("default-src 'none'; img-src data:;")
-    assert beside.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")[2] == page
-    status, _, why = beside.console.ask("/reports/lab/rig9/torn.mcap")
-    assert (status, b"hilrig recover" in why) == (404, True)
+    assert running_lab.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")[2] == page
+    status, _, message = running_lab.console.ask("/reports/lab/rig9/torn.mcap")
+    assert (status, b"hilrig recover" in message) == (404, True)
 
     for path in (
         "/recordings/secret.txt",
@@ -247,14 +249,14 @@ def test_recordings_are_listed_given_out_and_reported(beside: Beside) -> None:
         "/static/console.js",
         "/console.py",
     ):
-        status, _, body = beside.console.ask(path)
+        status, _, body = running_lab.console.ask(path)
         assert status == 404, path
         assert b"not for browsers" not in body
         assert b"<b>" not in body
 
 
-def test_it_answers_its_own_page_alone_and_changes_nothing(beside: Beside) -> None:
-    ask = beside.console.ask
+def test_rejects_foreign_hosts_sites_and_methods(running_lab: ConsoleWithLab) -> None:
+    ask = running_lab.console.ask
     status, headers, page = ask("/")
     assert status == 200
     assert b"<script src=" in page
@@ -272,18 +274,18 @@ def test_it_answers_its_own_page_alone_and_changes_nothing(beside: Beside) -> No
     assert ask("/", "HEAD")[2] == b""
 
 
-def test_there_are_only_so_many_places_and_who_leaves_makes_room(beside: Beside) -> None:
+def test_number_of_browsers_is_limited(running_lab: ConsoleWithLab) -> None:
     crowd = []
 
     def is_full() -> bool:
-        connection = http.client.HTTPConnection("127.0.0.1", beside.console.port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", running_lab.console.port, timeout=10)
         connection.request("GET", "/live")
         crowd.append(connection)
         return connection.getresponse().status == 503
 
     try:
         eventually(is_full, every_s=0)
-        assert len(crowd) > BROWSERS
+        assert len(crowd) > MAX_BROWSERS
     finally:
         for connection in crowd:
             connection.close()
@@ -291,10 +293,10 @@ def test_there_are_only_so_many_places_and_who_leaves_makes_room(beside: Beside)
     crowd.pop().close()
 
 
-def test_a_simulation_that_starts_anew_is_seen_to_go_and_to_come(beside: Beside) -> None:
-    with Watcher(beside.console.port) as watcher:
+def test_simulation_restart_is_shown(running_lab: ConsoleWithLab) -> None:
+    with Watcher(running_lab.console.port) as watcher:
         eventually(lambda: watcher.pose("rig2"))
-        sim = beside.lab.service_pid("sim")
+        sim = running_lab.lab.service_pid("sim")
         os.kill(sim, signal.SIGSTOP)
         try:
             eventually(lambda: watcher.rig("rig2")["state"] == "no simulation")
@@ -306,18 +308,18 @@ def test_a_simulation_that_starts_anew_is_seen_to_go_and_to_come(beside: Beside)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
-def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Path) -> None:
+def test_browser_shows_changing_values(running_lab: ConsoleWithLab, tmp_path: Path) -> None:
     with Browser(tmp_path / "profile") as browser:
-        browser.open(f"http://127.0.0.1:{beside.console.port}/", width=1400, height=900)
+        browser.open(f"http://127.0.0.1:{running_lab.console.port}/", width=1400, height=900)
 
-        def card(what: str) -> str:
+        def card(expression: str) -> str:
             found = "[...document.querySelectorAll('#cards > li')].find(card => card.innerText.startsWith('rig2'))"
-            return str(browser.run(f"(card => card ? {what} : '')({found})"))
+            return str(browser.run(f"(card => card ? {expression} : '')({found})"))
 
         text, arm = "card.innerText", "(card.querySelector('.one')?.getAttribute('y2') ?? '')"
         eventually(lambda: "free" in card(text) and card(arm))
         before = float(card(arm))
-        with steady_controller(beside.lab.lab.ports["rig2"]):
+        with steady_controller(running_lab.lab.lab.ports["rig2"]):
             eventually(lambda: "in use" in card(text) and "127.0.0.1:" in card(text))
             eventually(lambda: abs(float(card(arm)) - before) > 20)
         eventually(lambda: "session" in browser.run("document.getElementById('events').innerText"))
@@ -325,12 +327,12 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
         assert browser.run("document.getElementById('link').innerText") == "live"
         browser.run("document.getElementById('as-table').click()")
         assert browser.run("document.querySelector('#rows tbody tr').innerText.includes('rig1')")
-        words = "document.getElementById('words')"
-        browser.run(f"{words}.value = 'rig2'; {words}.dispatchEvent(new Event('input'))")
+        search = "document.getElementById('rig-search')"
+        browser.run(f"{search}.value = 'rig2'; {search}.dispatchEvent(new Event('input'))")
         assert browser.run("[...document.querySelectorAll('#rows tbody tr')].filter(row => !row.hidden).length") == 1
         assert sorted(browser.run("location.hash")[1:].split("&")) == ["rigs=rig2", "view=table"]
         for width in (1400, 400):
-            browser.open(f"http://127.0.0.1:{beside.console.port}/", width=width, height=900)
+            browser.open(f"http://127.0.0.1:{running_lab.console.port}/", width=width, height=900)
             eventually(lambda: "rig2" in browser.run("document.body.innerText"))
             assert browser.run("document.documentElement.scrollWidth") <= width
             eventually(lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2)
@@ -346,11 +348,11 @@ def test_a_browser_sees_the_figures_of_a_rig_change(beside: Beside, tmp_path: Pa
         }
 
 
-def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with_browsers_there(tmp_path: Path) -> None:
+def test_password_is_required_off_loopback(tmp_path: Path) -> None:
     with console(write_lab(tmp_path), listen="0.0.0.0:0") as running:
         assert running.process.stdout is not None
-        told = re.match(r"password: (\S+) ", running.process.stdout.readline())
-        assert told is not None
+        match = re.match(r"password: (\S+) ", running.process.stdout.readline())
+        assert match is not None
 
         def basic(password: str) -> str:
             return f"Basic {base64.b64encode(f'teacher:{password}'.encode()).decode()}"
@@ -359,9 +361,9 @@ def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with
         assert (status, headers["www-authenticate"].partition(" ")[0]) == (401, "Basic")
         assert running.ask("/live", authorization=basic("guess"))[0] == 401
         assert running.ask("/health")[0] == 200
-        with Watcher(running.port, authorization=basic(told[1])) as watcher:
+        with Watcher(running.port, authorization=basic(match[1])) as watcher:
             eventually(lambda: "lab" in watcher.newest)
-            assert answers(Address("", running.port), None)
+            assert answers(ListenAddress("", running.port), None)
             running.process.send_signal(signal.SIGINT)
             assert running.process.wait(PATIENT_S) == 0
             eventually(lambda: watcher.ended)
@@ -369,28 +371,30 @@ def test_off_loopback_it_wants_the_password_that_it_prints_and_ends_at_once_with
         assert "can be overheard" in running.process.stderr.read()
 
 
-def test_with_a_certificate_it_speaks_https(tmp_path: Path) -> None:
+def test_serves_https_with_certificate(tmp_path: Path) -> None:
     authority = make_bus_folder(tmp_path / "certs", ["console"])
     trusting = ssl.create_default_context(cadata=authority.certificate_pem.decode())
     tls = TlsFiles(tmp_path / "certs/console.pem", tmp_path / "certs/console.key")
-    with ConsoleServer(load_lab(write_lab(tmp_path)), Address.of("127.0.0.1:0"), Guard(), tls) as server:
+    with ConsoleServer(
+        load_lab(write_lab(tmp_path)), ListenAddress.parse("127.0.0.1:0"), AccessPolicy(), tls
+    ) as server:
         assert server.url.startswith("https://127.0.0.1:")
-        address = Address.of(server.url.removeprefix("https://").rstrip("/"))
+        address = ListenAddress.parse(server.url.removeprefix("https://").rstrip("/"))
         eventually(lambda: answers(address, tls))
         with urllib.request.urlopen(server.url, timeout=10, context=trusting) as page:
             assert b"console.js" in page.read()
         assert not answers(address, None)
 
 
-def answers(address: Address, tls: TlsFiles | None) -> bool:
+def answers(address: ListenAddress, tls: TlsFiles | None) -> bool:
     try:
-        ask_health(address, tls)
+        check_health(address, tls)
     except OperationError:
         return False
     return True
 
 
-def test_a_port_that_is_taken_is_said_in_a_line(tmp_path: Path) -> None:
+def test_reports_occupied_port(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         listen = f"127.0.0.1:{taken.getsockname()[1]}"
         done = hilrig("console", "--config", write_lab(tmp_path), "--listen", listen)

@@ -1,4 +1,4 @@
-"""`hilrig live` beside a lab that really runs."""
+"""`hilrig live` with a running lab."""
 
 import signal
 import subprocess
@@ -27,15 +27,15 @@ def live(config: Path, save: Path, log: Path) -> Iterator["subprocess.Popen[byte
             process.wait()
 
 
-def test_a_rig_is_followed_through_a_restart_of_its_simulation(tmp_path: Path) -> None:
+def test_live_view_survives_a_simulation_restart(tmp_path: Path) -> None:
     save, log = tmp_path / "live.rrd", tmp_path / "live.log"
     with RunningLab(write_lab(tmp_path)) as lab, live(lab.config, save, log) as process:
         eventually(lambda: save.exists() and save.stat().st_size > 400_000)
         lab_sim = lab.service_pid("sim")
         subprocess.run(["kill", "-STOP", str(lab_sim)], check=True)
-        eventually(lambda: "nothing comes from rig1: waiting for it" in log.read_text())
+        eventually(lambda: "rig1: no states received for 2 s; waiting" in log.read_text())
         subprocess.run(["kill", "-KILL", str(lab_sim)], check=True)
-        eventually(lambda: "rig1 is back" in log.read_text())
+        eventually(lambda: "rig1: receiving states again" in log.read_text())
         size = save.stat().st_size
         eventually(lambda: save.stat().st_size > size + 100_000)
         process.send_signal(signal.SIGINT)
@@ -44,14 +44,14 @@ def test_a_rig_is_followed_through_a_restart_of_its_simulation(tmp_path: Path) -
     assert shown.rows("/position") == shown.rows("/scene/joints/theta1") > 50
 
 
-def test_where_nothing_runs_it_says_so(tmp_path: Path) -> None:
+def test_missing_simulation_is_reported(tmp_path: Path) -> None:
     result = hilrig("live", "--config", write_lab(tmp_path), "--save", tmp_path / "live.rrd")
     assert result.returncode == 3
-    assert "no simulation of rig 'rig1' answers for lab 'lab': is it running" in result.stderr
+    assert "no reply from a simulation of rig 'rig1' in lab 'lab': is it running" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_a_rig_that_the_lab_does_not_have_is_refused(tmp_path: Path) -> None:
+def test_unknown_rig_is_rejected(tmp_path: Path) -> None:
     result = hilrig("live", "rig9", "--config", write_lab(tmp_path))
     assert result.returncode == 2
     assert "no rig is called 'rig9'; this lab has rig1" in result.stderr

@@ -1,4 +1,4 @@
-"""`hilrig play` on the real bus: whoever follows a running rig follows a recording."""
+"""`hilrig play` on the zenoh bus: tools receive a played recording like a running rig."""
 
 import signal
 import subprocess
@@ -17,34 +17,34 @@ from support.waiting import eventually
 
 
 @pytest.mark.rig
-def test_a_recording_is_followed_as_a_running_rig_is(tmp_path: Path) -> None:
+def test_played_recording_is_received_like_a_running_rig(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path)
     made = recordings.make(recordings.Script(seconds=2))
     path = recordings.write(tmp_path / "run.mcap", made, script=recordings.Script(seconds=2))
-    heard: list[tuple[float, bytes]] = []
+    received: list[tuple[float, bytes]] = []
     command = [*HILRIG, "play", str(path), "--config", str(config), "--loop", "--rig", "rig7"]
     player = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         with ZenohBus(lab.bus, "tool") as bus:
-            bus.subscribe(STATE.key(lab.name, "rig7"), lambda _, payload: heard.append((time.monotonic(), payload)))
+            bus.subscribe(STATE.key(lab.name, "rig7"), lambda _, payload: received.append((time.monotonic(), payload)))
             answers = eventually(lambda: bus.ask(CONFIG.key(lab.name, "rig7"), timeout_s=0.5))
             assert RigConfig.FromString(answers[0].payload).urdf
-            eventually(lambda: len(heard) > 80)
+            eventually(lambda: len(received) > 80)
         player.send_signal(signal.SIGINT)
-        _, said = player.communicate(timeout=10)
+        _, errors = player.communicate(timeout=10)
     finally:
         player.kill()
     assert player.returncode == 0
-    assert "played" in said
-    states = [JointState.FromString(payload) for _, payload in heard]
+    assert "played" in errors
+    states = [JointState.FromString(payload) for _, payload in received]
     assert {state.rig for state in states} == {"rig7"}
-    # Fifty a second, as they were recorded, however busy this machine is.
-    duration = heard[79][0] - heard[0][0]
+    # 50 states per second, as recorded.
+    duration = received[79][0] - received[0][0]
     assert 1.4 < duration < 3.0
 
 
 @pytest.mark.rig
-def test_where_a_lab_runs_a_recording_is_not_played_over_it(tmp_path: Path) -> None:
+def test_play_is_rejected_while_a_lab_runs(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path)
     path = recordings.record(tmp_path / "run.mcap", recordings.Script(seconds=1))
     with sending(lab, ["rig1"]) as senders:

@@ -1,4 +1,4 @@
-"""The recorder as a service, on a bus within this process: what other services sent is what the files hold."""
+"""The recorder service on an in-process bus: the files contain the messages of the other services."""
 
 import errno
 import threading
@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_recorder.service import run
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import LabConfig, RecorderConfig
@@ -26,7 +26,7 @@ SESSION = "20260101T000000Z-rig1-abcd"
 
 
 class Lab:
-    """A recorder in a thread, and fake services that send to it."""
+    """A recorder in a thread, and fake services that publish to it."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self.folder = folder
@@ -47,7 +47,7 @@ class Lab:
             def body() -> None:
                 try:
                     run(service)
-                except BaseException as error:  # handed to the test's thread
+                except BaseException as error:  # raised in the test's thread
                     errors.append(error)
 
             thread = threading.Thread(target=body)
@@ -91,7 +91,7 @@ def now() -> int:
     return SYSTEM_CLOCK.wall_ns()
 
 
-def test_a_session_becomes_a_file_with_every_byte_that_was_sent(tmp_path: Path) -> None:
+def test_session_is_recorded_with_every_published_byte(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
     config = RigConfig(rig="rig1", incarnation=1, step_ns=20_000_000, urdf="<robot/>", lab_toml="name = 'lab'\n")
     lab.bus.serve(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
@@ -131,7 +131,7 @@ def test_a_session_becomes_a_file_with_every_byte_that_was_sent(tmp_path: Path) 
         assert steps == list(range(1, 103))
 
 
-def test_a_recorder_that_is_stopped_finishes_its_files(tmp_path: Path) -> None:
+def test_stopped_recorder_finishes_its_files(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
     with lab.recorder():
@@ -145,32 +145,30 @@ def test_a_recorder_that_is_stopped_finishes_its_files(tmp_path: Path) -> None:
     assert sorted(payloads(path)) == sorted(sent(sim, edge))
 
 
-def test_a_folder_that_cannot_be_written_is_named_at_the_start(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported_at_start(tmp_path: Path) -> None:
     folder = tmp_path / "file"
-    folder.write_text("in the way")
+    folder.write_text("not a folder")
     with (
-        pytest.raises(OperationError, match=r"file/lab: recordings can't be written there: Not a directory"),
+        pytest.raises(OperationError, match=r"file/lab: can't write recordings: Not a directory"),
         Lab(folder).recorder(),
     ):
         pass
 
 
-def test_a_disk_that_fails_one_rig_s_file_is_told_and_the_others_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_error_of_one_file_does_not_affect_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(tmp_path)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
     failing = threading.Event()
-    append = RunWriter._append
+    append = RecordingWriter._append
 
-    def fail(writer: RunWriter, data: bytes) -> None:
+    def fail(writer: RecordingWriter, data: bytes) -> None:
         if failing.is_set() and writer.path.parent.name == "rig1":
             raise OSError(errno.EIO, "Input/output error")
         append(writer, data)
 
-    monkeypatch.setattr(RunWriter, "_append", fail)
-    told: list[Event] = []
-    lab.bus.subscribe("hil/lab/rig1/event", lambda _, payload: told.append(Event.FromString(payload)))
+    monkeypatch.setattr(RecordingWriter, "_append", fail)
+    events: list[Event] = []
+    lab.bus.subscribe("hil/lab/rig1/event", lambda _, payload: events.append(Event.FromString(payload)))
     with lab.recorder() as service:
         for rig in ("rig1", "rig2"):
             edge.start(rig, f"{SESSION}-{rig}", now())
@@ -181,8 +179,8 @@ def test_a_disk_that_fails_one_rig_s_file_is_told_and_the_others_go_on(
             for rig in ("rig1", "rig2"):
                 sim.state(rig, now())
             lab.send(sim)
-        eventually(lambda: any("Input/output error" in event.text for event in told))
-        assert {event.kind for event in told if event.severity == Event.ERROR} == {Event.RECORDING}
+        eventually(lambda: any("Input/output error" in event.text for event in events))
+        assert {event.kind for event in events if event.severity == Event.ERROR} == {Event.RECORDING}
         eventually(lambda: "Input/output error" in service.counters.trouble)
         edge.end("rig2", f"{SESSION}-rig2", now())
         lab.send(edge)
@@ -193,40 +191,38 @@ def test_a_disk_that_fails_one_rig_s_file_is_told_and_the_others_go_on(
     assert path.parent.name == "rig2"
     assert metadata(path)["hilrig.summary"]["lost_recorder"] == "0"
     assert len(payloads(path)) == 53
-    # What stood in the other file when the disk failed waits to be recovered, and is at the next start.
+    # The other file is recovered at the next start.
     failing.clear()
     with lab.recorder():
         eventually(lambda: len(lab.recordings()) == 2)
 
 
-def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocked_disk_fills_queue_and_drops_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(tmp_path, queue_entries=40)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
-    slow, go_on = threading.Event(), threading.Event()
-    close_chunk = RunWriter.close_chunk
+    slow, resume = threading.Event(), threading.Event()
+    close_chunk = RecordingWriter.close_chunk
 
-    def crawl(writer: RunWriter) -> None:
+    def close_slowly(writer: RecordingWriter) -> None:
         if slow.is_set():
-            go_on.wait(PATIENT_S)
+            resume.wait(PATIENT_S)
         close_chunk(writer)
 
-    monkeypatch.setattr(RunWriter, "close_chunk", crawl)
+    monkeypatch.setattr(RecordingWriter, "close_chunk", close_slowly)
     with lab.recorder() as service:
         edge.start("rig1", SESSION, now())
         lab.send(edge)
         eventually(lambda: list(tmp_path.rglob("*.part")))
         slow.set()
 
-        def more() -> int:
+        def publish_more() -> int:
             sim.state("rig1", now(), SESSION)
             lab.send(sim)
             return service.counters.lost_recorder or len(sim.sent) > 300
 
-        # The disk takes nothing for a while: first what comes waits, then it is dropped.
-        eventually(more)
-        go_on.set()
+        # The disk blocks: messages are queued first, then dropped.
+        eventually(publish_more)
+        resume.set()
         eventually(lambda: service.counters.queue_depth == 0 and service.counters.lost_recorder)
         edge.end("rig1", SESSION, now())
         lab.send(edge)
@@ -240,9 +236,7 @@ def test_a_slow_disk_is_waited_for_within_bounds_and_what_is_dropped_is_stated(
     assert summary["lost_transport"] == "0"
 
 
-def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost_between(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_recording_is_rotated_without_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilrig_recorder.storage.store.MIB", 12 * 1024)
     lab = Lab(tmp_path, rotate_mib=1, min_free_mib=0)
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
@@ -267,7 +261,7 @@ def test_a_recording_that_grows_large_goes_on_in_a_next_file_and_nothing_is_lost
     assert sorted(message for path in paths for message in payloads(path)) == sorted(sent(sim, edge))
 
 
-def test_a_session_that_has_ended_is_not_recorded_again_by_the_next_recorder(tmp_path: Path) -> None:
+def test_restarted_recorder_ignores_ended_sessions(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
     edge = FakeSource("edge/1")
     with lab.recorder():
@@ -278,7 +272,7 @@ def test_a_session_that_has_ended_is_not_recorded_again_by_the_next_recorder(tmp
         lab.send(edge)
         eventually(lab.recordings)
     before = [path.read_bytes() for path in lab.recordings()]
-    # The streams' caches give the next recorder the session's beginning and end once more.
+    # The next recorder receives the start and end of the session again from the caches of the streams.
     with lab.recorder() as service:
         eventually(lambda: service.counters.received >= 3)
     assert [path.read_bytes() for path in lab.recordings()] == before

@@ -1,4 +1,4 @@
-"""`hilrig latency` and `hilrig replay` as a user starts them: what they print, what they write, how they end."""
+"""Commands that analyze and show recordings: output, files and exit codes."""
 
 import json
 from pathlib import Path
@@ -17,14 +17,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("runs") / "run.mcap", Script(seconds=12.0))
 
 
-def test_latency_prints_a_table_for_people(run: Path) -> None:
+def test_latency_prints_a_table(run: Path) -> None:
     result = hilrig("latency", run)
     assert result.returncode == 0, result.stderr
-    for words in ("loop", "register wait", "tick wait", "p99.9", "fit for latency claims"):
-        assert words in result.stdout
+    for expected in ("loop", "register wait", "tick wait", "p99.9", "valid for latency measurements"):
+        assert expected in result.stdout
 
 
-def test_latency_as_json_is_alone_on_standard_output(run: Path, tmp_path: Path) -> None:
+def test_latency_json_is_the_only_standard_output(run: Path, tmp_path: Path) -> None:
     result = hilrig("latency", run, "--json", "--plot", tmp_path / "latency.png")
     report = json.loads(result.stdout)
     assert report["fit"] is True
@@ -32,13 +32,13 @@ def test_latency_as_json_is_alone_on_standard_output(run: Path, tmp_path: Path) 
     assert (tmp_path / "latency.png").stat().st_size > 20_000
 
 
-def test_a_recording_that_is_not_fit_ends_with_1(tmp_path: Path) -> None:
+def test_latency_of_an_invalid_recording_exits_with_1(tmp_path: Path) -> None:
     result = hilrig("latency", record(tmp_path / "run.mcap", Script(seconds=3.0)))
     assert result.returncode == 1
-    assert "not fit for latency claims" in result.stdout
+    assert "not valid for latency measurements" in result.stdout
 
 
-def test_a_folder_is_all_of_its_runs_and_a_bad_one_does_not_hide_the_others(run: Path, tmp_path: Path) -> None:
+def test_latency_of_a_folder_reports_unreadable_runs(run: Path, tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "good.mcap").write_bytes(run.read_bytes())
     (tmp_path / "torn.mcap").write_bytes(run.read_bytes()[:5000])
@@ -52,10 +52,12 @@ def test_a_folder_is_all_of_its_runs_and_a_bad_one_does_not_hide_the_others(run:
 
 @pytest.mark.parametrize("command", [["latency"], ["replay", "--save", "out.rrd"]])
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "not an MCAP file")],
 )
-def test_a_bad_file_is_one_clear_line(command: list[str], content: bytes | None, words: str, tmp_path: Path) -> None:
+def test_unreadable_file_gives_one_error_line(
+    command: list[str], content: bytes | None, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "run.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -64,10 +66,10 @@ def test_a_bad_file_is_one_clear_line(command: list[str], content: bytes | None,
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1
     assert f"{path}: " in result.stderr
-    assert words in result.stderr
+    assert message in result.stderr
 
 
-def test_a_run_without_a_controller_is_shown_and_has_no_latency(tmp_path: Path, run: Path) -> None:
+def test_run_without_a_controller_has_no_latency(tmp_path: Path, run: Path) -> None:
     script = Script(seconds=1.0, controllers=False)
     path = write(tmp_path / "alone.mcap", make(script), script=script)
     result = hilrig("latency", path)
@@ -79,13 +81,13 @@ def test_a_run_without_a_controller_is_shown_and_has_no_latency(tmp_path: Path, 
     assert hilrig("replay", path, "--save", tmp_path / "run.rrd").returncode == 0
     page = tmp_path / "page.html"
     assert hilrig("report", path, "--out", page).returncode == 0
-    assert "recorded by hand" in page.read_text()
+    assert "recorded manually" in page.read_text()
     compared = hilrig("compare", run, path, "--plot", tmp_path / "both.svg")
     assert compared.returncode == 0, compared.stderr
     assert "no controller commanded, so it is aligned by its start" in " ".join(compared.stdout.split())
 
 
-def test_among_several_runs_a_bad_one_does_not_hide_the_comparison(tmp_path: Path, run: Path) -> None:
+def test_compare_excludes_unreadable_runs(tmp_path: Path, run: Path) -> None:
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(run.read_bytes()[:5000])
     done = hilrig("compare", run, run, torn, "--json")
@@ -100,19 +102,19 @@ def test_among_several_runs_a_bad_one_does_not_hide_the_comparison(tmp_path: Pat
         assert f"{torn}: truncated" in refused.stderr
 
 
-def test_replay_writes_a_file_that_rerun_reads(run: Path, tmp_path: Path) -> None:
+def test_replay_writes_a_file_readable_by_rerun(run: Path, tmp_path: Path) -> None:
     result = hilrig("replay", run, "--save", tmp_path / "run.rrd")
     assert result.returncode == 0, result.stderr
     assert RrdFile(tmp_path / "run.rrd").rows("/position") == 600
 
 
-def test_two_ways_of_showing_at_once_are_refused(run: Path, tmp_path: Path) -> None:
+def test_replay_rejects_save_with_web(run: Path, tmp_path: Path) -> None:
     result = hilrig("replay", run, "--save", tmp_path / "run.rrd", "--web")
     assert result.returncode == 2
     assert "choose one" in result.stderr
 
 
-def test_compare_prints_differences_and_writes_pictures(run: Path, tmp_path: Path) -> None:
+def test_compare_prints_differences_and_writes_plots(run: Path, tmp_path: Path) -> None:
     slow = record(tmp_path / "slow.mcap", Script(seconds=4.0, delay_ms=40.0))
     result = hilrig("compare", run, slow, "--json", "--plot", tmp_path / "both.png", "--save", tmp_path / "both.rrd")
     assert result.returncode == 0, result.stderr
@@ -140,7 +142,7 @@ def test_output_never_replaces_a_recording(run: Path, tmp_path: Path, command: s
     assert other.read_bytes() == run.read_bytes()
 
 
-def test_where_a_report_can_not_be_written_is_said(run: Path, tmp_path: Path) -> None:
+def test_report_into_a_missing_folder_is_rejected(run: Path, tmp_path: Path) -> None:
     result = hilrig("report", run, "--out", tmp_path / "nowhere" / "report.html")
     assert result.returncode == 2
-    assert "there is no folder" in result.stderr
+    assert "does not exist" in result.stderr

@@ -1,4 +1,4 @@
-"""The viewer itself, on a virtual display: a recording opens as the arm, its table and its curves."""
+"""The rerun viewer on a virtual display: it shows the arm, its table and the plots of a recording."""
 
 import ctypes
 import os
@@ -25,7 +25,7 @@ from support.waiting import PATIENT_S, eventually
 pytestmark = pytest.mark.rig
 
 DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
-"""Vulkan in software, of Debian's mesa-vulkan-drivers; Debian 12 writes the architecture into the name, 13 does not."""
+"""Software Vulkan drivers of Debian's mesa-vulkan-drivers; in Debian 12 their names contain the architecture."""
 
 LIBRARIES = {
     "libvulkan.so.1": "libvulkan1",
@@ -33,7 +33,7 @@ LIBRARIES = {
     "libXcursor.so.1": "libxcursor1",
     "libXi.so.6": "libxi6",
 }
-"""What the viewer loads by itself when it opens a window, and Debian's packages of it."""
+"""Libraries that the viewer loads at run time to open a window, with their Debian packages."""
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +43,16 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.rrd"
 
 
-def require_a_display() -> None:
-    """Skip a test, with the reason, where the viewer can't open a window on a virtual display."""
-    missing = [name for name, package in LIBRARIES.items() if not can_be_loaded(name)]
+def require_display() -> None:
+    """Skip the test, with a reason, if the viewer can't open a window on a virtual display."""
+    missing = [name for name, package in LIBRARIES.items() if not is_loadable(name)]
     if missing:
         pytest.skip(f"needs {', '.join(missing)} (Debian's packages {', '.join(LIBRARIES[name] for name in missing)})")
     if shutil.which("xvfb-run") is None or shutil.which("xauth") is None or not DRIVERS:
         pytest.skip("needs xvfb-run, xauth and a software Vulkan driver (Debian's xvfb, xauth, mesa-vulkan-drivers)")
 
 
-def can_be_loaded(library: str) -> bool:
+def is_loadable(library: str) -> bool:
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -60,8 +60,8 @@ def can_be_loaded(library: str) -> bool:
     return True
 
 
-def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> None:
-    require_a_display()
+def test_screenshot_shows_arm_table_and_plots(rrd: Path, tmp_path: Path) -> None:
+    require_display()
     shot = tmp_path / "shot.png"
     command = ["xvfb-run", "-a", "-s", "-screen 0 4000x3000x24", str(executable()), str(rrd)]
     command += ["--screenshot-to", str(shot), "--window-size", "1000x600"]
@@ -71,7 +71,7 @@ def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> Non
     assert shot.exists(), result.stderr
     picture = imread(shot)[..., :3]
     scene = picture[: int(0.7 * len(picture)), : int(0.55 * picture.shape[1])]
-    # The table is light wood, the first link orange, the background nearly black.
+    # Colors: the table is light wood, the first link orange, the background nearly black.
     assert share_of(scene, (0.75, 1), (0.7, 1), (0.6, 0.9)) > 0.1
     assert share_of(scene, (0.6, 1), (0.35, 0.75), (0, 0.45)) > 0.004
     assert share_of(scene, (0, 0.15), (0, 0.15), (0, 0.18)) > 0.1
@@ -79,23 +79,23 @@ def test_the_picture_shows_an_arm_on_its_table(rrd: Path, tmp_path: Path) -> Non
     assert len(np.unique((curves.reshape(-1, 3) * 7).astype(np.uint8), axis=0)) > 10
 
 
-def test_the_browsers_viewer_is_served_on_this_machine_alone_and_rests(rrd: Path) -> None:
+def test_web_viewer_is_on_loopback_only_and_idle(rrd: Path) -> None:
     grpc_port, web_port = free_port(), free_port()
     with running_viewer(grpc_port, web_port) as viewer:
-        send_runs([open_run(rrd.with_name("run.mcap"))], grpc_port, over=lambda: False)
+        send_runs([open_run(rrd.with_name("run.mcap"))], grpc_port, is_closed=lambda: False)
         with urllib.request.urlopen(f"http://127.0.0.1:{web_port}/", timeout=10) as page:
             assert b"<canvas" in page.read()
         for port in (grpc_port, web_port):
             with socket.socket() as other:
-                # Nothing listens on another address of this machine, so it is still free.
+                # The port is free on another address of this host, because the viewer listens on one only.
                 other.bind(("127.0.0.2", port))
-        # What has all its data and no browser has nothing to do.
+        # With all data received and no browser connected, the viewer is idle.
         eventually(lambda: cpu_s_of(viewer.pid, while_s=0.5) < 0.1)
         assert viewer.poll() is None
     assert viewer.poll() is not None
 
 
-def test_replay_to_a_browser_ends_with_its_viewer_on_a_signal(rrd: Path) -> None:
+def test_replay_web_stops_its_viewer_on_sigterm(rrd: Path) -> None:
     command = [*HILRIG, "replay", str(rrd.with_name("run.mcap")), "--web"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
@@ -112,18 +112,18 @@ def test_replay_to_a_browser_ends_with_its_viewer_on_a_signal(rrd: Path) -> None
 
 
 def cpu_s_of(process: int, while_s: float) -> float:
-    """Processor time that a process takes meanwhile."""
+    """CPU time of a process within `while_s`, s."""
 
-    def taken_s() -> float:
+    def used_s() -> float:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    before_s = taken_s()
+    before_s = used_s()
     time.sleep(while_s)
-    return taken_s() - before_s
+    return used_s() - before_s
 
 
 def session_of(leader: int) -> list[int]:
-    """Processes still alive in a process group."""
+    """Living processes of a process group."""
     found = subprocess.run(["pgrep", "-g", str(leader)], check=False, capture_output=True, text=True)
     return [int(pid) for pid in found.stdout.split()]

@@ -1,4 +1,4 @@
-"""A service's log stream for tests of the recorder: what it sends is kept, to be compared with what was recorded."""
+"""Fake recording streams for tests of the recorder; sent messages are kept for comparison with the recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ LAB = "lab"
 
 @dataclass
 class Sent:
-    """One message as it was put on the stream."""
+    """One message of a stream."""
 
     key: str
     sequence: int
@@ -26,14 +26,14 @@ class Sent:
 
 @dataclass
 class FakeSource:
-    """Makes the batches of one run of a service; nothing is sent, `batch` gives the bytes."""
+    """Builds the batches of one incarnation of a service; nothing is published, `batch` returns the batch."""
 
     name: str = "sim/1"
     incarnation: int = 1
     lab: str = LAB
     sequence: int = 0
     sent: list[Sent] = field(default_factory=list)
-    _waiting: list[Sent] = field(default_factory=list)
+    _pending: list[Sent] = field(default_factory=list)
     _sequences: dict[str, int] = field(default_factory=dict)
 
     def put(self, topic: RigTopic[Message], rig: str, message: Message, publish_ns: int) -> Sent:
@@ -41,7 +41,7 @@ class FakeSource:
         key = topic.key(self.lab, rig)
         number = self._sequences[key] = self._sequences.get(key, 0) + 1
         sent = Sent(key, number, publish_ns, message.SerializeToString())
-        self._waiting.append(sent)
+        self._pending.append(sent)
         self.sent.append(sent)
         return sent
 
@@ -58,7 +58,7 @@ class FakeSource:
         return self.put(COMMAND, rig, command, publish_ns)
 
     def start(self, rig: str, session: str, publish_ns: int, controller: str = "192.0.2.7:40001") -> Sent:
-        """Add the event that begins a session."""
+        """Add the event that starts a session."""
         event = Event(rig=rig, session=session, kind=Event.SESSION_START, wall_ns=publish_ns, source=self.name)
         event.session_data.controller = controller
         return self.put(EVENT, rig, event, publish_ns)
@@ -70,11 +70,11 @@ class FakeSource:
         return self.put(EVENT, rig, event, publish_ns)
 
     def batch(self, sessions: Sequence[OpenSession] | None = None) -> LogBatch:
-        """What was added since the last batch; `sessions` are stated completely where they are given."""
+        """A batch of the messages added since the last one; `sessions`, if given, is a complete announcement."""
         self.sequence += 1
         batch = LogBatch(source=self.name, incarnation=self.incarnation, sequence=self.sequence)
-        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._waiting])
-        self._waiting.clear()
+        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._pending])
+        self._pending.clear()
         if sessions is not None:
             batch.sessions.extend(sessions)
             batch.complete_sessions = True

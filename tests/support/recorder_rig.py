@@ -1,4 +1,4 @@
-"""A recorder as a process of its own, and services that send to it over the real bus and remember what they sent."""
+"""A recorder process, and fake services that publish to it on the zenoh bus and keep the published messages."""
 
 import os
 import pickle
@@ -27,11 +27,11 @@ from support.labs import HILRIG, free_ports, write_lab
 from support.waiting import PATIENT_S, eventually
 
 Key = tuple[str, int, bytes]
-"""Channel, sequence of the sender, bytes."""
+"""(channel, sequence of the publisher, payload)."""
 
 
 class RecorderProcess:
-    """`hilrig recorder` as a user starts it; a context manager that leaves no process behind."""
+    """A `hilrig recorder` process; the context manager ends it."""
 
     def __init__(self, config: Path, *options: str) -> None:
         self.log = config.parent / f"recorder{''.join(options[:2])}.log"
@@ -40,12 +40,12 @@ class RecorderProcess:
             self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=config.parent)
 
     def kill(self) -> None:
-        """End it as a power cut would."""
+        """Kill the process with SIGKILL."""
         self.process.kill()
         self.process.wait()
 
     def stop(self, timeout_s: float = 10.0) -> int:
-        """Ask it to end; the exit code."""
+        """Send SIGTERM and return the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout_s)
@@ -64,32 +64,32 @@ class RecorderProcess:
 
 @dataclass
 class Senders:
-    """A simulation and an edge with nothing behind them: 50 states and commands a second for each rig."""
+    """A fake simulation and a fake edge that publish 50 states and commands per second and rig."""
 
     lab: LabConfig
     rigs: list[str]
     step_ms: float = 20.0
     sent: dict[str, list[Key]] = field(default_factory=dict)
-    """What was sent while a rig's session was open, by rig."""
+    """Messages published while a session of the rig was open, by rig."""
     sessions: dict[str, str] = field(default_factory=dict)
     stopping: threading.Event = field(default_factory=threading.Event)
 
     def begin(self, rig: str) -> str:
-        """Begin a session of a rig, at the next tick; its id."""
+        """Start a session of a rig at the next tick; returns its id."""
         session = f"20260101T000000Z-{rig}-{''.join(random.choices('abcdefghij', k=4))}"
         self.sessions[rig] = session
         return session
 
     def end(self, rig: str) -> None:
-        """End it, at the next tick."""
+        """End the session of a rig at the next tick."""
         del self.sessions[rig]
 
     def count(self, rig: str) -> int:
-        """How much was sent of a rig within sessions."""
+        """Number of messages of a rig published within sessions."""
         return len(self.sent.get(rig, ()))
 
     def run(self) -> None:
-        """Send until told to stop."""
+        """Publish until `stopping` is set."""
         lab = self.lab
         with (
             Service("sim", lab, ZenohBus(lab.bus, "sim"), stopping=self.stopping) as sim,
@@ -143,14 +143,14 @@ class Senders:
 
 @contextmanager
 def sending(lab: LabConfig, rigs: list[str], **options: float) -> Iterator[Senders]:
-    """Senders at work in a thread."""
+    """Senders that run in a thread."""
     senders = Senders(lab, rigs, **options)
     errors: list[BaseException] = []
 
     def body() -> None:
         try:
             senders.run()
-        except BaseException as error:  # handed to the test's thread
+        except BaseException as error:  # raised in the test's thread
             errors.append(error)
 
     thread = threading.Thread(target=body)
@@ -167,7 +167,7 @@ def sending(lab: LabConfig, rigs: list[str], **options: float) -> Iterator[Sende
 
 @contextmanager
 def router() -> Iterator[str]:
-    """A zenoh router as a process; gives its endpoint."""
+    """A zenoh router process; yields its endpoint."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)}"
     command = [sys.executable, str(Path(__file__).with_name("zenoh_router.py")), "--listen", endpoint]
     command.append("--no-multicast-scouting")
@@ -184,13 +184,13 @@ def router() -> Iterator[str]:
 
 
 def make_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> tuple[Path, LabConfig]:
-    """A lab's file and what it says."""
+    """Write a lab file; returns its path and the configuration."""
     path = write_lab(folder, rigs=rigs, extra=extra)
     return path, load_lab(path)
 
 
 def wait_ready(lab: LabConfig, recorder: RecorderProcess, instance: str = "*", timeout_s: float = 30.0) -> None:
-    """Return when the recorder says that it records."""
+    """Wait until the recorder announces that it is alive."""
     with ZenohBus(lab.bus, "tool") as bus:
 
         def ready() -> bool:
@@ -201,7 +201,7 @@ def wait_ready(lab: LabConfig, recorder: RecorderProcess, instance: str = "*", t
 
 
 def recorded(paths: list[Path]) -> list[Key]:
-    """Every state and command in finished recordings, as the stock reader finds them; each has an index."""
+    """Every state and command in finished recordings, read with the mcap library; each file must have an index."""
     found: list[Key] = []
     for path in paths:
         with path.open("rb") as stream:
@@ -223,23 +223,23 @@ def metadata(path: Path) -> dict[str, dict[str, str]]:
 
 
 def files_of(lab: LabConfig, rig: str, pattern: str = "*.mcap") -> list[Path]:
-    """A rig's files, first part first."""
+    """The files of a rig, in the order of their segment numbers."""
     folder = lab.recorder.folder / lab.name / rig
     return sorted(folder.glob(pattern), key=lambda path: (len(path.name), path.name))
 
 
 def times(name: str, default: int) -> int:
-    """How often something is tried: more often when the environment says so."""
+    """Number of repetitions, from an environment variable or a default."""
     return int(os.environ.get(name, default))
 
 
 def main() -> None:
-    """Senders as a program: `begin RIG` and `end RIG` on standard input; at its end what was sent goes into a file."""
+    """Run senders as a program: reads `begin RIG` and `end RIG` from standard input, then writes the sent messages."""
     lab, out = load_lab(Path(sys.argv[1])), Path(sys.argv[2])
     with sending(lab, [rig.name for rig in lab.rigs]) as senders:
         for line in sys.stdin:
-            word, rig = line.split()
-            (senders.begin if word == "begin" else senders.end)(rig)
+            action, rig = line.split()
+            (senders.begin if action == "begin" else senders.end)(rig)
     out.write_bytes(pickle.dumps(senders.sent))
 
 

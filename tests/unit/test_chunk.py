@@ -1,4 +1,4 @@
-"""Chunks as they stand in a file, and how they are found there again."""
+"""Encoding of chunks, and reading their infos back from a file."""
 
 from itertools import pairwise
 
@@ -9,31 +9,36 @@ from hypothesis import strategies as st
 from mcap.records import Metadata
 
 from hilrig_recorder.mcap_format.channels import encode_message
-from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES, ChunkNote, chunks_of, compressor, cut, encode_chunk
-from hilrig_recorder.mcap_format.summary_section import encoded
+from hilrig_recorder.mcap_format.chunk import (
+    CHUNK_BYTES,
+    ChunkInfo,
+    compressor,
+    encode_chunk,
+    read_chunk_infos,
+    split_into_chunks,
+)
+from hilrig_recorder.mcap_format.summary_section import encode_records
 
 MESSAGES = st.lists(st.tuples(st.integers(1, 4), st.integers(0, 2**62), st.binary(max_size=300)), min_size=1)
 
 
-def found(content: bytes, begin: int = 0) -> list[ChunkNote]:
-    return list(chunks_of(lambda at, size: content[at : at + size], begin, len(content)))
+def found(content: bytes, begin: int = 0) -> list[ChunkInfo]:
+    return list(read_chunk_infos(lambda at, size: content[at : at + size], begin, len(content)))
 
 
 @given(st.lists(MESSAGES, max_size=5), st.binary(max_size=40))
-def test_chunks_are_found_again_with_all_that_an_index_needs(
-    chunks: list[list[tuple[int, int, bytes]]], before: bytes
-) -> None:
+def test_chunk_infos_are_read_back_from_a_file(chunks: list[list[tuple[int, int, bytes]]], before: bytes) -> None:
     content = before
     expected = []
     compress = compressor()
     for number, messages in enumerate(chunks):
         records = [encode_message(channel, 1, time_ns, 0, data) for channel, time_ns, data in messages]
         start = len(content)
-        content += encode_chunk(records, compress) + encoded(Metadata(f"between {number}", {"a": "b"}))
+        content += encode_chunk(records, compress) + encode_records(Metadata(f"between {number}", {"a": "b"}))
         times = [time_ns for _, time_ns, _ in messages]
         channels = [channel for channel, _, _ in messages]
         expected.append(
-            ChunkNote(
+            ChunkInfo(
                 start,
                 min(times),
                 max(times),
@@ -45,22 +50,22 @@ def test_chunks_are_found_again_with_all_that_an_index_needs(
     assert found(content, len(before)) == expected
 
 
-def test_what_is_no_row_of_records_is_no_chunk() -> None:
+def test_incomplete_records_are_rejected() -> None:
     content = encode_chunk([encode_message(1, 1, 1, 1, b"message")], compressor())
-    for wrong in (content[:-1], content + b"12345", b"\x01" + content):
+    for content_with_error in (content[:-1], content + b"12345", b"\x01" + content):
         with pytest.raises(ValueError, match="record"):
-            found(wrong)
+            found(content_with_error)
 
 
 @given(st.lists(st.integers(0, CHUNK_BYTES * 2), max_size=30))
-def test_runs_are_as_large_as_a_chunk_may_be_and_nothing_is_left_out(sizes: list[int]) -> None:
+def test_records_are_split_into_chunks_of_maximum_size(sizes: list[int]) -> None:
     records = [bytes([number]) * size for number, size in enumerate(sizes)]
-    runs = [list(run) for run in cut(records)]
-    assert [record for run in runs for record in run] == records
-    assert all(len(run) == 1 or sum(map(len, run)) <= CHUNK_BYTES for run in runs)
-    assert all(sum(map(len, run)) + len(following[0]) > CHUNK_BYTES for run, following in pairwise(runs))
+    groups = [list(group) for group in split_into_chunks(records)]
+    assert [record for group in groups for record in group] == records
+    assert all(len(group) == 1 or sum(map(len, group)) <= CHUNK_BYTES for group in groups)
+    assert all(sum(map(len, group)) + len(following[0]) > CHUNK_BYTES for group, following in pairwise(groups))
 
 
 @given(st.binary(max_size=CHUNK_BYTES))
-def test_compressing_loses_nothing(raw: bytes) -> None:
+def test_compression_is_lossless(raw: bytes) -> None:
     assert zstandard.ZstdDecompressor().decompress(compressor()(raw), max_output_size=len(raw)) == raw

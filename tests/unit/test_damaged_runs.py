@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_recorder.mcap_format.recover import recover
-from hilrig_recorder.mcap_format.scan import Chunk, Message, open_chunk, scan
+from hilrig_recorder.mcap_format.scan import Chunk, Message, read_chunk, scan
 from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
@@ -23,7 +23,7 @@ def damage(source: Path, damaged: Path, number: int) -> int:
     middle = chunk.offset + 60 + len(chunk.data) // 2
     data[middle : middle + 20] = bytes(20)
     damaged.write_bytes(data)
-    return sum(isinstance(item, Message) for item in open_chunk(chunk))
+    return sum(isinstance(item, Message) for item in read_chunk(chunk))
 
 
 @pytest.mark.parametrize("number", [0, 1, -1])

@@ -1,4 +1,4 @@
-"""Recordings for other tools: what is in them is what was recorded, and the arm stands where the states say."""
+"""Exports contain the recorded data, and the drawn arm agrees with the states."""
 
 import errno
 import json
@@ -12,12 +12,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.export.export import DRAFT_SUFFIX, TABLES, export_foxglove, export_tables, table
-from hilrig_replay.export.urdf_geometry import Solid, solids_of
+from hilrig_replay.export.export import TABLES, TEMPORARY_SUFFIX, export_foxglove, export_tables, table
+from hilrig_replay.geometry.quaternion import rotate
+from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
 from hilrig_replay.io.run import open_run
-from hilrig_replay.rerun_view.scene import rotate
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters
@@ -33,7 +33,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_tables_hold_every_row_with_a_column_a_number(recording: Path, tmp_path: Path, kind: str) -> None:
+def test_tables_contain_all_rows_and_values(recording: Path, tmp_path: Path, kind: str) -> None:
     run = open_run(recording)
     paths = export_tables(run, tmp_path / "tables", kind)
     assert [path.name for path in paths] == [f"{name}.{kind}" for name in TABLES]
@@ -50,67 +50,65 @@ def test_tables_hold_every_row_with_a_column_a_number(recording: Path, tmp_path:
     assert read(paths[3]).num_rows == len(run.traffic)
 
 
-def test_a_table_has_no_column_that_is_a_code(recording: Path) -> None:
+def test_interned_columns_are_exported_as_text(recording: Path) -> None:
     run = open_run(recording)
     states = table(run, run.states)
     assert {str(states.schema.field(name).type) for name in ("session", "held_part")} == {"string"}
 
 
-def test_every_column_is_documented_and_no_other(recording: Path, tmp_path: Path) -> None:
-    said: dict[str, set[str]] = {name: set() for name in TABLES}
+def test_documentation_lists_exactly_the_columns(recording: Path, tmp_path: Path) -> None:
+    documented: dict[str, set[str]] = {name: set() for name in TABLES}
     for line in PAGE.read_text(encoding="utf-8").split("### Columns of the tables")[1].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) == 5 and "`" in cells[1]:
             for name in cells[0].split(", "):
-                said[name] |= set(re.findall(r"`(\w+\*?)`", cells[1]))
+                documented[name] |= set(re.findall(r"`(\w+\*?)`", cells[1]))
     for path in export_tables(open_run(recording), tmp_path / "tables", "csv"):
-        there = set(pyarrow.csv.read_csv(path).column_names)
-        assert {re.sub("_(theta1|theta2|d3|theta4)$", "_*", column) for column in there} == said[path.stem]
+        columns = set(pyarrow.csv.read_csv(path).column_names)
+        assert {re.sub("_(theta1|theta2|d3|theta4)$", "_*", column) for column in columns} == documented[path.stem]
 
 
-def test_the_stages_follow_from_the_columns_as_the_page_says(recording: Path, tmp_path: Path) -> None:
+def test_documented_stage_formulas_give_the_stages(recording: Path, tmp_path: Path) -> None:
     run = open_run(recording)
     samples = measure(run).table
     state_path, command_path, *_ = export_tables(run, tmp_path / "tables", "csv")
     states, commands = pyarrow.csv.read_csv(state_path).to_pylist(), pyarrow.csv.read_csv(command_path).to_pylist()
     by_seq = {command["seq"]: command for command in commands}
-    taken = [(state, by_seq[state["command_seq"]]) for state in states if state["loop_latency_ns"] > 0]
-    assert len(taken) == len(samples) > 50
-    by_hand = {
-        "loop": [s["loop_latency_ns"] for s, _ in taken],
-        "register_wait": [c["state_served_ns"] - c["state_arrived_ns"] - c["state_injected_ns"] for _, c in taken],
-        "controller": [c["write_arrived_ns"] - c["state_served_ns"] for _, c in taken],
-        "edge": [c["sent_ns"] - c["write_arrived_ns"] - c["command_injected_ns"] for _, c in taken],
-        "injected": [c["state_injected_ns"] + c["command_injected_ns"] for _, c in taken],
-        "tick_wait": [s["sampled_ns"] - s["command_arrived_ns"] for s, _ in taken],
+    effective = [(state, by_seq[state["command_seq"]]) for state in states if state["loop_latency_ns"] > 0]
+    assert len(effective) == len(samples) > 50
+    by_formula = {
+        "loop": [s["loop_latency_ns"] for s, _ in effective],
+        "register_wait": [c["state_served_ns"] - c["state_arrived_ns"] - c["state_injected_ns"] for _, c in effective],
+        "controller": [c["write_arrived_ns"] - c["state_served_ns"] for _, c in effective],
+        "edge": [c["sent_ns"] - c["write_arrived_ns"] - c["command_injected_ns"] for _, c in effective],
+        "injected": [c["state_injected_ns"] + c["command_injected_ns"] for _, c in effective],
+        "tick_wait": [s["sampled_ns"] - s["command_arrived_ns"] for s, _ in effective],
     }
-    for stage, expected in by_hand.items():
+    for stage, expected in by_formula.items():
         assert [int(value) for value in samples[stage]] == expected, stage
 
 
-def test_an_export_that_was_killed_is_in_nobody_s_way(recording: Path, tmp_path: Path) -> None:
-    (tmp_path / f"fox.mcap{DRAFT_SUFFIX}").write_bytes(b"half of it")
+def test_leftover_of_a_killed_export_is_replaced(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / f"fox.mcap{TEMPORARY_SUFFIX}").write_bytes(b"incomplete")
     out = export_foxglove(open_run(recording), tmp_path / "fox.mcap")
     assert [path.name for path in tmp_path.iterdir()] == [out.name]
 
 
-def test_an_export_that_does_not_fit_is_no_export(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    append = RunWriter._append
+def test_export_on_a_full_disk_leaves_no_file(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    append = RecordingWriter._append
 
-    def full(writer: RunWriter, data: bytes) -> None:
+    def full(writer: RecordingWriter, data: bytes) -> None:
         if writer.size + len(data) > 200_000:
             raise OSError(errno.ENOSPC, "No space left on device")
         append(writer, data)
 
-    monkeypatch.setattr(RunWriter, "_append", full)
+    monkeypatch.setattr(RecordingWriter, "_append", full)
     with pytest.raises(OperationError, match=r"fox\.mcap: can't be written: [Nn]o space"):
         export_foxglove(open_run(recording), tmp_path / "fox.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_recorded_message_is_in_the_export_as_it_was(recording: Path, tmp_path: Path) -> None:
+def test_export_contains_every_message_unchanged(recording: Path, tmp_path: Path) -> None:
     out = export_foxglove(open_run(recording), tmp_path / "fox.mcap")
     topics = ["/state", "/command", "/event", "/traffic"]
 
@@ -128,7 +126,7 @@ def test_every_recorded_message_is_in_the_export_as_it_was(recording: Path, tmp_
         assert [item.metadata for item in one.iter_metadata()] == [item.metadata for item in two.iter_metadata()]
 
 
-def test_the_frames_lead_to_where_the_kinematics_has_the_tool(recording: Path, tmp_path: Path) -> None:
+def test_frames_lead_to_the_tool_position(recording: Path, tmp_path: Path) -> None:
     run = open_run(recording)
     out = export_foxglove(run, tmp_path / "fox.mcap")
     poses = {}
@@ -153,10 +151,10 @@ def test_the_frames_lead_to_where_the_kinematics_has_the_tool(recording: Path, t
         np.testing.assert_allclose(point, expected, atol=1e-9)
 
 
-def test_shapes_and_points_of_every_link_are_there_in_its_frame(recording: Path, tmp_path: Path) -> None:
+def test_export_has_shapes_and_points_of_every_link(recording: Path, tmp_path: Path) -> None:
     run = open_run(recording)
     out = export_foxglove(run, tmp_path / "fox.mcap")
-    links = {solid.link for solid in solids_of(run.urdf)}
+    links = {shape.link for shape in visual_shapes(run.urdf)}
     with out.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = list(reader.iter_decoded_messages())
@@ -177,8 +175,8 @@ def test_shapes_and_points_of_every_link_are_there_in_its_frame(recording: Path,
     ("kind", "size"), [("box", (0.3, 0.2, 0.1)), ("cylinder", (0.2, 0.2, 0.3)), ("sphere", (0.2, 0.2, 0.2))]
 )
 def test_points_lie_on_the_surface(kind: str, size: tuple[float, float, float]) -> None:
-    at, unturned = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
-    points = Solid("link", kind, size, at, unturned, (1, 1, 1, 1)).points() - at
+    center, identity = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    points = VisualShape("link", kind, size, center, identity, (1, 1, 1, 1)).points() - center
     half = np.array(size) / 2
     np.testing.assert_allclose(np.abs(points).max(axis=0), half, atol=2e-3)
     if kind == "sphere":
@@ -187,13 +185,13 @@ def test_points_lie_on_the_surface(kind: str, size: tuple[float, float, float]) 
         assert np.isclose(np.abs(points), half).any(axis=1).all()
 
 
-def test_a_box_turned_about_z_by_a_quarter_swaps_its_sides() -> None:
+def test_quarter_turn_about_z_swaps_the_sides_of_a_box() -> None:
     quarter = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    points = Solid("link", "box", (0.4, 0.2, 0.1), np.zeros(3), quarter, (1, 1, 1, 1)).points()
+    points = VisualShape("link", "box", (0.4, 0.2, 0.1), np.zeros(3), quarter, (1, 1, 1, 1)).points()
     np.testing.assert_allclose(np.abs(points).max(axis=0), [0.1, 0.2, 0.05], atol=1e-12)
 
 
-def test_a_recording_without_a_urdf_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recording_without_urdf_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = recordings.record(tmp_path / "run.mcap", recordings.Script(seconds=1))
     run = open_run(path)
     monkeypatch.setattr(type(run), "urdf", "")
@@ -201,7 +199,7 @@ def test_a_recording_without_a_urdf_is_refused(tmp_path: Path, monkeypatch: pyte
         export_foxglove(run, tmp_path / "fox.mcap")
 
 
-def test_the_command_prints_what_it_wrote_and_refuses_to_write_over(recording: Path, tmp_path: Path) -> None:
+def test_command_prints_paths_and_does_not_overwrite(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "fox.mcap"
     answer = hilrig("export", recording, "--foxglove", out, "--csv", tmp_path / "csv")
     assert answer.returncode == 0, answer.stderr
@@ -214,6 +212,6 @@ def test_the_command_prints_what_it_wrote_and_refuses_to_write_over(recording: P
     assert "nothing to write" in nothing.stderr
 
 
-def test_the_answer_of_runs_is_json_of_which_every_path_exists(recording: Path) -> None:
+def test_runs_json_lists_existing_paths(recording: Path) -> None:
     answer = json.loads(hilrig("runs", recording.parent, "--json").stdout)
     assert [Path(run["path"]).exists() for run in answer["runs"]] == [True]

@@ -1,4 +1,4 @@
-"""A running rig followed on the bus in memory: drawn as it comes, missed when it goes, welcome when it is back."""
+"""Live view of a running rig over the in-memory bus: drawing, silence, restart."""
 
 import threading
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ import pytest
 import rerun as rr
 
 from hilrig_replay.rerun_view.layout import layout
-from hilrig_replay.rerun_view.live import SILENCE_NS, Follower
+from hilrig_replay.rerun_view.live import SILENCE_TIMEOUT_NS, Follower
 from hilrig_replay.rerun_view.sinks import to_file
 from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.errors import OperationError
@@ -23,15 +23,15 @@ KEYS = {topic.name: topic.key("lab", "rig1") for topic in RIG_TOPICS}
 
 
 class Watched:
-    """A follower with everything around it."""
+    """A follower with its bus, clock and output file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.bus = MemoryBus()
         self.clock = ManualClock()
-        self.said: list[str] = []
+        self.notices: list[str] = []
         self.stream: rr.RecordingStream = to_file(path, "live-rig1", layout(live=True))
-        self.follower = Follower(self.bus, "lab", "rig1", self.stream, self.clock, self.said.append)
+        self.follower = Follower(self.bus, "lab", "rig1", self.stream, self.clock, self.notices.append)
 
     def serve(self) -> None:
         config = RigConfig(rig="rig1", step_ns=20_000_000, parameters_json=PARAMETERS.to_json(), urdf=urdf(PARAMETERS))
@@ -54,7 +54,7 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
     watched.stream.disconnect()
 
 
-def test_what_is_on_the_bus_is_drawn_batch_by_batch(watched: Watched) -> None:
+def test_follower_draws_received_messages_in_batches(watched: Watched) -> None:
     watched.serve()
     assert watched.follower.find(threading.Event())
     made = make(Script(seconds=3.0))
@@ -69,32 +69,32 @@ def test_what_is_on_the_bus_is_drawn_batch_by_batch(watched: Watched) -> None:
     assert 25 < shown.rows("/modbus/192.0.2.7_40001/reads") < 32
 
 
-def test_where_nothing_runs_it_says_what_to_do(watched: Watched) -> None:
-    with pytest.raises(OperationError, match=r"no simulation of rig 'rig1' answers for lab 'lab'.*hilrig up"):
+def test_missing_simulation_raises_with_a_hint(watched: Watched) -> None:
+    with pytest.raises(OperationError, match=r"no reply from a simulation of rig 'rig1' in lab 'lab'.*hilrig up"):
         watched.follower.find(threading.Event(), timeout_s=0.0)
 
 
-def test_a_wish_to_stop_ends_the_search(watched: Watched) -> None:
+def test_find_returns_when_stopping_is_set(watched: Watched) -> None:
     stopping = threading.Event()
     stopping.set()
     assert not watched.follower.find(stopping)
 
 
-def test_silence_and_return_are_said_once(watched: Watched) -> None:
+def test_silence_and_recovery_are_reported_once(watched: Watched) -> None:
     watched.serve()
     watched.follower.find(threading.Event())
     made = [one for one in make(Script(seconds=1.0)) if one.topic == "state"]
     watched.send(made[:10])
     watched.follower.step()
     for _ in range(3):
-        watched.clock.advance(SILENCE_NS)
+        watched.clock.advance(SILENCE_TIMEOUT_NS)
         watched.follower.step()
     watched.send(made[10:])
     watched.follower.step()
-    assert watched.said == ["nothing comes from rig1: waiting for it", "rig1 is back"]
+    assert watched.notices == ["rig1: no states received for 2 s; waiting", "rig1: receiving states again"]
 
 
-def test_a_restarted_simulation_goes_on_in_the_same_picture(watched: Watched) -> None:
+def test_view_continues_after_a_simulation_restart(watched: Watched) -> None:
     watched.serve()
     watched.follower.find(threading.Event())
     made = [one for one in make(Script(seconds=2.0)) if one.topic == "state"]
@@ -109,7 +109,7 @@ def test_a_restarted_simulation_goes_on_in_the_same_picture(watched: Watched) ->
     assert watched.shown().rows("/position") == 100
 
 
-def test_what_comes_before_the_first_state_does_not_disturb(watched: Watched) -> None:
+def test_commands_before_the_first_state_are_ignored(watched: Watched) -> None:
     watched.serve()
     watched.follower.find(threading.Event())
     made = make(Script(seconds=1.0))
@@ -120,16 +120,16 @@ def test_what_comes_before_the_first_state_does_not_disturb(watched: Watched) ->
     assert watched.shown().rows("/position") == 50
 
 
-def test_a_message_of_another_version_is_said_and_passed_over(watched: Watched) -> None:
+def test_undecodable_message_is_reported_and_skipped(watched: Watched) -> None:
     watched.serve()
     watched.follower.find(threading.Event())
     watched.bus.publisher(KEYS["state"], Traffic.CONTROL).put(b"\xff\xff\xff")
     watched.follower.step()
-    assert len(watched.said) == 1
-    assert "can't be decoded" in watched.said[0]
+    assert len(watched.notices) == 1
+    assert "can't be decoded" in watched.notices[0]
 
 
-def test_what_waits_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pending_messages_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     watched.serve()
     watched.follower.find(threading.Event())
     state = next(one for one in make(Script(seconds=0.1)) if one.topic == "state")

@@ -11,7 +11,7 @@ from hilrig_replay.grading.grade import Grade, Grader
 from hilrig_replay.grading.placement import PartPlacement, PlacementReport
 from hilrig_replay.grading.task_loading import load_task, recorded_task, validate_task
 from hilrig_replay.io.run import open_run
-from hilrig_replay.report.report import report
+from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
@@ -228,7 +228,7 @@ def test_grades_by_the_recorded_task(tmp_path: Path) -> None:
     assert summary.grade.score == 0.5
     plain = summary.as_dict()["grade"]
     assert (plain["title"], plain["parts"][0]["placed"]) == ("Two corners", False)
-    page = report([path]).html
+    page = build_report([path]).html
     assert "Two corners" in page
     assert "1 of 2 goals" in page
     # Another task, given later.
@@ -249,7 +249,7 @@ def test_ranks_runs_by_grade(tmp_path: Path) -> None:
                 one.message.position[:] = inverse(PARAMETERS.arm, (x / 1000, 0.1, 0.0, 0.0))[0]
         text = TASK.format(x=400, y=100, z=0).replace("300", "2")
         paths.append(write(tmp_path / f"{name}.mcap", made, script=script, session=name, lab_toml=text))
-    found = report(paths)
+    found = build_report(paths)
     assert [run["session"] for run in found.runs] == ["first", "never"]
     assert [run["grade"]["score"] for run in found.runs] == [0.5, 0.0]
     assert found.html.index("1. first") < found.html.index("2. never")
@@ -298,18 +298,18 @@ def test_report_skips_an_unreadable_run(tmp_path: Path) -> None:
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(good.read_bytes()[:5000])
     alone = write(tmp_path / "alone.mcap", make(silent), script=silent)
-    found = report([torn, good, alone])
+    found = build_report([torn, good, alone])
     assert [run["latency"]["samples"] > 0 for run in found.runs].count(False) == 1
     assert len(found.runs) == 2
     assert ["torn" in reason for reason in found.left_out] == [True]
-    assert "Left out" in found.html
-    with pytest.raises(InputError, match="no run can be reported"):
-        report([torn, torn])
+    assert "Skipped recordings" in found.html
+    with pytest.raises(InputError, match="no readable recording"):
+        build_report([torn, torn])
 
 
 def test_no_goal_is_reached_without_commands(tmp_path: Path) -> None:
     silent = Script(seconds=1.0, controllers=False)
     path = write(tmp_path / "alone.mcap", make(silent), script=silent)
     task = parse_lab("[[task.poses]]\nname = 'a'\nposition_mm = [300, 0, 0]\n").task
-    (found,) = report([path], task=task).runs
+    (found,) = build_report([path], task=task).runs
     assert found["grade"]["score"] == 0

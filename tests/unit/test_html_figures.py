@@ -1,4 +1,4 @@
-"""A figure in a page: an image for each column of its panels, with everything that belongs to it and nothing else."""
+"""Figures in HTML pages: one image per column of panels, cut between the labels; reports with worker processes."""
 
 import re
 from base64 import b64decode
@@ -10,8 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from hilrig_replay.report.html_figures import picture
-from hilrig_replay.report.report import report
+from hilrig_replay.report.html_figures import html_figure
+from hilrig_replay.report.report import build_report
 from hilrig_runtime.errors import InputError
 from support.recordings import Script, record
 
@@ -28,41 +28,50 @@ def dark_columns(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("columns", [1, 2, 4])
-def test_a_figure_is_cut_between_its_columns_and_through_no_label(columns: int) -> None:
+def test_figure_is_cut_between_columns_not_through_labels(columns: int) -> None:
     figure = Figure(figsize=(11, 4), layout="constrained", dpi=110)
     for axes in np.atleast_2d(figure.subplots(2, columns)).flat:
-        # Labels stand out on both sides of a panel: the last tick's to the right, the axis's own to the left.
+        # Labels extend beyond both sides of a panel: the last tick label to the right, the axis label to the left.
         axes.set(xlim=(0, 1000), ylabel="samples", xticks=[0, 1000])
         axes.set_yticks([0, 1], ["a long name", "another"])
-    pieces = images(picture(figure, "panels"))
+    pieces = images(html_figure(figure, "panels"))
     assert len(pieces) == columns
     assert sum(piece.shape[1] for piece in pieces) == 1210
     for piece in pieces:
         dark = dark_columns(piece)
         assert dark[0] > 1
         assert dark[-1] < piece.shape[1] - 2
-    # Each has the names left of its panels: before the longest line, its axis, there is more than a label's width.
+    # Each piece includes the tick labels at the left: the axis, the longest line, is preceded by a label's width.
     for piece in pieces:
         axis = (piece[:, :, :3] < 0.3).all(axis=2).sum(axis=0).argmax()
         assert axis - dark_columns(piece)[0] > 60
 
 
-def test_many_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
-    whole = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
-    paths = [whole]
+def test_worker_processes_give_the_same_report(tmp_path: Path) -> None:
+    complete = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
+    paths = [complete]
     for length in (500, 1000, 2000):
-        paths.append(tmp_path / f"torn-{length}.mcap")
-        paths[-1].write_bytes(whole.read_bytes()[:length])
+        paths.append(tmp_path / f"truncated-{length}.mcap")
+        paths[-1].write_bytes(complete.read_bytes()[:length])
     shares: list[float] = []
-    alone, together = report(paths), report(paths, workers=2, tick=shares.append)
+    alone, together = build_report(paths), build_report(paths, workers=2, on_progress=shares.append)
     assert together == alone
     assert len(together.runs) == 1
     assert [path.name in reason for path, reason in zip(paths[1:], together.left_out, strict=True)] == [True] * 3
     assert shares == [0.25, 0.5, 0.75, 1.0]
 
 
-def test_a_report_of_one_damaged_file_says_so(tmp_path: Path) -> None:
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes(b"")
+def test_group_figure_has_its_columns_with_long_file_names(tmp_path: Path) -> None:
+    folders = [tmp_path / ("long" * 40) / name for name in ("one", "two")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    page = build_report([record(folder / "run.mcap", Script(seconds=1.0)) for folder in folders]).html
+    overview = page[: page.index("<details>")]
+    assert len(images(overview)) == 4
+
+
+def test_report_of_one_damaged_file_raises(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    empty.write_bytes(b"")
     with pytest.raises(InputError, match="empty"):
-        report([torn], workers=None)
+        build_report([empty], workers=None)

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.index import IN_PROGRESS, INDEX_NAME, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
 from support import recordings
@@ -198,7 +198,7 @@ def test_command_reports_a_missing_folder_in_one_line(tmp_path: Path) -> None:
 def test_command_shows_the_reason_of_an_abnormal_ending(tmp_path: Path) -> None:
     path = tmp_path / "lab" / "rig1" / "20260101T000000Z-rig1-abcd.mcap"
     path.parent.mkdir(parents=True)
-    writer = RunWriter(path, metadata=(Metadata("hilrig.session", {"rig": "rig1", "session": path.stem}),))
+    writer = RecordingWriter(path, metadata=(Metadata("hilrig.session", {"rig": "rig1", "session": path.stem}),))
     writer.finish(lambda: {"hilrig.summary": {"ended": "disk full", "reason": "No space left on device"}})
     writer.publish()
     answer = hilrig("runs", tmp_path)

@@ -197,5 +197,5 @@ def test_plot_format_follows_the_suffix(tmp_path: Path, ending: str) -> None:
 
 def test_rejects_an_unknown_plot_suffix(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=2.0)))
-    with pytest.raises(InputError, match=r"a picture ends in \.png, \.svg, \.pdf"):
+    with pytest.raises(InputError, match=r"unsupported plot format '\.bmp'; .* must end in \.png, \.svg, \.pdf"):
         save_plot(measure(run), run, tmp_path / "latency.bmp")

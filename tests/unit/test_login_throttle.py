@@ -1,4 +1,4 @@
-"""Guesses at the console's password: some at once, then few, whatever their number of connections."""
+"""Login throttle of the console: a burst of wrong passwords, then one attempt per interval."""
 
 import asyncio
 import base64
@@ -8,76 +8,76 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message
 
-from hilrig_console.auth import Guard, Guarded
-from hilrig_console.login_throttle import ADDRESSES, AT_ONCE, PERIOD_NS, Patience
+from hilrig_console.auth import AccessPolicy, AuthMiddleware
+from hilrig_console.login_throttle import BURST_ATTEMPTS, MAX_ADDRESSES, RETRY_INTERVAL_NS, LoginThrottle
 from hilrig_runtime.timing.clock import ManualClock
 
 HOST = "192.0.2.7"
 
 
-def worn(address: str = HOST) -> Patience:
-    patience = Patience()
-    for _ in range(AT_ONCE):
-        assert patience.wait_ns(address, 0) == 0
-        patience.wrong(address, 0)
-    return patience
+def exhausted(address: str = HOST) -> LoginThrottle:
+    throttle = LoginThrottle()
+    for _ in range(BURST_ATTEMPTS):
+        assert throttle.wait_ns(address, 0) == 0
+        throttle.record_failure(address, 0)
+    return throttle
 
 
-def test_after_some_wrong_passwords_one_may_be_tried_each_period() -> None:
-    patience = worn()
-    assert patience.wait_ns(HOST, 0) == PERIOD_NS
-    assert patience.wait_ns(HOST, PERIOD_NS - 1) == 1
-    assert patience.wait_ns(HOST, PERIOD_NS) == 0
-    patience.wrong(HOST, PERIOD_NS)
-    assert patience.wait_ns(HOST, PERIOD_NS) == PERIOD_NS
+def test_allows_one_attempt_per_interval_after_burst() -> None:
+    throttle = exhausted()
+    assert throttle.wait_ns(HOST, 0) == RETRY_INTERVAL_NS
+    assert throttle.wait_ns(HOST, RETRY_INTERVAL_NS - 1) == 1
+    assert throttle.wait_ns(HOST, RETRY_INTERVAL_NS) == 0
+    throttle.record_failure(HOST, RETRY_INTERVAL_NS)
+    assert throttle.wait_ns(HOST, RETRY_INTERVAL_NS) == RETRY_INTERVAL_NS
 
 
-def test_who_is_quiet_for_long_begins_anew() -> None:
-    patience = worn()
-    later_ns = AT_ONCE * PERIOD_NS
-    for _ in range(AT_ONCE):
-        assert patience.wait_ns(HOST, later_ns) == 0
-        patience.wrong(HOST, later_ns)
-    assert patience.wait_ns(HOST, later_ns) == PERIOD_NS
+def test_burst_is_available_again_after_pause() -> None:
+    throttle = exhausted()
+    later_ns = BURST_ATTEMPTS * RETRY_INTERVAL_NS
+    for _ in range(BURST_ATTEMPTS):
+        assert throttle.wait_ns(HOST, later_ns) == 0
+        throttle.record_failure(HOST, later_ns)
+    assert throttle.wait_ns(HOST, later_ns) == RETRY_INTERVAL_NS
 
 
-def test_others_do_not_wait() -> None:
-    assert worn().wait_ns("192.0.2.8", 0) == 0
+def test_other_addresses_do_not_wait() -> None:
+    assert exhausted().wait_ns("192.0.2.8", 0) == 0
 
 
 @pytest.mark.parametrize(("other", "waits"), [("2001:db8::ffff:1", True), ("2001:db8:0:1::1", False)])
-def test_a_host_has_a_whole_network_of_ipv6(other: str, waits: bool) -> None:
-    assert bool(worn("2001:db8::1").wait_ns(other, 0)) is waits
+def test_throttles_ipv6_per_network(other: str, waits: bool) -> None:
+    assert bool(exhausted("2001:db8::1").wait_ns(other, 0)) is waits
 
 
-def test_what_is_remembered_is_bounded() -> None:
-    patience = worn()
-    for number in range(ADDRESSES):
-        patience.wrong(f"10.0.{number // 256}.{number % 256}", 0)
-    assert len(patience._worn_until_ns) == ADDRESSES
-    assert patience.wait_ns(HOST, 0) == 0
+def test_number_of_addresses_is_bounded() -> None:
+    throttle = exhausted()
+    for number in range(MAX_ADDRESSES):
+        throttle.record_failure(f"10.0.{number // 256}.{number % 256}", 0)
+    assert len(throttle._blocked_until_ns) == MAX_ADDRESSES
+    assert throttle.wait_ns(HOST, 0) == 0
 
 
-def test_a_guess_that_comes_too_early_is_not_looked_at_even_if_it_is_right() -> None:
+def test_rejects_correct_password_during_wait() -> None:
     clock = ManualClock()
-    guarded = Guarded(PlainTextResponse("in"), Guard(password="open sesame"), clock)
+    protected = AuthMiddleware(PlainTextResponse("in"), AccessPolicy(password="open sesame"), clock)
 
-    def asked(password: str | None = None) -> tuple[int, str]:
+    def request(password: str | None = None) -> tuple[int, str]:
         headers = [(b"host", b"localhost")]
         if password is not None:
             headers.append((b"authorization", b"Basic " + base64.b64encode(f"teacher:{password}".encode())))
-        return asyncio.run(answer_of(guarded, headers))
+        return asyncio.run(reply_of(protected, headers))
 
-    assert asked() == (401, "")
-    assert [asked("guess") for _ in range(AT_ONCE)] == [(401, "")] * AT_ONCE
-    assert asked() == (401, ""), "to ask without a password is no guess"
-    assert asked("open sesame") == (429, "5")
-    clock.advance(PERIOD_NS)
-    assert [asked("open sesame") for _ in range(3 * AT_ONCE)] == [(200, "")] * (3 * AT_ONCE)
+    assert request() == (401, "")
+    assert [request("guess") for _ in range(BURST_ATTEMPTS)] == [(401, "")] * BURST_ATTEMPTS
+    assert request() == (401, ""), "a request without a password is not an attempt"
+    assert request("open sesame") == (429, "5")
+    clock.advance(RETRY_INTERVAL_NS)
+    assert [request("open sesame") for _ in range(3 * BURST_ATTEMPTS)] == [(200, "")] * (3 * BURST_ATTEMPTS)
 
 
-async def answer_of(app: ASGIApp, headers: list[tuple[bytes, bytes]]) -> tuple[int, str]:
-    """Status, and the seconds after which to try again, of what an application answers."""
+async def reply_of(app: ASGIApp, headers: list[tuple[bytes, bytes]]) -> tuple[int, str]:
+    """Return the status and the Retry-After header of the reply of an application."""
     sent: list[Message] = []
 
     async def receive() -> Message:

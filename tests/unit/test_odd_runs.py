@@ -9,7 +9,7 @@ from hilrig_replay.analysis.compare import compare
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.analysis.verify import verify
 from hilrig_replay.io.run import open_run
-from hilrig_replay.report.report import report
+from hilrig_replay.report.report import build_report
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.errors import InputError
 from support.recordings import Script, make, record, write
@@ -18,7 +18,7 @@ COMMANDS: dict[str, Callable[[Path], object]] = {
     "latency": lambda path: measure(open_run(path)),
     "replay": lambda path: save_rrd(open_run(path), path.with_suffix(".rrd")),
     "compare": lambda path: compare([open_run(path), open_run(path)]),
-    "report": lambda path: report([path]),
+    "report": lambda path: build_report([path]),
     "verify": verify,
 }
 

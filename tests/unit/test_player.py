@@ -1,4 +1,4 @@
-"""Playing a recording: what is due when, and what arrives on the bus."""
+"""Playback of a recording: schedule and published messages."""
 
 import json
 import threading
@@ -6,7 +6,7 @@ from itertools import islice
 
 import pytest
 
-from hilrig_replay.export.player import Player, play_on, rig_config
+from hilrig_replay.export.player import Player, publish_recording, rig_config
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.errors import InputError
@@ -25,8 +25,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return open_run(recordings.write(path, MADE, script=recordings.Script(seconds=2)))
 
 
-class Waiting(threading.Event):
-    """Waits on a clock that the test owns."""
+class ManualEvent(threading.Event):
+    """An event whose `wait` advances the test's clock."""
 
     def __init__(self, clock: ManualClock) -> None:
         super().__init__()
@@ -38,78 +38,78 @@ class Waiting(threading.Event):
 
 
 @pytest.mark.parametrize("speed", [1.0, 0.5, 10.0])
-def test_messages_are_due_at_the_distances_at_which_they_were_published(run: Run, speed: float) -> None:
-    dues = list(Player(run.file, speed=speed))
-    assert len(dues) == len(MADE)
+def test_schedule_restores_the_publication_intervals(run: Run, speed: float) -> None:
+    schedule = list(Player(run.file, speed=speed))
+    assert len(schedule) == len(MADE)
     first = MADE[0].publish_wall_ns
-    assert [due.message.publish_ns for due in dues] == [one.publish_wall_ns for one in MADE]
-    for due, one in zip(dues, MADE, strict=True):
-        assert due.at_ns == round((one.publish_wall_ns - first) / speed)
+    assert [each.message.publish_ns for each in schedule] == [one.publish_wall_ns for one in MADE]
+    for each, one in zip(schedule, MADE, strict=True):
+        assert each.offset_ns == round((one.publish_wall_ns - first) / speed)
 
 
-def test_it_begins_where_it_is_told(run: Run) -> None:
-    dues = list(Player(run.file, start_s=1.0))
+def test_playback_starts_at_start_s(run: Run) -> None:
+    schedule = list(Player(run.file, start_s=1.0))
     first = MADE[0].publish_wall_ns + 1_000_000_000
-    assert len(dues) == sum(one.publish_wall_ns >= first for one in MADE)
-    assert 0 <= dues[0].at_ns < 20_000_000
+    assert len(schedule) == sum(one.publish_wall_ns >= first for one in MADE)
+    assert 0 <= schedule[0].offset_ns < 20_000_000
 
 
-def test_a_loop_begins_again_where_it_ended(run: Run) -> None:
-    whole = len(MADE)
-    dues = list(islice(Player(run.file, loop=True), 3 * whole))
-    assert [dues[number * whole].round for number in range(3)] == [0, 1, 2]
-    times = [due.at_ns for due in dues]
+def test_loop_restarts_after_the_end(run: Run) -> None:
+    length = len(MADE)
+    schedule = list(islice(Player(run.file, loop=True), 3 * length))
+    assert [schedule[number * length].repetition for number in range(3)] == [0, 1, 2]
+    times = [each.offset_ns for each in schedule]
     assert times == sorted(times)
-    assert dues[whole].at_ns > dues[whole - 1].at_ns
+    assert schedule[length].offset_ns > schedule[length - 1].offset_ns
 
 
-def test_a_start_behind_the_end_is_named(run: Run) -> None:
+def test_start_after_the_end_is_rejected(run: Run) -> None:
     with pytest.raises(InputError, match="ends before 60 s"):
         Player(run.file, start_s=60)
 
 
-def test_on_the_bus_come_the_bytes_that_were_recorded_when_they_are_due(run: Run) -> None:
+def test_recorded_bytes_are_published_on_schedule(run: Run) -> None:
     bus, clock = MemoryBus(), ManualClock()
-    heard: list[tuple[str, bytes]] = []
+    received: list[tuple[str, bytes]] = []
     times = []
 
     def on_message(key: str, payload: bytes) -> None:
-        heard.append((parse_rig_key(key).topic.name, payload))
+        received.append((parse_rig_key(key).topic.name, payload))
         times.append(clock.monotonic_ns())
 
     bus.subscribe("hil/lab/rig1/*", on_message)
     begin = clock.monotonic_ns()
-    assert play_on(bus, "lab", Player(run.file, speed=2.0), clock, Waiting(clock)) == len(MADE)
-    assert heard == [(one.topic, one.message.SerializeToString()) for one in MADE]
+    assert publish_recording(bus, "lab", Player(run.file, speed=2.0), clock, ManualEvent(clock)) == len(MADE)
+    assert received == [(one.topic, one.message.SerializeToString()) for one in MADE]
     first = MADE[0].publish_wall_ns
     for at, one in zip(times, MADE, strict=True):
         assert at - begin == pytest.approx((one.publish_wall_ns - first) / 2, abs=1000)
 
 
-def test_another_rig_s_name_is_in_the_keys_and_in_the_messages(run: Run) -> None:
+def test_rename_changes_keys_and_messages(run: Run) -> None:
     bus, clock = MemoryBus(), ManualClock()
-    heard: list[bytes] = []
-    bus.subscribe(STATE.key("lab", "rig9"), lambda _, payload: heard.append(payload))
-    play_on(bus, "lab", Player(run.file), clock, Waiting(clock), rename="rig9")
-    states = [JointState.FromString(payload) for payload in heard]
+    received: list[bytes] = []
+    bus.subscribe(STATE.key("lab", "rig9"), lambda _, payload: received.append(payload))
+    publish_recording(bus, "lab", Player(run.file), clock, ManualEvent(clock), rename="rig9")
+    states = [JointState.FromString(payload) for payload in received]
     assert {state.rig for state in states} == {"rig9"}
     assert [state.step for state in states] == [one.message.step for one in MADE if isinstance(one.message, JointState)]
     assert rig_config(run, "rig9").urdf == run.urdf
 
 
-def test_it_stops_when_it_is_told(run: Run) -> None:
+def test_playback_stops_when_stopping_is_set(run: Run) -> None:
     clock = ManualClock()
-    stopping = Waiting(clock)
+    stopping = ManualEvent(clock)
     bus = MemoryBus()
     bus.subscribe("hil/lab/**", lambda *_: stopping.set())
-    assert play_on(bus, "lab", Player(run.file, loop=True), clock, stopping) == 1
+    assert publish_recording(bus, "lab", Player(run.file, loop=True), clock, stopping) == 1
 
 
-def test_every_recorded_topic_can_be_played(run: Run) -> None:
-    assert {due.message.topic for due in Player(run.file)} == set(RECORDED)
+def test_all_recorded_topics_are_played(run: Run) -> None:
+    assert {each.message.topic for each in Player(run.file)} == set(RECORDED)
 
 
-def test_the_command_refuses_a_name_that_is_none(run: Run) -> None:
+def test_command_rejects_an_invalid_rig_name(run: Run) -> None:
     answer = hilrig("play", run.path, "--rig", "a/b")
     assert answer.returncode == 2
     assert json.dumps("a/b").strip('"') in answer.stderr

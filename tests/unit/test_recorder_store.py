@@ -1,40 +1,40 @@
-"""What the recorder tells of its disk: when it is slow, once, until it is quick again."""
+"""Alerts of the recorder's file store: a slow disk is reported once, until it is fast again."""
 
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hilrig_recorder.storage.store import SLOW_S, Files
+from hilrig_recorder.storage.store import SLOW_SYNC_S, FileStore
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event
 
 
-def test_a_slow_disk_is_told_of_once_and_until_it_is_quick_again(tmp_path: Path) -> None:
+def test_slow_disk_alert_is_raised_once_and_cleared(tmp_path: Path) -> None:
     (tmp_path / "lab").mkdir()
-    disk: Any = SimpleNamespace(behind_s=0.2)
-    told: list[Event] = []
-    files = Files(
+    sync_worker: Any = SimpleNamespace(sync_delay_s=0.2)
+    events: list[Event] = []
+    store = FileStore(
         "lab",
         RecorderConfig(folder=tmp_path, min_free_mib=0),
         ManualClock(),
-        disk,
+        sync_worker,
         instance="1",
         repeated_ns=0,
-        tell=told.append,
-        ask_config=lambda _: None,
-        give_up=lambda _: None,
+        emit=events.append,
+        request_config=lambda _: None,
+        on_failed=lambda _: None,
     )
-    files.tick(0)
-    assert (files.trouble, told) == ("", [])
-    disk.behind_s = SLOW_S + 1
+    store.tick(0)
+    assert (store.alert, events) == ("", [])
+    sync_worker.sync_delay_s = SLOW_SYNC_S + 1
     for now_ns in range(5):
-        files.tick(now_ns)
-    assert f"the disk is slow: what comes is safe from a power cut after {SLOW_S:g} s and more" in files.trouble
-    assert [(event.kind, event.severity, event.text) for event in told] == [
-        (Event.RECORDING, Event.WARNING, files.trouble)
+        store.tick(now_ns)
+    assert f"slow disk: a power failure may lose the last {SLOW_SYNC_S:g} s or more" in store.alert
+    assert [(event.kind, event.severity, event.text) for event in events] == [
+        (Event.RECORDING, Event.WARNING, store.alert)
     ]
-    disk.behind_s = 0.1
-    files.tick(6)
-    assert files.trouble == ""
-    files.release()
+    sync_worker.sync_delay_s = 0.1
+    store.tick(6)
+    assert store.alert == ""
+    store.release()

@@ -1,4 +1,4 @@
-"""Whole files of torn and damaged ones: nothing whole is lost, nothing is invented, and nothing crashes."""
+"""Recovery of truncated and damaged files: complete chunks are kept, damaged ones are not, and nothing crashes."""
 
 import errno
 import random
@@ -14,23 +14,23 @@ from mcap.writer import CompressionType, Writer
 
 from hilrig_recorder.mcap_format.channels import encode_message
 from hilrig_recorder.mcap_format.fsutil import lock_file
-from hilrig_recorder.mcap_format.recover import recover, recovered_path, session_of
-from hilrig_recorder.mcap_format.scan import Chunk, Message, is_whole, open_chunk, scan
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.recover import read_session_metadata, recover, recovered_path
+from hilrig_recorder.mcap_format.scan import Chunk, Message, is_complete, read_chunk, scan
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
 from support import recordings
 from support.labs import hilrig
 
 START = 1_767_225_600_000_000_000
 HEADER_BYTES = 31
-"""Of a recording: what comes before says nothing."""
+"""Minimum length of a file with a complete MCAP header."""
 Found = tuple[int, int, int, bytes]
 
 
 def good_file(path: Path, chunks: int = 40) -> list[list[Found]]:
-    """Write a recording of many small chunks; gives the messages of each."""
+    """Write a recording of many small chunks; returns the messages of each chunk."""
     rng = random.Random(1)
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     writer.add_metadata("hilrig.session", {"session": "s1", "rig": "rig1"})
     made = []
     number = 0
@@ -64,14 +64,14 @@ def read(path: Path) -> list[Found]:
     return found
 
 
-def words_of(path: Path) -> dict[str, dict[str, str]]:
-    """What a file says of itself."""
+def metadata_of(path: Path) -> dict[str, dict[str, str]]:
+    """Metadata records of a file, by name."""
     with path.open("rb") as stream:
         return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
 
 
 def chunk_ends(path: Path) -> list[int]:
-    """Where each chunk of a file ends."""
+    """End offset of each chunk of a file."""
     data = path.read_bytes()
     return [
         offset + 9 + struct.unpack_from("<Q", data, offset + 1)[0]
@@ -80,7 +80,7 @@ def chunk_ends(path: Path) -> list[int]:
     ]
 
 
-def test_a_whole_file_is_left_alone(tmp_path: Path) -> None:
+def test_complete_file_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     good_file(path)
     before = path.read_bytes()
@@ -90,27 +90,27 @@ def test_a_whole_file_is_left_alone(tmp_path: Path) -> None:
     assert not (tmp_path / "new.mcap").exists()
 
 
-def test_cut_anywhere_every_whole_chunk_is_kept(tmp_path: Path) -> None:
-    path, torn, new = (tmp_path / name for name in ("run.mcap", "torn.mcap", "new.mcap"))
+def test_all_complete_chunks_of_a_truncated_file_are_kept(tmp_path: Path) -> None:
+    path, truncated, new = (tmp_path / name for name in ("run.mcap", "truncated.mcap", "new.mcap"))
     made = good_file(path)
     good, ends = path.read_bytes(), chunk_ends(path)
     seed = random.randrange(1 << 30)
     rng = random.Random(seed)
     for length in sorted({0, 1, 8, 9, *ends[:3], *(rng.randrange(len(good)) for _ in range(200))}):
-        torn.write_bytes(good[:length])
+        truncated.write_bytes(good[:length])
         expected = [message for end, content in zip(ends, made, strict=True) if end <= length for message in content]
         if length < HEADER_BYTES:
-            with pytest.raises(InputError, match="nothing of an MCAP file"):
-                recover(torn, new)
+            with pytest.raises(InputError, match=r"not an MCAP file|without a complete record"):
+                recover(truncated, new)
             continue
-        recovery = recover(torn, new)
-        assert read(new) == expected, f"seed {seed}, cut at {length}"
+        recovery = recover(truncated, new)
+        assert read(new) == expected, f"seed {seed}, truncated at {length}"
         assert recovery.messages == len(expected)
-        assert torn.read_bytes() == good[:length]
+        assert truncated.read_bytes() == good[:length]
         new.unlink()
 
 
-def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_are_kept(tmp_path: Path) -> None:
+def test_only_intact_chunks_of_a_corrupted_file_are_kept(tmp_path: Path) -> None:
     path, damaged, new = (tmp_path / name for name in ("run.mcap", "damaged.mcap.part", "new.mcap"))
     made = good_file(path)
     good = path.read_bytes()
@@ -119,7 +119,7 @@ def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_ar
     seed = random.randrange(1 << 30)
     rng = random.Random(seed)
     for _ in range(150):
-        # The end is cut off too, or a file would be taken for whole.
+        # The end is truncated too. Otherwise the file is complete.
         data = bytearray(good[: -rng.randrange(1, 50)])
         places = [rng.randrange(len(data)) for _ in range(rng.choice((1, 1, 3)))]
         for place in places:
@@ -128,7 +128,7 @@ def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_ar
         try:
             recover(damaged, new)
         except InputError:
-            pytest.fail(f"seed {seed}: recognised nothing, flipped at {places}")
+            pytest.fail(f"seed {seed}: nothing recovered, flipped at {places}")
         whole = [
             content
             for start, end, content in zip(starts, ends, made, strict=True)
@@ -137,13 +137,13 @@ def test_with_bytes_flipped_anywhere_nothing_is_invented_and_all_whole_chunks_ar
         allowed = {message for content in made for message in content}
         found = read(new)
         assert set(found) <= allowed, f"seed {seed}, flipped at {places}"
-        # What comes before the first chunk are the schemas and channels: without them messages have no home.
+        # Before the first chunk are the schemas and channels. Without them messages have no channel.
         if all(place > starts[0] for place in places):
             assert set(found) >= {message for content in whole for message in content}, f"seed {seed}, {places}"
         new.unlink()
 
 
-def test_a_finished_file_with_zeros_in_its_middle_is_not_taken_for_whole(tmp_path: Path) -> None:
+def test_finished_file_with_a_damaged_chunk_is_recovered(tmp_path: Path) -> None:
     path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
     made = good_file(path)
     starts = [offset for offset, item in scan(path.read_bytes()) if isinstance(item, Chunk)]
@@ -151,21 +151,21 @@ def test_a_finished_file_with_zeros_in_its_middle_is_not_taken_for_whole(tmp_pat
     within = starts[1] + 60
     data[within : within + 40] = bytes(40)
     path.write_bytes(data)
-    assert is_whole(data)
+    assert is_complete(data)
     recovery = recover(path, new)
     assert recovery.damaged_chunks == 1
     assert read(new) == [message for number, content in enumerate(made) if number != 1 for message in content]
-    # What was made of it is whole.
+    # The new file is complete.
     assert recover(new, tmp_path / "again.mcap").path is None
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("chunked", [True, False])
-def test_a_foreign_file_is_recovered_too(tmp_path: Path, compression: CompressionType, chunked: bool) -> None:
+def test_foreign_file_is_recovered(tmp_path: Path, compression: CompressionType, chunked: bool) -> None:
     source, new = tmp_path / "foreign.mcap", tmp_path / "new.mcap"
     with source.open("wb") as stream:
         writer = Writer(stream, chunk_size=1_000, compression=compression, use_chunking=chunked)
-        writer.start(profile="ros2", library="somebody else's")
+        writer.start(profile="ros2", library="foreign")
         for number in range(3):
             schema = writer.register_schema(f"pkg/Type{number}", "ros2msg", b"int32 x")
             channel = writer.register_channel(f"/topic{number}", "cdr", schema, {"qos": "1"})
@@ -186,76 +186,76 @@ def test_a_foreign_file_is_recovered_too(tmp_path: Path, compression: Compressio
     )
 
 
-def test_a_recovered_recording_says_what_it_is(tmp_path: Path) -> None:
+def test_recovered_recording_has_session_and_recovery_metadata(tmp_path: Path) -> None:
     source = tmp_path / "run.mcap.part"
     recordings.write(source, recordings.make(recordings.Script(seconds=1)), finish=False)
     data = bytearray(source.read_bytes())
     source.write_bytes(data)
     recover(source, tmp_path / "run.mcap")
-    found = words_of(tmp_path / "run.mcap")
+    found = metadata_of(tmp_path / "run.mcap")
     assert "hilrig.session" in found
     assert found["hilrig.recovered"]["damaged_bytes"] == "0"
 
 
-def test_losses_that_were_noted_are_in_the_summary_of_a_recovered_file(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_recovered_summary_contains_recorded_losses(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
     for transport, recorder in ((3, 0), (0, 4)):
         writer.add_metadata("hilrig.loss", {"transport": str(transport), "recorder": str(recorder)})
     writer.close()
-    recover(writer.part, writer.path)
-    found = words_of(writer.path)
+    recover(writer.temporary_path, writer.path)
+    found = metadata_of(writer.path)
     assert found["hilrig.summary"]["ended"] == "recovered"
-    assert "had no end" in found["hilrig.summary"]["reason"]
+    assert "was not finished" in found["hilrig.summary"]["reason"]
     assert (found["hilrig.summary"]["lost_transport"], found["hilrig.summary"]["lost_recorder"]) == ("3", "4")
 
 
-def test_a_file_that_lost_its_last_words_does_not_say_that_it_had_no_end(tmp_path: Path) -> None:
+def test_damaged_summary_is_not_reported_as_unfinished_file(tmp_path: Path) -> None:
     path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
     good_file(path)
     data = bytearray(path.read_bytes())
-    words = next(at for at, item in scan(data) if isinstance(item, Metadata) and item.name == "hilrig.summary")
-    data[words + 9 : words + 40] = bytes(31)
+    summary_at = next(at for at, item in scan(data) if isinstance(item, Metadata) and item.name == "hilrig.summary")
+    data[summary_at + 9 : summary_at + 40] = bytes(31)
     path.write_bytes(data)
-    assert is_whole(data)
+    assert is_complete(data)
     recover(path, new)
-    assert words_of(new)["hilrig.summary"]["reason"] == "how it ended stood where the file is damaged"
+    assert metadata_of(new)["hilrig.summary"]["reason"] == "the summary of the file was damaged"
 
 
-def test_a_loss_that_is_no_number_is_passed_over(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_damaged_loss_count_is_ignored(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
     writer.add_metadata("hilrig.loss", {"transport": "3", "recorder": "-4\x00"})
     writer.close()
-    recover(writer.part, writer.path)
-    assert words_of(writer.path)["hilrig.summary"]["lost_transport"] == "3"
-    assert words_of(writer.path)["hilrig.summary"]["lost_recorder"] == "0"
+    recover(writer.temporary_path, writer.path)
+    assert metadata_of(writer.path)["hilrig.summary"]["lost_transport"] == "3"
+    assert metadata_of(writer.path)["hilrig.summary"]["lost_recorder"] == "0"
 
 
-@pytest.mark.parametrize("torn", [False, True])
-def test_what_is_torn_off_the_end_is_told_apart(tmp_path: Path, torn: bool) -> None:
+@pytest.mark.parametrize("truncated", [False, True])
+def test_truncated_bytes_are_counted_separately_from_damage(tmp_path: Path, truncated: bool) -> None:
     path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
     good_file(path)
     ends = chunk_ends(path)
     data = bytearray(path.read_bytes())
-    if torn:
+    if truncated:
         del data[ends[-1] - 10 :]
     else:
         data[ends[3] - 10 : ends[3]] = bytes(10)
     path.write_bytes(data)
     recovery = recover(path, new)
     assert recovery.damaged_bytes > 0
-    assert recovery.torn_bytes == (recovery.damaged_bytes if torn else 0)
-    assert words_of(new)["hilrig.recovered"]["torn_bytes"] == str(recovery.torn_bytes)
+    assert recovery.torn_bytes == (recovery.damaged_bytes if truncated else 0)
+    assert metadata_of(new)["hilrig.recovered"]["torn_bytes"] == str(recovery.torn_bytes)
 
 
-def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
-    with pytest.raises(InputError, match="is writing it just now"):
-        recover(writer.part, tmp_path / "new.mcap")
+def test_file_being_written_is_refused(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    with pytest.raises(InputError, match="a recorder is writing it"):
+        recover(writer.temporary_path, tmp_path / "new.mcap")
     writer.close()
-    recover(writer.part, tmp_path / "new.mcap")
+    recover(writer.temporary_path, tmp_path / "new.mcap")
 
 
-def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     source = tmp_path / "run.mcap.part"
     good_file(tmp_path / "run.mcap")
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
@@ -265,60 +265,60 @@ def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
     assert (tmp_path / "run.mcap").read_bytes() == before
 
 
-def test_recovering_can_be_interrupted_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_interrupted_recovery_leaves_no_new_file(tmp_path: Path) -> None:
     good_file(tmp_path / "run.mcap")
-    source = tmp_path / "torn.mcap"
+    source = tmp_path / "truncated.mcap"
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
-    asked = iter([True, True, False])
+    answers = iter([True, True, False])
     with pytest.raises(OperationError, match="interrupted"):
-        recover(source, tmp_path / "new.mcap", go_on=lambda: next(asked))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "torn.mcap"]
+        recover(source, tmp_path / "new.mcap", should_continue=lambda: next(answers))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "truncated.mcap"]
 
 
-def test_where_the_new_file_goes(tmp_path: Path) -> None:
+def test_default_path_of_a_recovered_file(tmp_path: Path) -> None:
     assert recovered_path(tmp_path / "a.mcap.part") == tmp_path / "a.mcap"
     assert recovered_path(tmp_path / "a.mcap") == tmp_path / "a.recovered.mcap"
 
 
-def test_the_session_of_a_torn_file_is_known(tmp_path: Path) -> None:
+def test_session_metadata_of_a_truncated_file_is_read(tmp_path: Path) -> None:
     good_file(tmp_path / "run.mcap")
-    torn = tmp_path / "torn.mcap"
-    torn.write_bytes((tmp_path / "run.mcap").read_bytes()[:14_000])
-    assert session_of(torn) == {"session": "s1", "rig": "rig1"}
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes((tmp_path / "run.mcap").read_bytes()[:14_000])
+    assert read_session_metadata(truncated) == {"session": "s1", "rig": "rig1"}
 
 
-def test_scanning_and_the_stock_reader_agree(tmp_path: Path) -> None:
+def test_scan_agrees_with_the_mcap_library(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     made = good_file(path)
     data = path.read_bytes()
-    assert is_whole(data)
+    assert is_complete(data)
     found = [
         (message.channel_id, message.sequence, message.log_time, message.data)
         for _, item in scan(data)
         if isinstance(item, Chunk)
-        for message in open_chunk(item)
+        for message in read_chunk(item)
         if isinstance(message, Message)
     ]
     assert found == [message for content in made for message in content] == read(path)
 
 
-def test_the_command_recovers_and_says_what_was_lost(tmp_path: Path) -> None:
+def test_command_recovers_and_reports_losses(tmp_path: Path) -> None:
     good_file(tmp_path / "run.mcap")
-    part = tmp_path / "torn.mcap.part"
+    part = tmp_path / "truncated.mcap.part"
     part.write_bytes((tmp_path / "run.mcap").read_bytes()[:15_000])
     answer = hilrig("recover", part)
     assert answer.returncode == 1
     assert "messages in" in answer.stdout
     assert "not saved" in answer.stdout
     assert not part.exists()
-    assert read(tmp_path / "torn.mcap")
+    assert read(tmp_path / "truncated.mcap")
     whole = hilrig("recover", tmp_path / "run.mcap")
     assert whole.returncode == 0
     assert "nothing to do" in whole.stdout
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 1000])
-def test_what_is_no_mcap_file_is_named_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_other_file_is_reported_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "notes.mcap"
     path.write_bytes(content)
     answer = hilrig("recover", path)
@@ -328,9 +328,9 @@ def test_what_is_no_mcap_file_is_named_in_one_line(tmp_path: Path, content: byte
     assert path.read_bytes() == content
 
 
-def test_a_full_disk_leaves_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_leaves_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good_file(tmp_path / "run.mcap")
-    source = tmp_path / "torn.mcap"
+    source = tmp_path / "truncated.mcap"
     shutil.copyfile(tmp_path / "run.mcap", source)
     source.write_bytes(source.read_bytes()[:-10])
     before = source.read_bytes()
@@ -338,23 +338,23 @@ def test_a_full_disk_leaves_the_original(tmp_path: Path, monkeypatch: pytest.Mon
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(RunWriter, "publish", refuse)
+    monkeypatch.setattr(RecordingWriter, "publish", refuse)
     with pytest.raises(OperationError, match="No space left"):
         recover(source, tmp_path / "new.mcap")
     assert source.read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "torn.mcap"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "truncated.mcap"]
 
 
-def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
+def test_folder_is_refused_with_a_hint(tmp_path: Path) -> None:
     answer = hilrig("recover", tmp_path)
     assert answer.returncode == 2
-    assert "is a folder; name the MCAP files in it" in answer.stderr
+    assert "is a folder; give the MCAP files in it" in answer.stderr
     assert "Traceback" not in answer.stderr
 
 
-def test_where_nothing_can_be_written_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_errors_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good_file(tmp_path / "run.mcap")
-    source = tmp_path / "torn.mcap"
+    source = tmp_path / "truncated.mcap"
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
 
     def refuse(*_: object, **__: object) -> None:
@@ -371,9 +371,9 @@ def test_where_nothing_can_be_written_it_says_so(tmp_path: Path, monkeypatch: py
                     recover(source, tmp_path / "new.mcap")
 
 
-def test_a_file_on_a_read_only_disk_is_recovered_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_on_a_read_only_disk_is_recovered_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good_file(tmp_path / "run.mcap")
-    source = tmp_path / "torn.mcap"
+    source = tmp_path / "truncated.mcap"
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
     open_path = Path.open
 
@@ -386,7 +386,7 @@ def test_a_file_on_a_read_only_disk_is_recovered_elsewhere(tmp_path: Path, monke
     assert recover(source, tmp_path / "new.mcap").messages > 0
 
 
-def test_a_lock_shows_whether_a_file_is_open(tmp_path: Path) -> None:
+def test_open_file_can_be_locked_once(tmp_path: Path) -> None:
     with (tmp_path / "file").open("w") as one, (tmp_path / "file").open("r+") as two:
         assert lock_file(one.fileno())
         assert not lock_file(two.fileno())

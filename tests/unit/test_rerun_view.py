@@ -1,4 +1,4 @@
-"""What stands in a rerun file is what stands in the recording; read back with rerun's own reader."""
+"""Rerun files contain the data of the recording; read back with rerun's own reader."""
 
 from pathlib import Path
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.run import open_run
-from hilrig_replay.rerun_view.scene import tips
 from hilrig_replay.rerun_view.view import root_names, save_rrd
 from hilrig_runtime.errors import InputError, OperationError
 from support.recordings import PARAMETERS, Script, make, record, write
 from support.rrd_files import RrdFile
 
 
-def test_curves_are_the_states_in_degrees_and_millimetres(tmp_path: Path) -> None:
+def test_time_series_are_states_in_degrees_and_millimeters(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=3.0)))
     save_rrd(run, tmp_path / "run.rrd")
     shown = RrdFile(tmp_path / "run.rrd")
@@ -26,7 +26,7 @@ def test_curves_are_the_states_in_degrees_and_millimetres(tmp_path: Path) -> Non
     assert {"sim_time", "wall", "step"} <= shown.timelines
 
 
-def test_the_stages_end_at_the_loop_latency(tmp_path: Path) -> None:
+def test_stages_sum_to_the_loop_latency(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=3.0)))
     save_rrd(run, tmp_path / "run.rrd")
     shown = RrdFile(tmp_path / "run.rrd")
@@ -37,15 +37,15 @@ def test_the_stages_end_at_the_loop_latency(tmp_path: Path) -> None:
     assert (np.diff(ends, axis=1) >= 0).all()
 
 
-def test_the_trail_ends_where_the_tool_is(tmp_path: Path) -> None:
+def test_trail_ends_at_the_tool(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=2.0)))
     save_rrd(run, tmp_path / "run.rrd")
     strips = RrdFile(tmp_path / "run.rrd").column("/scene/trail", "strips")
-    assert np.allclose(strips[:, 0, 1], tips(PARAMETERS.arm, run.states["position"]), atol=1e-6)
+    assert np.allclose(strips[:, 0, 1], tool_positions(PARAMETERS.arm, run.states["position"]), atol=1e-6)
     assert np.allclose(strips[1:, 0, 0], strips[:-1, 0, 1])
 
 
-def test_arm_parts_events_and_requests_are_there(tmp_path: Path) -> None:
+def test_file_has_arm_parts_events_and_requests(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=4.0)))
     save_rrd(run, tmp_path / "run.rrd")
     shown = RrdFile(tmp_path / "run.rrd")
@@ -61,18 +61,18 @@ def test_arm_parts_events_and_requests_are_there(tmp_path: Path) -> None:
     assert reads.sum() / 10 == pytest.approx((run.traffic["function"] == 3).sum())
 
 
-def test_lanes_hold_changes_only(tmp_path: Path) -> None:
+def test_state_timelines_contain_changes_only(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=8.0)))
     save_rrd(run, tmp_path / "run.rrd")
     shown = RrdFile(tmp_path / "run.rrd")
     magnet = run.states["magnet"]
-    assert shown.column("/lanes/magnet", "state").ravel().tolist() == [
+    assert shown.column("/states/magnet", "state").ravel().tolist() == [
         "on" if on else "off" for on in magnet[np.concatenate(([True], np.diff(magnet)))]
     ]
-    assert shown.column("/lanes/torque", "state").ravel().tolist() == ["nobody", "192.0.2.7:40001"]
+    assert shown.column("/states/torque", "state").ravel().tolist() == ["no controller", "192.0.2.7:40001"]
 
 
-def test_several_runs_stand_beside_each_other(tmp_path: Path) -> None:
+def test_several_runs_have_separate_root_paths(tmp_path: Path) -> None:
     script = Script(seconds=1.0)
     paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
     runs = [open_run(write(path, make(script), script=script, session=f"session-{path.stem}")) for path in paths]
@@ -83,7 +83,7 @@ def test_several_runs_stand_beside_each_other(tmp_path: Path) -> None:
     assert len(set(root_names([runs[0], runs[0]]))) == 2
 
 
-def test_a_recording_that_says_nothing_of_its_rig_is_drawn_as_by_default(tmp_path: Path) -> None:
+def test_recording_without_configuration_uses_defaults(tmp_path: Path) -> None:
     script = Script(seconds=1.0)
     run = open_run(write(tmp_path / "run.mcap", make(script), script=script, configured=False))
     assert (run.urdf, run.parameters_json, run.step_ns) == ("", "", 20_000_000)
@@ -91,9 +91,9 @@ def test_a_recording_that_says_nothing_of_its_rig_is_drawn_as_by_default(tmp_pat
     assert RrdFile(tmp_path / "run.rrd").rows("/scene/joints/theta1") == 50
 
 
-def test_where_it_can_not_be_written_is_said(tmp_path: Path) -> None:
+def test_unwritable_path_raises(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=0.5)))
-    with pytest.raises(InputError, match="there is no folder"):
+    with pytest.raises(InputError, match=r"folder .* does not exist"):
         save_rrd(run, tmp_path / "nowhere" / "run.rrd")
     with pytest.raises(OperationError, match="can't be written: Is a directory"):
         save_rrd(run, tmp_path)

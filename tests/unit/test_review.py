@@ -1,4 +1,4 @@
-"""Summaries, comparisons and reports: figures that a scripted run makes known, and pages that stand alone."""
+"""Summaries, comparisons and reports of scripted runs with known values; reports are self-contained pages."""
 
 import json
 import re
@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.compare import Origin, compare, find_origin, save_comparison_plot
+from hilrig_replay.analysis.compare import Origin, compare, find_origin
 from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
+from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
-from hilrig_replay.report.report import report
-from hilrig_replay.rerun_view.scene import tips
+from hilrig_replay.plots.comparison_plot import save_comparison_plot
+from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -29,12 +30,12 @@ def named(folder: Path, name: str, script: Script, made: list[Made] | None = Non
     return open_run(write(folder / f"{name}.mcap", made, script=script, session=name))
 
 
-def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
+def test_summary_has_the_scripted_motion(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=10.0)))
     summary = summarize(run)
     t = np.arange(0, 10.0, 0.001)
-    way = tips(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
-    assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(way, axis=0), axis=1).sum(), rel=0.01)
+    path = tool_positions(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
+    assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum(), rel=0.01)
     work = np.abs(run.states["effort"] * run.states["velocity"]).sum() * 0.02
     assert summary.motion.work_j == pytest.approx(work)
     assert summary.motion.saturated_share == (0, 0, 0, 0)
@@ -43,7 +44,7 @@ def test_a_summary_knows_the_motion_that_was_scripted(tmp_path: Path) -> None:
     assert (summary.placement.placed, len(summary.placement.parts)) == (0, 4)
 
 
-def test_saturation_is_the_share_of_steps_at_the_registers_limit(tmp_path: Path) -> None:
+def test_saturation_is_the_share_of_steps_at_the_limit(tmp_path: Path) -> None:
     script = Script(seconds=4.0)
     made = make(script)
     states = [one.message for one in made if isinstance(one.message, JointState)]
@@ -54,14 +55,14 @@ def test_saturation_is_the_share_of_steps_at_the_registers_limit(tmp_path: Path)
     assert summary.motion.peak_effort[2] == 32.767
 
 
-def test_a_course_stays_short_however_long_the_run(tmp_path: Path) -> None:
+def test_trajectory_length_is_bounded(tmp_path: Path) -> None:
     script = Script(seconds=10.0, step_ms=1.0, poll_ms=50.0)
     trajectory = summarize(named(tmp_path, "run", script)).trajectory
     assert TRAJECTORY_POINTS <= len(trajectory.time_s) < 2 * TRAJECTORY_POINTS
     assert np.allclose(np.diff(trajectory.time_s), trajectory.time_s[1], atol=2e-4)
 
 
-def test_a_run_does_not_differ_from_itself(tmp_path: Path) -> None:
+def test_identical_runs_have_no_differences(tmp_path: Path) -> None:
     script = Script(seconds=4.0)
     (difference,) = compare([named(tmp_path, "one", script), named(tmp_path, "two", script)]).differences
     assert difference.position_max == (0, 0, 0, 0)
@@ -70,7 +71,7 @@ def test_a_run_does_not_differ_from_itself(tmp_path: Path) -> None:
     assert (difference.loop_p50_ms, difference.loop_p99_ms) == (0, 0)
 
 
-def test_a_difference_that_was_put_in_is_found(tmp_path: Path) -> None:
+def test_inserted_difference_is_found(tmp_path: Path) -> None:
     script = Script(seconds=4.0)
     made = make(script)
     for one in made:
@@ -88,26 +89,26 @@ def test_runs_are_aligned_by_an_event(tmp_path: Path) -> None:
     late = [one for one in made if one.publish_wall_ns > made[0].publish_wall_ns + 1_000_000_000]
     runs = [named(tmp_path, "one", script), named(tmp_path, "late", script, late)]
     by_event = compare(runs, "session-end")
-    # A second is missing at the beginning of the late run: seen from the end, they are the same.
+    # The late run lacks the first second: aligned at the end, the runs are identical.
     assert (by_event.origins[0].ns - by_event.origins[1].ns) / 1e9 == pytest.approx(1.0, abs=0.03)
     assert by_event.differences[0].tool_max_mm < 2.0
     assert runs[1].time_s(runs[1].states)[-1] == pytest.approx(0.0, abs=0.03)
 
 
-def test_a_slower_controller_shows_in_the_comparison(tmp_path: Path) -> None:
+def test_comparison_shows_a_slower_controller(tmp_path: Path) -> None:
     runs = [named(tmp_path, "quick", Script(seconds=8.0)), named(tmp_path, "slow", Script(seconds=8.0, delay_ms=40.0))]
     comparison = compare(runs)
     assert comparison.differences[0].loop_p50_ms == pytest.approx(40, abs=1)
     assert json.loads(json.dumps(comparison.as_dict()))["differences"][0]["session"] == "slow"
 
 
-def test_what_can_not_be_aligned_is_said(tmp_path: Path) -> None:
+def test_missing_alignment_event_is_reported(tmp_path: Path) -> None:
     run = named(tmp_path, "run", Script(seconds=2.0))
     with pytest.raises(InputError, match="no event PART_PICKED; its events: SESSION_END, SESSION_START"):
         compare([run, run], "part_picked")
 
 
-def test_what_never_moves_is_aligned_by_its_first_command_and_without_one_by_its_start(tmp_path: Path) -> None:
+def test_motionless_run_is_aligned_by_command_or_start(tmp_path: Path) -> None:
     script, silent = Script(seconds=2.0), Script(seconds=2.0, controllers=False)
     made = make(script)
     for one in made:
@@ -124,7 +125,7 @@ def test_what_never_moves_is_aligned_by_its_first_command_and_without_one_by_its
     assert comparison.left_out == ()
 
 
-def test_the_torque_zero_that_an_edge_begins_with_is_nobody_s_command(tmp_path: Path) -> None:
+def test_initial_zero_torque_is_not_a_controller_command(tmp_path: Path) -> None:
     silent = Script(seconds=2.0, controllers=False)
     made = make(silent)
     for one in made:
@@ -144,7 +145,7 @@ def test_the_torque_zero_that_an_edge_begins_with_is_nobody_s_command(tmp_path: 
     assert summary.grade.score == 0
 
 
-def test_a_run_that_can_not_be_aligned_does_not_hide_the_others(tmp_path: Path) -> None:
+def test_run_without_alignment_is_excluded(tmp_path: Path) -> None:
     script = Script(seconds=2.0)
     cut = [
         one for one in make(script) if not (isinstance(one.message, Event) and one.message.kind == Event.SESSION_END)
@@ -156,26 +157,26 @@ def test_a_run_that_can_not_be_aligned_does_not_hide_the_others(tmp_path: Path) 
     assert ["no event SESSION_END" in reason for reason in comparison.left_out] == [True]
 
 
-def test_a_report_of_a_run_without_a_controller_says_that_nothing_closed_a_loop(tmp_path: Path) -> None:
+def test_report_of_a_run_without_a_controller(tmp_path: Path) -> None:
     silent = named(tmp_path, "silent", Script(seconds=2.0, controllers=False))
-    alone = report([silent.path])
+    alone = build_report([silent.path])
     page = _Page(alone.html)
     assert page.text.count("no closed loop: no controller wrote commands in this session") == 2
     assert alone.html.count("<img") == 2
     assert "tick lateness" in page.text
-    among = report([silent.path, named(tmp_path, "quick", Script(seconds=2.0)).path])
+    among = build_report([silent.path, named(tmp_path, "quick", Script(seconds=2.0)).path])
     assert among.left_out == ()
-    # Among equals it comes last.
+    # Among equal runs it is ranked last.
     assert [run["session"] for run in among.runs] == ["quick", "silent"]
     assert among.runs[1]["latency"]["loop_ms"] is None
 
 
-def test_one_run_is_no_comparison(tmp_path: Path) -> None:
+def test_comparison_of_one_run_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two runs or more"):
         compare([named(tmp_path, "run", Script(seconds=1.0))])
 
 
-def test_a_comparison_is_drawn(tmp_path: Path) -> None:
+def test_comparison_plot_is_written(tmp_path: Path) -> None:
     script = Script(seconds=2.0)
     comparison = compare([named(tmp_path, "one", script), named(tmp_path, "two", script)])
     save_comparison_plot(comparison, tmp_path / "both.svg")
@@ -183,7 +184,7 @@ def test_a_comparison_is_drawn(tmp_path: Path) -> None:
 
 
 class _Page(HTMLParser):
-    """Tags that are open, what a page refers to, and its text."""
+    """Open tags, references and text of a page."""
 
     VOID = frozenset({"meta", "img", "br", "!doctype"})
 
@@ -207,20 +208,26 @@ class _Page(HTMLParser):
             self.text += f"{data} "
 
 
-def test_a_report_is_one_page_that_needs_no_other(tmp_path: Path) -> None:
-    text = report([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0)).path]).html
-    page = _Page(text)
+def test_report_is_a_self_contained_page(tmp_path: Path) -> None:
+    html = build_report([named(tmp_path, "run-1", Script(seconds=8.0, delay_ms=40.0)).path]).html
+    page = _Page(html)
     assert page.open == []
-    # Two pictures, each in its two columns.
+    # Two figures with two columns each.
     assert len(page.sources) == 4
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert not re.search(r"https?://|@import|url\(|<script|<link", text)
-    for words in ("run-1", "register wait", "controlled by 192.0.2.7:40001", "0 of 4", "Not fit for latency claims"):
-        assert words in page.text, words
+    assert not re.search(r"https?://|@import|url\(|<script|<link", html)
+    for expected in (
+        "run-1",
+        "register wait",
+        "controlled by 192.0.2.7:40001",
+        "0 of 4",
+        "Not valid for latency measurements",
+    ):
+        assert expected in page.text, expected
     assert "pass between reading the positions and writing the torques" in page.text
 
 
-def test_a_class_is_ranked_with_each_run_below(tmp_path: Path) -> None:
+def test_group_report_ranks_the_runs(tmp_path: Path) -> None:
     script = Script(seconds=3.0)
     placed = make(script)
     spot = PARAMETERS.scene.trays[0].places[0]
@@ -230,40 +237,40 @@ def test_a_class_is_ranked_with_each_run_below(tmp_path: Path) -> None:
                 if part.name == "red":
                     part.x, part.y, part.z = spot[0] + 0.001, spot[1], spot[2] + PARAMETERS.scene.parts[0].size[2] / 2
     runs = [named(tmp_path, "nothing", script), named(tmp_path, "one-part", script, placed)]
-    page = _Page(report([run.path for run in runs]).html)
+    page = _Page(build_report([run.path for run in runs]).html)
     assert page.text.index("one-part") < page.text.index("nothing")
     assert "1 of 4" in page.text
     assert "1.00" in page.text
 
 
-def test_a_run_that_was_replayed_and_a_copied_file_are_named_and_honest_ones_are_not(tmp_path: Path) -> None:
+def test_report_lists_replayed_and_copied_runs(tmp_path: Path) -> None:
     script = Script(seconds=8.0, law="feedback")
     anna = named(tmp_path, "anna", script).path
     ben = named(tmp_path, "ben", replace(script, seed=2, delay_ms=3.0)).path
-    # The same torques, in a session of its own; and the same file under another name.
+    # The same torques in another session, and the same file under another name.
     replayed = named(tmp_path, "carl", script).path
     copied = tmp_path / "dora.mcap"
     copied.write_bytes(ben.read_bytes())
-    found = report([anna, ben, replayed, copied])
-    assert sorted(found.alike) == [
-        "anna and carl: 100 % of the torques that the controllers wrote are the same to the last count",
+    found = build_report([anna, ben, replayed, copied])
+    assert sorted(found.same_torques) == [
+        "anna and carl: 100 % of the torques written by the controllers are identical",
         "ben and dora: the same recording",
     ]
     page = _Page(found.html)
-    assert "The same torques" in page.text
-    assert all(pair in page.text for pair in found.alike)
-    # Each goes by the name of its file.
+    assert "Runs with the same torques" in page.text
+    assert all(pair in page.text for pair in found.same_torques)
+    # Runs are named after their files.
     assert {run["name"] for run in found.runs} == {"anna", "ben", "carl", "dora"}
     assert "dora" in page.text.split("Ranked")[0]
 
 
-def test_files_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+def test_files_with_equal_names_are_distinguished(tmp_path: Path) -> None:
     paths = []
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         paths.append(named(tmp_path / day, "anna", Script(seconds=1.0)).path)
     third = named(tmp_path, "ben", Script(seconds=1.0)).path
-    page = _Page(report([*paths, third]).html)
+    page = _Page(build_report([*paths, third]).html)
     assert set(display_names([*paths, third]).values()) == {
         str(tmp_path / "monday/anna"),
         str(tmp_path / "tuesday/anna"),
@@ -272,7 +279,7 @@ def test_files_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None
     assert all(str(path.with_suffix("")) in page.text for path in paths)
 
 
-def test_what_a_recording_says_is_text_and_never_markup(tmp_path: Path) -> None:
-    text = report([named(tmp_path, "a<b>&c", Script(seconds=1.0)).path]).html
+def test_recorded_texts_are_escaped(tmp_path: Path) -> None:
+    text = build_report([named(tmp_path, "a<b>&c", Script(seconds=1.0)).path]).html
     assert "a&lt;b&gt;&amp;c" in text
     assert "<b>&c" not in text

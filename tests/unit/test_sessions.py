@@ -1,27 +1,27 @@
-"""Sessions and files, decided without clock, bus or disk."""
+"""The session tracker: sessions, their messages and losses, without clock, bus and disk."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import pytest
 
-from hilrig_recorder.ingest.queue import Arrival
+from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import Recording
-from hilrig_recorder.ingest.sessions import BLOCK_NS, KEEPER_SILENCE_NS, LINGER_MAX_NS, SessionBook
-from hilrig_recorder.mcap_format.channels import message_head
+from hilrig_recorder.ingest.sessions import BLOCK_PERIOD_NS, DRAIN_MAX_NS, OWNER_TIMEOUT_NS, SessionTracker
+from hilrig_recorder.mcap_format.channels import parse_message_header
 from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
 from support.log_streams import LAB, MS, SECOND, FakeSource, Sent
 
-MESSAGE_HEAD_BYTES = 31
-"""Of an MCAP message record: opcode, length, channel, sequence, two times."""
+MESSAGE_HEADER_BYTES = 31
+"""Size of the header of an MCAP message record: opcode, length, channel, sequence, two times."""
 WALL = 1_767_225_600 * SECOND
 
 
 @dataclass
 class FakeFile:
-    """What one recording got."""
+    """The messages and the end of one recording."""
 
     recording: Recording
     flush: Callable[[], None]
@@ -34,23 +34,23 @@ class FakeFile:
 
     @property
     def payloads(self) -> list[bytes]:
-        """What it got, and what waits for it."""
+        """Payloads of the written and the pending messages."""
         self.flush()
-        return [record[MESSAGE_HEAD_BYTES:] for record in self.records]
+        return [record[MESSAGE_HEADER_BYTES:] for record in self.records]
 
     @property
     def log_times(self) -> list[int]:
         self.flush()
-        return [message_head(record).log_time for record in self.records]
+        return [parse_message_header(record).log_time for record in self.records]
 
 
 @dataclass
-class FakeShelf:
-    """Keeps recordings in memory."""
+class FakeStore:
+    """Stores recordings in memory."""
 
     flush: Callable[[], None] = lambda: None
     files: list[FakeFile] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)
+    rejected: list[str] = field(default_factory=list)
     losses: list[tuple[str, int, int]] = field(default_factory=list)
     sources: list[tuple[str, int]] = field(default_factory=list)
     accepts: bool = True
@@ -69,23 +69,23 @@ class FakeShelf:
         file = next(file for file in self.files if file.recording is recording)
         file.end, file.reason = end, reason
 
-    def lost(self, _recording: Recording, _source: str, key: str, transport: int, recorder: int) -> None:
+    def record_loss(self, _recording: Recording, _source: str, key: str, transport: int, recorder: int) -> None:
         self.losses.append((key, transport, recorder))
 
-    def source(self, _recording: Recording, source: str, incarnation: int) -> None:
+    def record_source(self, _recording: Recording, source: str, incarnation: int) -> None:
         self.sources.append((source, incarnation))
 
-    def refuse(self, what: str) -> None:
-        self.refused.append(what)
+    def report_rejected(self, message: str) -> None:
+        self.rejected.append(message)
 
 
-class Desk:
-    """A book, its shelf, and a time that the test moves."""
+class TrackerBench:
+    """A session tracker with a fake store, fake publishers and a manual clock."""
 
     def __init__(self, preroll_s: float = 2.0, rigs: Sequence[str] | None = None) -> None:
-        self.shelf = FakeShelf()
-        self.book = SessionBook(LAB, preroll_s, self.shelf, lambda rig: rigs is None or rig in rigs)
-        self.shelf.flush = self.book.flush
+        self.store = FakeStore()
+        self.tracker = SessionTracker(LAB, preroll_s, self.store, lambda rig: rigs is None or rig in rigs)
+        self.store.flush = self.tracker.flush
         self.now = 100 * SECOND
         self.offset = WALL
         self.sim, self.edge = FakeSource("sim/1"), FakeSource("edge/1")
@@ -94,38 +94,38 @@ class Desk:
     def wall(self) -> int:
         return self.now + self.offset
 
-    def take(self, batch: LogBatch) -> None:
-        self.book.accept(Arrival(batch, self.wall), self.now)
+    def accept(self, batch: LogBatch) -> None:
+        self.tracker.accept(ReceivedBatch(batch, self.wall), self.now)
 
     def wait(self, duration: int) -> None:
-        """Let time pass, ticking as the recorder does."""
+        """Advance the time, and tick as the recorder does."""
         end = self.now + duration
         while self.now < end:
             self.now = min(end, self.now + 100 * MS)
-            self.book.tick(self.now, self.wall)
+            self.tracker.tick(self.now, self.wall)
 
     def states(self, count: int, rig: str = "rig1", every: int = 20 * MS) -> list[Sent]:
         sent = []
         for _ in range(count):
             sent.append(self.sim.state(rig, self.wall))
-            self.take(self.sim.batch())
+            self.accept(self.sim.batch())
             self.wait(every)
         return sent
 
     def start(self, session: str = "s1", rig: str = "rig1") -> Sent:
         sent = self.edge.start(rig, session, self.wall)
         self.edge.command(rig, self.wall)
-        self.take(self.edge.batch())
+        self.accept(self.edge.batch())
         return sent
 
     def end(self, session: str = "s1", rig: str = "rig1") -> Sent:
         sent = self.edge.end(rig, session, self.wall)
-        self.take(self.edge.batch())
+        self.accept(self.edge.batch())
         return sent
 
     @property
     def file(self) -> FakeFile:
-        [file] = self.shelf.files
+        [file] = self.store.files
         return file
 
 
@@ -133,392 +133,392 @@ def payloads(*sent: Sent) -> list[bytes]:
     return [message.payload for message in sent]
 
 
-def test_a_file_begins_with_what_came_shortly_before_the_session() -> None:
-    desk = Desk()
-    states = desk.states(200)
-    start = desk.start()
-    before = desk.file.payloads[:-2]
-    assert payloads(start)[0] in desk.file.payloads
-    # Two seconds at 50 Hz, within what passes between two ticks.
+def test_file_begins_with_the_preroll() -> None:
+    bench = TrackerBench()
+    states = bench.states(200)
+    start = bench.start()
+    before = bench.file.payloads[:-2]
+    assert payloads(start)[0] in bench.file.payloads
+    # Two seconds at 50 Hz, with the tolerance of one tick.
     assert before == payloads(*states)[-len(before) :]
     assert 95 <= len(before) <= 106
 
 
-def test_without_pre_roll_a_file_begins_with_its_session() -> None:
-    desk = Desk(preroll_s=0)
-    desk.states(50)
-    desk.start()
-    assert len(desk.file.payloads) <= 3
+def test_without_preroll_file_begins_with_its_session() -> None:
+    bench = TrackerBench(preroll_s=0)
+    bench.states(50)
+    bench.start()
+    assert len(bench.file.payloads) <= 3
 
 
-def test_a_file_closes_when_the_other_stream_has_passed_the_end() -> None:
-    desk = Desk()
-    desk.states(1)
-    desk.start()
-    desk.states(10)
-    end = desk.end()
-    desk.wait(500 * MS)
-    assert desk.file.end == "", "the simulation's stream has not passed the end yet"
-    late = desk.sim.state("rig1", end.publish_ns - 5 * MS)
-    after = desk.sim.state("rig1", end.publish_ns + 15 * MS)
-    desk.take(desk.sim.batch())
-    desk.wait(200 * MS)
-    assert (desk.file.end, desk.file.reason) == ("ended", "the controller left")
-    assert payloads(late, after) == desk.file.payloads[-2:]
+def test_file_closes_when_all_streams_passed_the_end() -> None:
+    bench = TrackerBench()
+    bench.states(1)
+    bench.start()
+    bench.states(10)
+    end = bench.end()
+    bench.wait(500 * MS)
+    assert bench.file.end == "", "the simulation's stream has not passed the end yet"
+    late = bench.sim.state("rig1", end.publish_ns - 5 * MS)
+    after = bench.sim.state("rig1", end.publish_ns + 15 * MS)
+    bench.accept(bench.sim.batch())
+    bench.wait(200 * MS)
+    assert (bench.file.end, bench.file.reason) == ("ended", "the controller left")
+    assert payloads(late, after) == bench.file.payloads[-2:]
 
 
-def test_a_stream_that_never_comes_back_is_not_waited_for_without_end() -> None:
-    desk = Desk()
-    desk.states(1)
-    desk.start()
-    desk.end()
-    desk.wait(LINGER_MAX_NS - 200 * MS)
-    assert desk.file.end == ""
-    desk.wait(400 * MS)
-    assert desk.file.end == "ended"
+def test_drain_time_is_limited_for_a_silent_stream() -> None:
+    bench = TrackerBench()
+    bench.states(1)
+    bench.start()
+    bench.end()
+    bench.wait(DRAIN_MAX_NS - 200 * MS)
+    assert bench.file.end == ""
+    bench.wait(400 * MS)
+    assert bench.file.end == "ended"
 
 
-def test_a_stream_with_nothing_to_say_holds_a_file_open_for_a_second_only() -> None:
-    desk = Desk()
-    hand = FakeSource("recorder/1")
-    desk.start("s1")
-    desk.end("s1")
-    hand.start("rig1", "by-hand", desk.wall)
-    desk.take(hand.batch())
-    desk.wait(SECOND)
-    hand.end("rig1", "by-hand", desk.wall)
-    desk.take(hand.batch())
-    desk.wait(1100 * MS)
-    desk.take(desk.edge.batch(sessions=[]))
-    desk.wait(200 * MS)
-    assert [file.end for file in desk.shelf.files] == ["ended", "ended"]
+def test_idle_stream_keeps_file_open_for_one_second_only() -> None:
+    bench = TrackerBench()
+    recorder = FakeSource("recorder/1")
+    bench.start("s1")
+    bench.end("s1")
+    recorder.start("rig1", "manual", bench.wall)
+    bench.accept(recorder.batch())
+    bench.wait(SECOND)
+    recorder.end("rig1", "manual", bench.wall)
+    bench.accept(recorder.batch())
+    bench.wait(1100 * MS)
+    bench.accept(bench.edge.batch(sessions=[]))
+    bench.wait(200 * MS)
+    assert [file.end for file in bench.store.files] == ["ended", "ended"]
 
 
-def test_what_comes_long_after_the_end_is_not_in_the_file() -> None:
-    desk = Desk()
-    desk.start()
-    end = desk.end()
-    desk.sim.state("rig1", end.publish_ns - 10 * SECOND)
-    far = desk.sim.state("rig1", end.publish_ns + SECOND)
-    desk.take(desk.sim.batch())
-    assert payloads(far)[0] not in desk.file.payloads
+def test_late_messages_after_the_end_are_not_recorded() -> None:
+    bench = TrackerBench()
+    bench.start()
+    end = bench.end()
+    bench.sim.state("rig1", end.publish_ns - 10 * SECOND)
+    far = bench.sim.state("rig1", end.publish_ns + SECOND)
+    bench.accept(bench.sim.batch())
+    assert payloads(far)[0] not in bench.file.payloads
 
 
-def test_a_session_whose_start_was_not_heard_is_recorded_from_its_statement() -> None:
-    desk = Desk()
-    desk.states(3)
-    session = OpenSession(rig="rig1", session="s1", controller="192.0.2.9:1", start_wall_ns=desk.wall - 60 * SECOND)
-    desk.take(desk.edge.batch(sessions=[session]))
-    assert desk.file.recording.controller == "192.0.2.9:1"
-    assert len(desk.file.payloads) == 3
+def test_session_is_recorded_from_its_announcement() -> None:
+    bench = TrackerBench()
+    bench.states(3)
+    session = OpenSession(rig="rig1", session="s1", controller="192.0.2.9:1", start_wall_ns=bench.wall - 60 * SECOND)
+    bench.accept(bench.edge.batch(sessions=[session]))
+    assert bench.file.recording.controller == "192.0.2.9:1"
+    assert len(bench.file.payloads) == 3
 
 
-def test_a_session_that_its_keeper_no_longer_states_has_ended() -> None:
-    desk = Desk()
-    desk.start()
+def test_session_ends_when_owner_no_longer_announces_it() -> None:
+    bench = TrackerBench()
+    bench.start()
     session = OpenSession(rig="rig1", session="s1")
-    desk.take(desk.edge.batch(sessions=[session]))
+    bench.accept(bench.edge.batch(sessions=[session]))
     for _ in range(2):
-        desk.wait(500 * MS)
-        desk.take(desk.edge.batch(sessions=[]))
-    desk.wait(2 * SECOND)
-    assert desk.file.end == "ended"
-    assert "does not keep it" in desk.file.reason
+        bench.wait(500 * MS)
+        bench.accept(bench.edge.batch(sessions=[]))
+    bench.wait(2 * SECOND)
+    assert bench.file.end == "ended"
+    assert "no longer announces the session" in bench.file.reason
 
 
-def test_one_statement_that_is_older_than_the_event_ends_nothing() -> None:
-    desk = Desk()
-    desk.start()
-    desk.take(desk.edge.batch(sessions=[]))
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    desk.take(desk.edge.batch(sessions=[]))
-    desk.wait(5 * SECOND)
-    assert desk.file.end == ""
+def test_one_outdated_announcement_does_not_end_a_session() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.accept(bench.edge.batch(sessions=[]))
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    bench.accept(bench.edge.batch(sessions=[]))
+    bench.wait(5 * SECOND)
+    assert bench.file.end == ""
 
 
-def test_a_silent_keeper_ends_its_sessions_and_takes_them_up_when_it_is_back() -> None:
-    desk = Desk()
-    desk.start()
-    desk.wait(KEEPER_SILENCE_NS - SECOND)
-    assert desk.file.end == ""
-    desk.wait(2 * SECOND)
-    assert desk.file.end == "keeper lost"
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    assert [file.end for file in desk.shelf.files] == ["keeper lost", ""]
+def test_session_of_a_silent_owner_ends_and_resumes() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.wait(OWNER_TIMEOUT_NS - SECOND)
+    assert bench.file.end == ""
+    bench.wait(2 * SECOND)
+    assert bench.file.end == "keeper lost"
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    assert [file.end for file in bench.store.files] == ["keeper lost", ""]
 
 
-def test_a_session_that_is_over_does_not_come_back_with_an_old_statement() -> None:
-    desk = Desk()
-    desk.start()
-    desk.end()
-    desk.wait(LINGER_MAX_NS + SECOND)
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    assert desk.file.end == "ended"
+def test_old_announcement_does_not_reopen_an_ended_session() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.end()
+    bench.wait(DRAIN_MAX_NS + SECOND)
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    assert bench.file.end == "ended"
 
 
-def test_sessions_of_one_rig_may_overlap_and_each_gets_every_message() -> None:
-    desk = Desk()
-    desk.start("s1")
-    desk.states(5)
-    desk.start("s2")
-    both = desk.states(5)
-    desk.end("s1")
-    first, second = desk.shelf.files
+def test_overlapping_sessions_of_a_rig_get_all_messages() -> None:
+    bench = TrackerBench()
+    bench.start("s1")
+    bench.states(5)
+    bench.start("s2")
+    both = bench.states(5)
+    bench.end("s1")
+    first, second = bench.store.files
     assert payloads(*both) == [payload for payload in first.payloads if payload in payloads(*both)]
     assert payloads(*both) == [payload for payload in second.payloads if payload in payloads(*both)]
 
 
-def test_rigs_do_not_mix() -> None:
-    desk = Desk()
-    desk.start("s1", "rig1")
-    desk.start("s2", "rig2")
-    one = desk.states(3, "rig1")
-    two = desk.states(3, "rig2")
-    first, second = desk.shelf.files
+def test_messages_of_rigs_are_not_mixed() -> None:
+    bench = TrackerBench()
+    bench.start("s1", "rig1")
+    bench.start("s2", "rig2")
+    one = bench.states(3, "rig1")
+    two = bench.states(3, "rig2")
+    first, second = bench.store.files
     assert set(payloads(*one)) <= set(first.payloads)
     assert not set(payloads(*one)) & set(second.payloads)
     assert set(payloads(*two)) <= set(second.payloads)
 
 
-def test_a_recorder_of_some_rigs_passes_over_the_others() -> None:
-    desk = Desk(rigs=["rig2"])
-    desk.start("s1", "rig1")
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    desk.start("s2", "rig2")
-    desk.states(3, "rig1")
-    states = desk.states(3, "rig2")
-    assert desk.file.recording.rig == "rig2"
-    assert set(payloads(*states)) <= set(desk.file.payloads)
-    assert desk.shelf.refused == []
-    # What is missing of another recorder's rig is not lost here.
-    desk.sim.state("rig1", desk.wall)
-    desk.sim.batch()
-    desk.states(1, "rig1")
-    assert (desk.file.recording.tally.lost_transport, desk.book.lost_transport) == (0, 0)
+def test_messages_of_unassigned_rigs_are_ignored() -> None:
+    bench = TrackerBench(rigs=["rig2"])
+    bench.start("s1", "rig1")
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    bench.start("s2", "rig2")
+    bench.states(3, "rig1")
+    states = bench.states(3, "rig2")
+    assert bench.file.recording.rig == "rig2"
+    assert set(payloads(*states)) <= set(bench.file.payloads)
+    assert bench.store.rejected == []
+    # A gap in messages of an unassigned rig is not counted.
+    bench.sim.state("rig1", bench.wall)
+    bench.sim.batch()
+    bench.states(1, "rig1")
+    assert (bench.file.recording.counters.lost_transport, bench.tracker.lost_transport) == (0, 0)
 
 
-def test_what_comes_first_is_written_at_once_and_then_within_a_second_and_not_of_all_rigs_at_once() -> None:
-    desk = Desk()
+def test_first_block_is_immediate_and_later_ones_staggered() -> None:
+    bench = TrackerBench()
     rigs = [f"rig{number}" for number in range(20)]
     for rig in rigs:
-        desk.start(rig, rig)
+        bench.start(rig, rig)
 
-    def written_in_turns() -> list[int]:
+    def counts_per_phase() -> list[int]:
         for rig in rigs:
-            desk.sim.state(rig, desk.wall)
-        desk.take(desk.sim.batch())
-        written = [len(file.records) for file in desk.shelf.files]
-        turns = []
+            bench.sim.state(rig, bench.wall)
+        bench.accept(bench.sim.batch())
+        written = [len(file.records) for file in bench.store.files]
+        phases = []
         for _ in range(10):
-            desk.wait(BLOCK_NS // 10)
-            counts = [len(file.records) for file in desk.shelf.files]
-            turns.append(sum(now > before for now, before in zip(counts, written, strict=True)))
+            bench.wait(BLOCK_PERIOD_NS // 10)
+            counts = [len(file.records) for file in bench.store.files]
+            phases.append(sum(now > before for now, before in zip(counts, written, strict=True)))
             written = counts
-        return turns
+        return phases
 
-    assert written_in_turns() == [len(rigs)] + 9 * [0]
-    turns = written_in_turns()
-    assert sum(turns) == len(rigs)
-    assert max(turns) <= 4
+    assert counts_per_phase() == [len(rigs)] + 9 * [0]
+    phases = counts_per_phase()
+    assert sum(phases) == len(rigs)
+    assert max(phases) <= 4
 
 
-def test_a_gap_is_counted_as_lost_on_the_way() -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(2)
+def test_gap_is_counted_as_transport_loss() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(2)
     for _ in range(7):
-        desk.sim.state("rig1", desk.wall)
-    desk.sim.batch()
-    desk.states(1)
-    tally = desk.file.recording.tally
-    assert (tally.lost_transport, tally.lost_recorder, tally.lost_batches) == (7, 0, 1)
-    assert desk.shelf.losses == [(STATE.key(LAB, "rig1"), 7, 0)]
+        bench.sim.state("rig1", bench.wall)
+    bench.sim.batch()
+    bench.states(1)
+    counters = bench.file.recording.counters
+    assert (counters.lost_transport, counters.lost_recorder, counters.lost_batches) == (7, 0, 1)
+    assert bench.store.losses == [(STATE.key(LAB, "rig1"), 7, 0)]
 
 
 @pytest.mark.parametrize(("waited", "set_back", "counted"), [(1, 0, 7), (4, 0, 0), (4, 3600, 0)])
-def test_a_gap_shortly_before_a_session_is_its_too(waited: int, set_back: int, counted: int) -> None:
-    desk = Desk()
-    desk.states(2)
+def test_gap_within_the_preroll_is_counted(waited: int, set_back: int, counted: int) -> None:
+    bench = TrackerBench()
+    bench.states(2)
     for _ in range(7):
-        desk.sim.state("rig1", desk.wall)
-    desk.sim.batch()
-    desk.states(1)
-    desk.offset -= set_back * SECOND
-    desk.states(50 * waited)
-    desk.start()
-    assert desk.file.recording.tally.lost_transport == counted
+        bench.sim.state("rig1", bench.wall)
+    bench.sim.batch()
+    bench.states(1)
+    bench.offset -= set_back * SECOND
+    bench.states(50 * waited)
+    bench.start()
+    assert bench.file.recording.counters.lost_transport == counted
 
 
-def test_a_gap_before_the_first_message_of_a_fresh_run_is_counted() -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(2)
-    desk.sim = FakeSource("sim/1", incarnation=2)
-    desk.sim.state("rig1", desk.wall)
-    desk.sim.batch()
-    desk.states(1)
-    assert desk.file.recording.tally.lost_transport == 1
+def test_gap_before_first_message_after_a_restart_is_counted() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(2)
+    bench.sim = FakeSource("sim/1", incarnation=2)
+    bench.sim.state("rig1", bench.wall)
+    bench.sim.batch()
+    bench.states(1)
+    assert bench.file.recording.counters.lost_transport == 1
 
 
-def test_another_run_of_a_service_begins_its_numbers_anew() -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(5)
-    desk.sim = FakeSource("sim/1", incarnation=2)
-    again = desk.states(5)
-    tally = desk.file.recording.tally
-    assert (tally.lost_transport, tally.lost_batches) == (0, 0)
-    assert set(payloads(*again)) <= set(desk.file.payloads)
-    assert desk.shelf.sources == [("edge/1", 1), ("sim/1", 1), ("sim/1", 2)]
+def test_restarted_service_has_new_sequence_numbers() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(5)
+    bench.sim = FakeSource("sim/1", incarnation=2)
+    again = bench.states(5)
+    counters = bench.file.recording.counters
+    assert (counters.lost_transport, counters.lost_batches) == (0, 0)
+    assert set(payloads(*again)) <= set(bench.file.payloads)
+    assert bench.store.sources == [("edge/1", 1), ("sim/1", 1), ("sim/1", 2)]
 
 
-def test_what_comes_twice_is_recorded_once() -> None:
-    desk = Desk()
-    desk.start()
-    desk.sim.state("rig1", desk.wall)
-    batch = desk.sim.batch()
-    desk.take(batch)
-    desk.take(batch)
-    assert len(desk.file.payloads) == 3
+def test_duplicate_batch_is_recorded_once() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.sim.state("rig1", bench.wall)
+    batch = bench.sim.batch()
+    bench.accept(batch)
+    bench.accept(batch)
+    assert len(bench.file.payloads) == 3
 
 
-def test_two_senders_on_one_key_have_numbers_of_their_own() -> None:
-    desk = Desk()
-    desk.start()
-    event = Event(rig="rig1", kind=Event.LIMIT_HIT, text="joint 1 on its stop")
+def test_publishers_on_one_key_have_separate_sequences() -> None:
+    bench = TrackerBench()
+    bench.start()
+    event = Event(rig="rig1", kind=Event.LIMIT_HIT, text="joint 1 at its limit")
     for _ in range(3):
-        desk.sim.put(EVENT, "rig1", event, desk.wall)
-        desk.take(desk.sim.batch())
-    assert desk.file.recording.tally.lost_transport == 0
-    assert len(desk.file.payloads) == 5
+        bench.sim.put(EVENT, "rig1", event, bench.wall)
+        bench.accept(bench.sim.batch())
+    assert bench.file.recording.counters.lost_transport == 0
+    assert len(bench.file.payloads) == 5
 
 
-def test_overruns_are_counted_from_their_events() -> None:
-    desk = Desk()
-    desk.start("s1", "rig1")
-    desk.start("s2", "rig2")
-    desk.states(1, "rig1")
-    desk.states(1, "rig2")
+def test_overruns_are_counted_from_events() -> None:
+    bench = TrackerBench()
+    bench.start("s1", "rig1")
+    bench.start("s2", "rig2")
+    bench.states(1, "rig1")
+    bench.states(1, "rig2")
     whole = Event(kind=Event.OVERRUN)
     whole.overrun_data.missed_steps = 3
     one = Event(kind=Event.OVERRUN, rig="rig2")
     one.overrun_data.missed_steps = 2
-    desk.sim.put(EVENT, "sim", whole, desk.wall)
-    desk.sim.put(EVENT, "rig2", one, desk.wall)
-    desk.take(desk.sim.batch())
-    first, second = (file.recording.tally for file in desk.shelf.files)
+    bench.sim.put(EVENT, "sim", whole, bench.wall)
+    bench.sim.put(EVENT, "rig2", one, bench.wall)
+    bench.accept(bench.sim.batch())
+    first, second = (file.recording.counters for file in bench.store.files)
     assert (first.overruns, first.missed_steps) == (1, 3)
     assert (second.overruns, second.missed_steps) == (2, 5)
 
 
 @pytest.mark.parametrize("step", [2 * SECOND, -2 * SECOND])
-def test_a_clock_that_is_set_is_counted_once(step: int) -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(1000)
-    desk.offset += step
-    desk.states(20)
-    assert desk.file.recording.tally.clock_steps == 1
+def test_clock_step_is_counted_once(step: int) -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(1000)
+    bench.offset += step
+    bench.states(20)
+    assert bench.file.recording.counters.clock_steps == 1
 
 
 @pytest.mark.parametrize("step", [2 * SECOND, -2 * SECOND])
-def test_a_sender_whose_clock_is_set_is_noticed(step: int) -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(1000)
+def test_clock_step_of_a_publisher_is_detected(step: int) -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(1000)
     for _ in range(20):
-        desk.sim.state("rig1", desk.wall + step)
-        desk.take(desk.sim.batch())
-        desk.wait(20 * MS)
-    assert desk.file.recording.tally.clock_steps == 1
+        bench.sim.state("rig1", bench.wall + step)
+        bench.accept(bench.sim.batch())
+        bench.wait(20 * MS)
+    assert bench.file.recording.counters.clock_steps == 1
 
 
-def test_an_outage_is_no_clock_step() -> None:
-    desk = Desk()
-    desk.start()
-    desk.states(1000)
+def test_outage_is_not_a_clock_step() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(1000)
     for _ in range(250):
-        desk.sim.state("rig1", desk.wall)
-        desk.wait(20 * MS)
-    desk.take(desk.sim.batch())
-    desk.states(50)
-    assert desk.file.recording.tally.clock_steps == 0
+        bench.sim.state("rig1", bench.wall)
+        bench.wait(20 * MS)
+    bench.accept(bench.sim.batch())
+    bench.states(50)
+    assert bench.file.recording.counters.clock_steps == 0
 
 
-def test_a_continued_session_leaves_out_what_the_file_before_holds_and_counts_what_neither_has() -> None:
-    desk = Desk()
-    known = [desk.sim.state("rig1", desk.wall + number) for number in range(4)]
-    desk.shelf.seen = {(1, message.sequence, message.publish_ns) for message in known}
-    desk.shelf.last = {1: (4, known[-1].publish_ns)}
-    desk.take(desk.sim.batch())
+def test_continued_session_skips_duplicates_and_counts_the_gap() -> None:
+    bench = TrackerBench()
+    known = [bench.sim.state("rig1", bench.wall + number) for number in range(4)]
+    bench.store.seen = {(1, message.sequence, message.publish_ns) for message in known}
+    bench.store.last = {1: (4, known[-1].publish_ns)}
+    bench.accept(bench.sim.batch())
     for number in range(4, 7):
-        desk.sim.state("rig1", desk.wall + number)
-    desk.sim.batch()
-    desk.sim._sequences[STATE.key(LAB, "rig1")] = 7
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    assert desk.file.payloads == []
-    # A recorder that starts anew knows of no number before: the gap is seen against the earlier file.
-    desk.sim.name = "sim/2"
-    desk.wait(SECOND)
-    new = desk.states(1)
-    assert desk.file.payloads == payloads(*new)
-    assert desk.file.recording.tally.lost_recorder == 3
+        bench.sim.state("rig1", bench.wall + number)
+    bench.sim.batch()
+    bench.sim._sequences[STATE.key(LAB, "rig1")] = 7
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    assert bench.file.payloads == []
+    # A restarted recorder knows no earlier sequence numbers. The gap is detected by the previous segment.
+    bench.sim.name = "sim/2"
+    bench.wait(SECOND)
+    new = bench.states(1)
+    assert bench.file.payloads == payloads(*new)
+    assert bench.file.recording.counters.lost_recorder == 3
 
 
 @pytest.mark.parametrize("opened_before_the_gap", [True, False])
-def test_a_gap_between_two_files_that_was_seen_on_the_stream_is_counted_once(opened_before_the_gap: bool) -> None:
-    desk = Desk()
-    known = [desk.sim.state("rig1", desk.wall + number) for number in range(4)]
-    desk.shelf.seen = {(1, message.sequence, message.publish_ns) for message in known}
-    desk.shelf.last = {1: (4, known[-1].publish_ns)}
-    desk.take(desk.sim.batch())
+def test_gap_between_segments_is_counted_once(opened_before_the_gap: bool) -> None:
+    bench = TrackerBench()
+    known = [bench.sim.state("rig1", bench.wall + number) for number in range(4)]
+    bench.store.seen = {(1, message.sequence, message.publish_ns) for message in known}
+    bench.store.last = {1: (4, known[-1].publish_ns)}
+    bench.accept(bench.sim.batch())
     for lost in range(3):
-        desk.sim.state("rig1", desk.wall + 4 + lost)
-    desk.sim.batch()
-    desk.sim.sequence -= 1
+        bench.sim.state("rig1", bench.wall + 4 + lost)
+    bench.sim.batch()
+    bench.sim.sequence -= 1
     session = OpenSession(rig="rig1", session="s1")
     if opened_before_the_gap:
-        desk.take(desk.edge.batch(sessions=[session]))
-    wanted = desk.sim.state("rig1", desk.wall + 7)
-    desk.take(desk.sim.batch())
+        bench.accept(bench.edge.batch(sessions=[session]))
+    wanted = bench.sim.state("rig1", bench.wall + 7)
+    bench.accept(bench.sim.batch())
     if not opened_before_the_gap:
-        desk.take(desk.edge.batch(sessions=[session]))
-    assert desk.file.payloads == payloads(wanted)
-    tally = desk.file.recording.tally
-    assert (tally.lost_transport, tally.lost_recorder) == (3, 0)
+        bench.accept(bench.edge.batch(sessions=[session]))
+    assert bench.file.payloads == payloads(wanted)
+    counters = bench.file.recording.counters
+    assert (counters.lost_transport, counters.lost_recorder) == (3, 0)
 
 
-def test_what_is_repeated_from_before_what_is_known_of_the_file_before_is_left_out() -> None:
-    desk = Desk()
-    desk.shelf.seen = set()
-    desk.shelf.horizon_ns = {1: desk.wall}
-    desk.sim.state("rig1", desk.wall - 1)
-    wanted = desk.sim.state("rig1", desk.wall)
-    desk.take(desk.sim.batch())
-    desk.take(desk.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
-    assert desk.file.payloads == payloads(wanted)
+def test_messages_before_the_horizon_are_skipped() -> None:
+    bench = TrackerBench()
+    bench.store.seen = set()
+    bench.store.horizon_ns = {1: bench.wall}
+    bench.sim.state("rig1", bench.wall - 1)
+    wanted = bench.sim.state("rig1", bench.wall)
+    bench.accept(bench.sim.batch())
+    bench.accept(bench.edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
+    assert bench.file.payloads == payloads(wanted)
 
 
-def test_a_session_that_can_not_be_recorded_is_tried_again() -> None:
-    desk = Desk()
-    desk.shelf.accepts = False
+def test_session_that_cannot_be_opened_is_retried() -> None:
+    bench = TrackerBench()
+    bench.store.accepts = False
     session = OpenSession(rig="rig1", session="s1")
-    desk.take(desk.edge.batch(sessions=[session]))
-    desk.shelf.accepts = True
-    desk.take(desk.edge.batch(sessions=[session]))
-    assert desk.shelf.files == []
-    desk.wait(11 * SECOND)
-    desk.take(desk.edge.batch(sessions=[session]))
-    assert desk.file.end == ""
+    bench.accept(bench.edge.batch(sessions=[session]))
+    bench.store.accepts = True
+    bench.accept(bench.edge.batch(sessions=[session]))
+    assert bench.store.files == []
+    bench.wait(11 * SECOND)
+    bench.accept(bench.edge.batch(sessions=[session]))
+    assert bench.file.end == ""
 
 
-def test_a_recorder_that_stops_closes_everything() -> None:
-    desk = Desk()
-    desk.start("s1", "rig1")
-    desk.start("s2", "rig2")
-    desk.end("s2", "rig2")
-    desk.book.stop()
-    assert [file.end for file in desk.shelf.files] == ["recorder stopped", "ended"]
+def test_stop_closes_all_recordings() -> None:
+    bench = TrackerBench()
+    bench.start("s1", "rig1")
+    bench.start("s2", "rig2")
+    bench.end("s2", "rig2")
+    bench.tracker.stop()
+    assert [file.end for file in bench.store.files] == ["recorder stopped", "ended"]
 
 
 @pytest.mark.parametrize(
@@ -532,22 +532,22 @@ def test_a_recorder_that_stops_closes_everything() -> None:
         ("s1", ".."),
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(session: str, rig: str) -> None:
-    desk = Desk()
+def test_invalid_session_and_rig_names_are_rejected(session: str, rig: str) -> None:
+    bench = TrackerBench()
     event = Event(rig=rig, session=session, kind=Event.SESSION_START)
-    desk.edge.put(EVENT, "rig1", event, desk.wall)
-    desk.take(desk.edge.batch())
-    assert desk.shelf.files == []
-    assert len(desk.shelf.refused) == 1
+    bench.edge.put(EVENT, "rig1", event, bench.wall)
+    bench.accept(bench.edge.batch())
+    assert bench.store.files == []
+    assert len(bench.store.rejected) == 1
 
 
-def test_what_is_not_understood_is_told_once_and_stops_nothing() -> None:
-    desk = Desk()
-    desk.start()
+def test_unknown_input_is_reported_once() -> None:
+    bench = TrackerBench()
+    bench.start()
     batch = LogBatch(source="edge/1", incarnation=1, sequence=2)
     keys = ("hil/lab/rig1/nothing", "hil/elsewhere/rig1/state", "hil/lab/rig1/config", "hil/lab/rig2/event")
     put_entries(batch, [(key, sequence, 0, b"\xff\xff") for sequence in (1, 2) for key in keys])
-    desk.take(batch)
-    states = desk.states(2)
-    assert len(desk.shelf.refused) == 4
-    assert set(payloads(*states)) <= set(desk.file.payloads)
+    bench.accept(batch)
+    states = bench.states(2)
+    assert len(bench.store.rejected) == 4
+    assert set(payloads(*states)) <= set(bench.file.payloads)

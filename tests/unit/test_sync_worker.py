@@ -1,4 +1,4 @@
-"""What is synced, when, and how files end, on the disk's own thread."""
+"""The sync worker: which files are synced, when, and how files are finished."""
 
 import errno
 import threading
@@ -9,18 +9,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilrig_recorder.storage.sync_worker import Disk
+from hilrig_recorder.storage.sync_worker import SyncWorker
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from support.waiting import PATIENT_S, eventually
 
 
 @dataclass(eq=False)
 class FakeWriter:
-    """As much of a writer as the disk's thread sees."""
+    """The members of a writer that the sync worker uses."""
 
     size: int = 0
     path: Path = Path("run.mcap")
-    part: Path = Path("run.mcap.part")
+    temporary_path: Path = Path("run.mcap.part")
     sync_s: float = 0.0
     synced: list[int] = field(default_factory=list)
     done: list[str] = field(default_factory=list)
@@ -44,115 +44,115 @@ class FakeWriter:
         self.done.append("close")
 
 
-class Heard:
-    """What the disk's thread says."""
+class Results:
+    """The calls of the worker's callbacks."""
 
     def __init__(self) -> None:
-        self.troubles: list[Any] = []
-        self.ended: list[Any] = []
+        self.sync_errors: list[Any] = []
+        self.finished: list[Any] = []
         self.threads: set[threading.Thread] = set()
 
-    def on_trouble(self, writer: Any, error: OSError) -> None:
-        self.troubles.append((writer, error))
+    def on_sync_error(self, writer: Any, error: OSError) -> None:
+        self.sync_errors.append((writer, error))
 
-    def on_ended(self, writer: Any, error: OSError | None) -> None:
-        self.ended.append((writer, error))
+    def on_finished(self, writer: Any, error: OSError | None) -> None:
+        self.finished.append((writer, error))
         self.threads.add(threading.current_thread())
 
 
 @contextmanager
-def disk() -> Iterator[tuple[Any, Heard]]:
-    heard = Heard()
-    thread = Disk(SYSTEM_CLOCK, heard.on_trouble, heard.on_ended)
+def running_worker() -> Iterator[tuple[Any, Results]]:
+    results = Results()
+    worker = SyncWorker(SYSTEM_CLOCK, results.on_sync_error, results.on_finished)
     try:
-        yield thread, heard
+        yield worker, results
     finally:
-        assert thread.close(5.0)
+        assert worker.close(5.0)
 
 
-def test_what_was_written_is_synced_soon_and_only_then() -> None:
+def test_only_files_with_new_data_are_synced() -> None:
     writer, idle = FakeWriter(), FakeWriter()
-    with disk() as (thread, heard):
-        thread.follow(writer)
-        thread.follow(idle)
+    with running_worker() as (worker, results):
+        worker.follow(writer)
+        worker.follow(idle)
         for size in (1000, 2000):
             writer.size = size
             begin_s = time.monotonic()
             eventually(lambda size=size: size in writer.synced)
-            soon_s = time.monotonic() - begin_s
-        # It was written to twice.
+            duration_s = time.monotonic() - begin_s
+        # There were two writes.
         assert writer.synced == [1000, 2000]
         assert idle.synced == []
-        assert soon_s < 5
-    assert heard.troubles == []
+        assert duration_s < 5
+    assert results.sync_errors == []
 
 
-def test_a_file_ends_on_the_disk_s_thread_and_then_has_its_name() -> None:
+def test_file_is_finished_and_renamed_on_the_worker_thread() -> None:
     writer = FakeWriter()
-    with disk() as (thread, heard):
-        thread.follow(writer)
-        thread.end(writer, writer.finish)
-        eventually(lambda: heard.ended)
-        assert heard.ended == [(writer, None)]
+    with running_worker() as (worker, results):
+        worker.follow(writer)
+        worker.finish(writer, writer.finish)
+        eventually(lambda: results.finished)
+        assert results.finished == [(writer, None)]
         assert writer.done == ["finish", "publish durably"]
-        assert heard.threads != {threading.current_thread()}
-        # Nobody syncs it any more.
+        assert results.threads != {threading.current_thread()}
+        # A finished file is not synced any more.
         writer.size = 1
         other = FakeWriter(size=1)
-        thread.follow(other)
+        worker.follow(other)
         eventually(lambda: other.synced)
         assert writer.synced == []
 
 
-def test_a_file_that_can_not_be_finished_is_let_go_and_told() -> None:
+def test_unfinishable_file_is_closed_and_reported() -> None:
     writer = FakeWriter(failure=OSError(errno.EIO, "Input/output error"), size=1)
-    with disk() as (thread, heard):
-        thread.follow(writer)
-        eventually(lambda: heard.troubles)
-        thread.end(writer, writer.finish)
-        eventually(lambda: heard.ended)
-    assert heard.troubles == [(writer, writer.failure)]
-    assert heard.ended == [(writer, writer.failure)]
+    with running_worker() as (worker, results):
+        worker.follow(writer)
+        eventually(lambda: results.sync_errors)
+        worker.finish(writer, writer.finish)
+        eventually(lambda: results.finished)
+    assert results.sync_errors == [(writer, writer.failure)]
+    assert results.finished == [(writer, writer.failure)]
     assert writer.done == ["close"]
 
 
-def test_a_slow_disk_syncs_and_ends_files_in_turns() -> None:
+def test_slow_disk_alternates_syncing_and_finishing() -> None:
     writers = [FakeWriter(size=1, sync_s=0.02) for _ in range(200)]
     ending = [FakeWriter() for _ in range(5)]
-    with disk() as (thread, heard):
+    with running_worker() as (worker, results):
         for writer in writers:
-            thread.follow(writer)
+            worker.follow(writer)
         eventually(lambda: any(writer.synced for writer in writers))
         for writer in ending:
-            thread.end(writer, writer.finish)
-        eventually(lambda: len(heard.ended) == len(ending))
+            worker.finish(writer, writer.finish)
+        eventually(lambda: len(results.finished) == len(ending))
         assert not all(writer.synced for writer in writers)
 
 
-def test_how_long_it_takes_until_all_is_safe_is_known() -> None:
+def test_sync_delay_is_measured() -> None:
     writers = [FakeWriter(size=1, sync_s=0.1) for _ in range(3)]
-    with disk() as (thread, _):
+    with running_worker() as (worker, _):
         for writer in writers:
-            thread.follow(writer)
-        eventually(lambda: thread.behind_s > 0.1, every_s=0.01)
+            worker.follow(writer)
+        eventually(lambda: worker.sync_delay_s > 0.1, every_s=0.01)
         eventually(lambda: all(writer.synced for writer in writers))
-        # Nothing is written any more.
-        eventually(lambda: thread.behind_s < 0.1)
+        # No new data.
+        eventually(lambda: worker.sync_delay_s < 0.1)
 
 
-def test_at_the_end_every_file_gets_its_name_if_need_be_without_syncing() -> None:
+def test_shutdown_renames_every_file_without_sync_if_late() -> None:
     slow = FakeWriter()
-    quick = FakeWriter()
-    heard = Heard()
-    thread = Disk(SYSTEM_CLOCK, heard.on_trouble, heard.on_ended)
-    begun = threading.Event()
+    fast = FakeWriter()
+    results = Results()
+    worker = SyncWorker(SYSTEM_CLOCK, results.on_sync_error, results.on_finished)
+    started = threading.Event()
 
     def finish_slowly() -> None:
-        begun.set()
+        started.set()
         time.sleep(0.3)
 
-    thread.end(slow, finish_slowly)  # type: ignore[arg-type]
-    thread.end(quick, quick.finish)  # type: ignore[arg-type]
-    assert begun.wait(PATIENT_S)
-    assert thread.close(0.05)
-    assert (slow.done, quick.done) == (["publish"], ["finish", "publish"])
+    worker.finish(slow, finish_slowly)  # type: ignore[arg-type]
+    worker.finish(fast, fast.finish)  # type: ignore[arg-type]
+    assert started.wait(PATIENT_S)
+    assert worker.close(0.05)
+    assert (slow.done, fast.done) == (["publish"], ["finish", "publish"])

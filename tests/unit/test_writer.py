@@ -1,4 +1,4 @@
-"""The file that the recorder writes, judged by the stock MCAP reader."""
+"""Files of the recording writer, read by the mcap library."""
 
 import errno
 import os
@@ -21,15 +21,15 @@ from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, CHANNELS, enc
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.scan import scan
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_schemas import JointState
 
 START = 1_767_225_600_000_000_000
 STATE, COMMAND = CHANNEL_OF_TOPIC["state"], CHANNEL_OF_TOPIC["command"]
 
 
-def fill(writer: RunWriter, count: int, seed: int = 1, size: int = 150) -> list[tuple[int, int, int, bytes]]:
-    """Add messages of random bytes; gives (channel, sequence, log time, bytes) of each."""
+def fill(writer: RecordingWriter, count: int, seed: int = 1, size: int = 150) -> list[tuple[int, int, int, bytes]]:
+    """Add messages of random bytes; returns (channel, sequence, log time, bytes) of each."""
     rng = random.Random(seed)
     added = []
     for number in range(count):
@@ -49,13 +49,13 @@ def read(path: Path) -> list[tuple[int, int, int, bytes]]:
         ]
 
 
-def test_the_stock_reader_finds_everything(tmp_path: Path) -> None:
+def test_mcap_library_reads_everything(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     writer.add_metadata("about", {"rig": "rig1"})
     added = fill(writer, 2_000)
     writer.add_attachment("a.txt", "text/plain", b"hello", log_time=START)
-    writer.finish(lambda: {"last": {"words": "bye"}})
+    writer.finish(lambda: {"last": {"key": "value"}})
     assert part_path(path).exists()
     assert not path.exists()
     writer.publish()
@@ -73,27 +73,27 @@ def test_the_stock_reader_finds_everything(tmp_path: Path) -> None:
         assert (statistics.chunk_count, statistics.channel_count) == (len(summary.chunk_indexes), len(CHANNELS))
         assert {record.name: record.metadata for record in reader.iter_metadata()} == {
             "about": {"rig": "rig1"},
-            "last": {"words": "bye"},
+            "last": {"key": "value"},
         }
         assert [(item.name, item.data) for item in reader.iter_attachments()] == [("a.txt", b"hello")]
     with path.open("rb") as stream:
         records = list(StreamReader(stream, validate_crcs=True).records)
     assert type(records[-1]).__name__ == "Footer"
-    # A checksum of zero stands for none, and every reader would be content with it.
+    # A checksum of zero means "no checksum", which every reader accepts.
     with path.open("rb") as stream:
-        whole = list(StreamReader(stream, emit_chunks=True).records)
-    chunks = [record for record in whole if isinstance(record, Chunk)]
+        all_records = list(StreamReader(stream, emit_chunks=True).records)
+    chunks = [record for record in all_records if isinstance(record, Chunk)]
     assert [chunk.uncompressed_crc for chunk in chunks] == [
         zlib.crc32(zstandard.decompress(chunk.data, chunk.uncompressed_size)) for chunk in chunks
     ]
     assert len(chunks) > 1
-    assert isinstance(whole[-1], Footer)
-    assert whole[-1].summary_crc
+    assert isinstance(all_records[-1], Footer)
+    assert all_records[-1].summary_crc
 
 
-def test_the_index_leads_to_the_messages_of_a_time(tmp_path: Path) -> None:
+def test_index_finds_messages_of_a_time_range(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     added = fill(writer, 3_000)
     writer.finish()
     writer.publish()
@@ -110,7 +110,7 @@ def test_the_index_leads_to_the_messages_of_a_time(tmp_path: Path) -> None:
 
 def test_chunks_are_at_most_64_kib(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     fill(writer, 2_000, size=700)
     fill(writer, 3, size=CHUNK_BYTES * 2)
     writer.finish()
@@ -119,16 +119,16 @@ def test_chunks_are_at_most_64_kib(tmp_path: Path) -> None:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     sizes = [index.uncompressed_size for index in summary.chunk_indexes]
-    assert sum(size > CHUNK_BYTES for size in sizes) == 3, "only a message that is larger makes a chunk that is larger"
+    assert sum(size > CHUNK_BYTES for size in sizes) == 3, "only a larger message makes a larger chunk"
     assert len(sizes) > 20
 
 
-def test_a_recorded_state_decodes_with_the_schema_in_the_file(tmp_path: Path) -> None:
+def test_recorded_state_decodes_with_the_schema_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     state = JointState(rig="rig1", step=7, position=[1, 2, 3, 4])
     with_parts = JointState(rig="rig1", step=8)
     with_parts.parts.add(name="bolt", x=0.5)
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     for message in (state, with_parts):
         writer.add(encode_message(STATE, message.step, START, START, message.SerializeToString()))
     writer.finish()
@@ -141,16 +141,16 @@ def test_a_recorded_state_decodes_with_the_schema_in_the_file(tmp_path: Path) ->
     assert decoded[1].parts[0].name == "bolt"
 
 
-def test_an_empty_recording_is_a_whole_file(tmp_path: Path) -> None:
+def test_empty_recording_is_a_complete_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     writer.finish()
     writer.publish()
     assert read(path) == []
 
 
-def test_every_whole_chunk_is_on_the_disk_before_the_file_is_finished(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_chunks_are_readable_before_the_file_is_finished(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
     added = fill(writer, 500)
     writer.close_chunk()
     messages = []
@@ -160,28 +160,28 @@ def test_every_whole_chunk_is_on_the_disk_before_the_file_is_finished(tmp_path: 
             if isinstance(record, Message):
                 messages.append(record.data)
 
-    with writer.part.open("rb") as stream, pytest.raises(EndOfFile):
+    with writer.temporary_path.open("rb") as stream, pytest.raises(EndOfFile):
         read_all(stream)
     writer.discard()
     assert messages == [data for _, _, _, data in added]
 
 
-def test_a_file_is_never_written_over(tmp_path: Path) -> None:
-    first = RunWriter(tmp_path / "run.mcap")
+def test_open_recording_is_not_overwritten(tmp_path: Path) -> None:
+    first = RecordingWriter(tmp_path / "run.mcap")
     with pytest.raises(FileExistsError):
-        RunWriter(tmp_path / "run.mcap")
+        RecordingWriter(tmp_path / "run.mcap")
     first.discard()
 
 
 class SmallDisk:
-    """Stands before a file and has room for so many bytes."""
+    """Wraps a file and limits its size to `space` bytes."""
 
-    def __init__(self, file: FileIO, room: int) -> None:
+    def __init__(self, file: FileIO, space: int) -> None:
         self._file = file
-        self.room = room
+        self.space = space
 
     def write(self, data: memoryview) -> int:
-        left = self.room - self._file.tell()
+        left = self.space - self._file.tell()
         if left <= 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         return self._file.write(data[:left]) or 0
@@ -190,12 +190,12 @@ class SmallDisk:
         return getattr(self._file, name)
 
 
-@pytest.mark.parametrize("room", [*range(11_000, 21_000, 613), 100_000, 200_000])
-def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
+@pytest.mark.parametrize("space", [*range(11_000, 21_000, 613), 100_000, 200_000])
+def test_file_on_a_full_disk_is_finished(tmp_path: Path, space: int) -> None:
     path = tmp_path / "run.mcap"
     failures: list[OSError] = []
-    writer = RunWriter(path)
-    writer._file = SmallDisk(writer._file, room)  # type: ignore[assignment]
+    writer = RecordingWriter(path)
+    writer._file = SmallDisk(writer._file, space)  # type: ignore[assignment]
     added = []
     number = 0
     while not failures:
@@ -205,16 +205,16 @@ def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
             writer.close_chunk()
         except OSError as error:
             failures.append(error)
-    writer.finish(lambda: {"hilrig.summary": {"lost_recorder": str(writer.given_up)}})
+    writer.finish(lambda: {"hilrig.summary": {"lost_recorder": str(writer.dropped_count)}})
     writer.publish()
-    assert path.stat().st_size <= room
+    assert path.stat().st_size <= space
     found = read(path)
     assert [data for *_, data in found] == [data for *_, data in added[: len(found)]]
-    assert len(found) + writer.given_up == len(added)
+    assert len(found) + writer.dropped_count == len(added)
     with path.open("rb") as stream:
         reader = make_reader(stream)
-        [words] = [record.metadata for record in reader.iter_metadata()]
-        assert words == {"lost_recorder": str(writer.given_up)}
+        [summary_metadata] = [record.metadata for record in reader.iter_metadata()]
+        assert summary_metadata == {"lost_recorder": str(writer.dropped_count)}
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
@@ -222,49 +222,49 @@ def test_on_a_full_disk_the_file_ends_whole(tmp_path: Path, room: int) -> None:
         assert sum(summary.statistics.channel_message_counts.values()) == len(found)
 
 
-def test_what_did_not_fit_is_written_when_there_is_room_again(tmp_path: Path) -> None:
+def test_unwritten_messages_are_written_when_space_is_free(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     disk = SmallDisk(writer._file, writer.size)
     writer._file = disk  # type: ignore[assignment]
     added = fill(writer, 10)
     with pytest.raises(OSError, match="No space left"):
         writer.close_chunk()
-    disk.room = 1 << 20
+    disk.space = 1 << 20
     writer.finish()
     writer.publish()
-    assert (read(path), writer.given_up) == (added, 0)
+    assert (read(path), writer.dropped_count) == (added, 0)
 
 
-def test_what_is_known_at_the_beginning_stands_in_the_first_write(tmp_path: Path) -> None:
+def test_initial_metadata_is_in_the_first_write(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path, metadata=(Metadata("whose", {"rig": "rig1"}), Metadata("more", {})))
-    assert metadata_in(writer.part.read_bytes()) == {"whose": {"rig": "rig1"}, "more": {}}
+    writer = RecordingWriter(path, metadata=(Metadata("owner", {"rig": "rig1"}), Metadata("more", {})))
+    assert metadata_in(writer.temporary_path.read_bytes()) == {"owner": {"rig": "rig1"}, "more": {}}
     added = fill(writer, 10)
     writer.finish()
     writer.publish()
     assert read(path) == added
     with path.open("rb") as stream:
         found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-    assert found == {"whose": {"rig": "rig1"}, "more": {}}
+    assert found == {"owner": {"rig": "rig1"}, "more": {}}
 
 
 def metadata_in(content: bytes) -> dict[str, dict[str, str]]:
     return {item.name: item.metadata for _, item in scan(content) if isinstance(item, Metadata)}
 
 
-def test_with_no_room_for_anything_it_says_so(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_finish_without_any_space_raises(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
     writer._file = SmallDisk(writer._file, writer.size + 100)  # type: ignore[assignment]
     fill(writer, 10)
     with pytest.raises(OSError, match="No space left"):
         writer.finish()
-    assert writer.given_up == 10
+    assert writer.dropped_count == 10
     writer.discard()
 
 
-def test_a_recording_takes_no_memory_however_long_it_grows(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
 
     def write(chunks: int) -> None:
         for number in range(chunks):
@@ -285,22 +285,22 @@ def test_a_recording_takes_no_memory_however_long_it_grows(tmp_path: Path) -> No
     assert len(read(tmp_path / "run.mcap")) == 2_200
 
 
-def test_a_file_that_somebody_cut_meanwhile_is_not_finished(tmp_path: Path) -> None:
-    writer = RunWriter(tmp_path / "run.mcap")
+def test_file_truncated_by_others_is_not_finished(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
     fill(writer, 10)
     writer.close_chunk()
-    os.truncate(writer.part, writer.size // 2)
+    os.truncate(writer.temporary_path, writer.size // 2)
     with pytest.raises(OSError, match="can't be read back"):
         writer.finish()
     writer.discard()
 
 
-def test_a_recording_never_takes_the_place_of_another(tmp_path: Path) -> None:
+def test_publish_does_not_replace_another_recording(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path)
+    writer = RecordingWriter(path)
     writer.finish()
     path.write_bytes(b"another")
     with pytest.raises(FileExistsError):
         writer.publish()
     assert path.read_bytes() == b"another"
-    assert writer.part.exists()
+    assert writer.temporary_path.exists()

@@ -1,1 +1,1 @@
-"""The recorder: log streams in, one MCAP file a session out."""
+"""The recorder: writes the recording streams of the services into one MCAP file per session."""

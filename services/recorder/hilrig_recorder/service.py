@@ -1,4 +1,4 @@
-"""The recorder as a service: the wiring of intake, sessions, files and disk, and the loop that drives them."""
+"""The recorder service: connects ingest queue, session tracker and file store, and runs the main loop."""
 
 import contextlib
 import logging
@@ -13,52 +13,55 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.ingest.manual_sessions import HandSessions
-from hilrig_recorder.ingest.queue import Intake
+from hilrig_recorder.ingest.manual_sessions import ManualSessions
+from hilrig_recorder.ingest.queue import IngestQueue
 from hilrig_recorder.ingest.recording import SECOND_NS, Recording
-from hilrig_recorder.ingest.rig_partition import Share
-from hilrig_recorder.ingest.sessions import SessionBook
-from hilrig_recorder.mcap_format.recover import session_of
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.ingest.rig_partition import RigPartition
+from hilrig_recorder.ingest.sessions import SessionTracker
+from hilrig_recorder.mcap_format.recover import read_session_metadata
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_recorder.storage.folder_lock import FolderLock
-from hilrig_recorder.storage.maintenance import Housekeeping, unfinished
-from hilrig_recorder.storage.store import Files
-from hilrig_recorder.storage.sync_worker import Disk
+from hilrig_recorder.storage.maintenance import MaintenanceWorker, find_unfinished
+from hilrig_recorder.storage.store import FileStore
+from hilrig_recorder.storage.sync_worker import SyncWorker
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.messaging.recording_stream import FLUSH_PERIOD_NS
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
-TICK_NS: Final = SECOND_NS // 10
+TICK_PERIOD_NS: Final = SECOND_NS // 10
+"""Period of the housekeeping between received batches."""
 _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
-_ANSWER_TIMEOUT_S: Final = 1.0
-_LAST_BATCHES_NS: Final = 3 * SECOND_NS // 10
-"""When it is told to stop, the recorder waits so long for what the others still have to say."""
-_DRAIN_NS: Final = SECOND_NS // 2
-_REPEATED_LATE_NS: Final = 5 * SECOND_NS
-"""What a sender repeats may have arrived at an earlier recorder so much later than it was sent."""
+_REPLY_TIMEOUT_S: Final = 1.0
+_LAST_BATCHES_TIMEOUT_NS: Final = 3 * SECOND_NS // 10
+"""Time after the stop request in which the recorder still receives the last batches of other services."""
+_QUEUE_DRAIN_TIMEOUT_NS: Final = SECOND_NS // 2
+"""Maximum time for writing the messages in the ingest queue at shutdown."""
+_MAX_ARRIVAL_DELAY_NS: Final = 5 * SECOND_NS
+"""Maximum delay with which an earlier recorder may have received messages that publishers now send again."""
 _FINISH_TIMEOUT_S: Final = 0.3
+"""Time for finishing and syncing files at shutdown; after it, files are finished without syncing."""
 
 logger = logging.getLogger(__name__)
 
 
 def run(service: Service) -> None:
-    """Record every session of the lab until the service is told to stop.
+    """Record every session of the lab until the service is stopped.
 
     Raises:
-        OperationError: the folder for recordings can't be written, or another recorder records one of the rigs.
+        OperationError: the folder of recordings can't be written, or another recorder records one of the rigs.
     """
     service.claim()
     with ExitStack() as closing:
-        closing.enter_context(_own_folder(service))
+        closing.enter_context(_lock_folder(service))
         recorder = Recorder(service)
         closing.callback(recorder.close)
         recorder.run()
 
 
-def _own_folder(service: Service) -> FolderLock:
+def _lock_folder(service: Service) -> FolderLock:
     folder = service.lab.recorder.folder / service.lab.name
     probe = folder / f".probe-{service.incarnation}"
     try:
@@ -68,228 +71,236 @@ def _own_folder(service: Service) -> FolderLock:
         return FolderLock(folder, service.instance, [rig.name for rig in service.rigs])
     except OSError as error:
         raise OperationError(
-            f"{folder}: recordings can't be written there: {error.strerror}; choose another recorder.folder"
+            f"{folder}: can't write recordings: {error.strerror}; choose another recorder.folder"
         ) from error
 
 
 @dataclass(slots=True)
 class _Request:
-    """What a person asked for, on its way to the recorder's thread and back."""
+    """A control request, passed to the recorder's thread and back."""
 
     event: Event
-    answer: Event = field(default_factory=Event)
-    refusal: str = ""
+    reply: Event = field(default_factory=Event)
+    error: str = ""
     done: threading.Event = field(default_factory=threading.Event)
 
 
 class Recorder:
-    """What a running recorder has."""
+    """A running recorder."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
         self._clock = service.clock
         lab, config = service.lab, service.lab.recorder
-        # What other threads have to say; the recorder's thread listens.
-        self._troubles: SimpleQueue[tuple[RunWriter, OSError] | str] = SimpleQueue()
-        self._ended: SimpleQueue[tuple[RunWriter, OSError | None]] = SimpleQueue()
+        # Results of other threads, processed by the recorder's thread.
+        self._errors: SimpleQueue[tuple[RecordingWriter, OSError] | str] = SimpleQueue()
+        self._finished: SimpleQueue[tuple[RecordingWriter, OSError | None]] = SimpleQueue()
         self._configs: SimpleQueue[tuple[str, RigConfig | None]] = SimpleQueue()
         self._requests: SimpleQueue[_Request] = SimpleQueue()
-        self._asked: dict[str, int] = {}
-        self._asking = ThreadPoolExecutor(max_workers=2, thread_name_prefix="asking")
-        self._intake = Intake(config.queue_entries, service.clock)
-        self._disk = Disk(
+        self._config_due_ns: dict[str, int] = {}
+        self._config_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
+        self._queue = IngestQueue(config.queue_entries, service.clock)
+        self._sync_worker = SyncWorker(
             service.clock,
-            on_trouble=lambda writer, error: self._troubles.put((writer, error)),
-            on_ended=lambda writer, error: self._ended.put((writer, error)),
+            on_sync_error=lambda writer, error: self._errors.put((writer, error)),
+            on_finished=lambda writer, error: self._finished.put((writer, error)),
         )
-        self._files = Files(
+        self._store = FileStore(
             lab.name,
             config,
             service.clock,
-            self._disk,
+            self._sync_worker,
             instance=service.instance,
-            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _REPEATED_LATE_NS,
-            tell=self._tell,
-            ask_config=self._ask_config,
-            give_up=self._give_up,
+            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _MAX_ARRIVAL_DELAY_NS,
+            emit=self._emit,
+            request_config=self._request_config,
+            on_failed=self._on_failed,
         )
-        share = Share([rig.name for rig in lab.rigs], [rig.name for rig in service.rigs])
-        self._book = SessionBook(lab.name, config.preroll_s, self._files, share.has)
-        self._by_hand = HandSessions(
-            lambda rig: share.lists(rig) or (share.has(rig) and self._book.has_heard_of(rig)),
+        partition = RigPartition([rig.name for rig in lab.rigs], [rig.name for rig in service.rigs])
+        self._sessions = SessionTracker(lab.name, config.preroll_s, self._store, partition.contains)
+        self._manual_sessions = ManualSessions(
+            lambda rig: (
+                partition.contains_configured(rig) or (partition.contains(rig) and self._sessions.has_received(rig))
+            ),
             random.Random(service.incarnation),
         )
-        parts = [part for part in unfinished(self._files.folder) if share.has(part.parent.name)]
-        self._restore(parts)
+        unfinished = [path for path in find_unfinished(self._store.folder) if partition.contains(path.parent.name)]
+        self._restore(unfinished)
         self._stream = service.bus.subscribe_recording(
-            LOG.key(lab.name, "*", "*"), self._intake.offer, self._on_loss, service.batches_kept
+            LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batches_kept
         )
-        self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._answer)
+        self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._handle_control)
         service.health.rig_reports = self._rig_reports
-        self._housekeeping = Housekeeping(self._files.folder, parts, config, service.clock, self._troubles.put)
+        self._maintenance = MaintenanceWorker(self._store.folder, unfinished, config, service.clock, self._errors.put)
 
-    def _restore(self, parts: list[Path]) -> None:
-        for part in parts:
+    def _restore(self, unfinished: list[Path]) -> None:
+        for path in unfinished:
             with contextlib.suppress(HilrigError, ValueError):
-                session = session_of(part)
+                session = read_session_metadata(path)
                 if session.get("keeper") == self._service.source:
                     start_wall_ns = int(session["start_wall_ns"])
-                    self._by_hand.restore(
+                    self._manual_sessions.restore(
                         OpenSession(rig=session["rig"], session=session["session"], start_wall_ns=start_wall_ns)
                     )
 
-    # -- the loop ---------------------------------------------------------------------------------------------------
+    # -- main loop --------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Record until the service is told to stop, then what was sent before that."""
+        """Record until the service is stopped, then record the messages published before."""
         service, clock = self._service, self._clock
         due_ns = clock.monotonic_ns()
-        service.log.set_sessions(self._by_hand.sessions)
+        service.log.set_sessions(self._manual_sessions.sessions)
         service.ready()
         while not service.stopping.is_set():
-            due_ns = self._turn(due_ns)
-        # What may still arrive is waited for a little while, and what has arrived is written.
-        deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_NS
-        while self._book.recordings and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._turn(due_ns)
+            due_ns = self._run_once(due_ns)
+        # Receive the last batches for a short time, then write the messages in the queue.
+        deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_TIMEOUT_NS
+        while self._sessions.recordings and clock.monotonic_ns() < deadline_ns:
+            due_ns = self._run_once(due_ns)
         self._stream.close()
-        deadline_ns = clock.monotonic_ns() + _DRAIN_NS
-        while self._intake.depth > 0 and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._turn(due_ns)
+        deadline_ns = clock.monotonic_ns() + _QUEUE_DRAIN_TIMEOUT_NS
+        while self._queue.depth > 0 and clock.monotonic_ns() < deadline_ns:
+            due_ns = self._run_once(due_ns)
 
-    def _turn(self, due_ns: int) -> int:
+    def _run_once(self, due_ns: int) -> int:
         now_ns = self._clock.monotonic_ns()
         if now_ns >= due_ns:
             self._tick(now_ns)
-            # Counted from here: after a long one what has come meanwhile is taken first.
+            # The next tick is due one period after this one ends, so that a long tick does not delay received batches.
             now_ns = self._clock.monotonic_ns()
-            due_ns = now_ns + TICK_NS
-        arrival = self._intake.take(max(0.0, (due_ns - now_ns) * 1e-9))
-        if arrival is not None:
-            self._book.accept(arrival, now_ns)
+            due_ns = now_ns + TICK_PERIOD_NS
+        received = self._queue.get(max(0.0, (due_ns - now_ns) * 1e-9))
+        if received is not None:
+            self._sessions.accept(received, now_ns)
         return due_ns
 
     def _tick(self, now_ns: int) -> None:
-        self._book.tick(now_ns, self._clock.wall_ns())
-        self._hear()
-        self._files.tick(now_ns)
-        for rig in self._files.unconfigured():
-            if now_ns >= self._asked.get(rig, 0):
-                self._ask_config(rig)
+        self._sessions.tick(now_ns, self._clock.wall_ns())
+        self._process_results()
+        self._store.tick(now_ns)
+        for rig in self._store.unconfigured():
+            if now_ns >= self._config_due_ns.get(rig, 0):
+                self._request_config(rig)
         self._report(now_ns)
 
-    def _hear(self) -> None:
+    def _process_results(self) -> None:
         with contextlib.suppress(Empty):
             while True:
-                trouble = self._troubles.get_nowait()
-                if isinstance(trouble, str):
-                    self._tell(Event(kind=Event.RECORDING, severity=Event.ERROR, text=trouble))
+                item = self._errors.get_nowait()
+                if isinstance(item, str):
+                    self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=item))
                 else:
-                    self._files.fail(*trouble)
+                    self._store.fail(*item)
         with contextlib.suppress(Empty):
             while True:
-                self._files.ended(*self._ended.get_nowait())
+                self._store.finished(*self._finished.get_nowait())
         with contextlib.suppress(Empty):
             while True:
-                self._take_config(*self._configs.get_nowait())
+                self._accept_config(*self._configs.get_nowait())
         with contextlib.suppress(Empty):
             while True:
-                self._do(self._requests.get_nowait())
+                self._execute(self._requests.get_nowait())
 
     def _report(self, now_ns: int) -> None:
-        counters, intake, book = self._service.counters, self._intake, self._book
-        counters.received = intake.received
-        counters.queue_depth, counters.queue_capacity = intake.depth, intake.capacity
-        counters.lost_transport, counters.lost_recorder = book.lost_transport, intake.dropped
-        counters.malformed = intake.malformed
-        counters.recordings = len(book.recordings)
-        counters.rigs = len({recording.rig for recording in book.recordings})
-        counters.bytes_written = self._files.bytes_written
-        counters.trouble = self._files.trouble
+        counters, queue, sessions = self._service.counters, self._queue, self._sessions
+        counters.received = queue.received
+        counters.queue_depth, counters.queue_capacity = queue.depth, queue.capacity
+        counters.lost_transport, counters.lost_recorder = sessions.lost_transport, queue.dropped
+        counters.malformed = queue.malformed
+        counters.recordings = len(sessions.recordings)
+        counters.rigs = len({recording.rig for recording in sessions.recordings})
+        counters.bytes_written = self._store.bytes_written
+        counters.trouble = self._store.alert
         self._service.beat(now_ns)
 
     def _rig_reports(self) -> list[RigReport]:
-        return [RigReport(rig=rig, recording=True) for rig in {recording.rig for recording in self._book.recordings}]
+        return [
+            RigReport(rig=rig, recording=True) for rig in {recording.rig for recording in self._sessions.recordings}
+        ]
 
-    def _tell(self, event: Event) -> None:
+    def _emit(self, event: Event) -> None:
         logger.warning("%s", event.text)
         self._service.emit(event)
 
-    def _give_up(self, recording: Recording) -> None:
-        self._book.drop(recording)
+    def _on_failed(self, recording: Recording) -> None:
+        self._sessions.drop(recording)
 
     @staticmethod
     def _on_loss(batches: int) -> None:
-        # What was lost is counted from the sequence numbers, where it is known to whom it belonged.
-        logger.warning("%d batches of a log stream were lost on the way", batches)
+        # Lost messages are counted by their sequence numbers, where their rig is known.
+        logger.warning("%d batches of a recording stream were lost in transport", batches)
 
-    # -- sessions by hand -------------------------------------------------------------------------------------------
+    # -- manual sessions --------------------------------------------------------------------------------------------
 
-    def _answer(self, payload: bytes) -> bytes:
-        """Answer a question; on a thread of the bus, so the recorder's own thread does it."""
+    def _handle_control(self, payload: bytes) -> bytes:
+        """Handle a control request on a bus thread: pass it to the recorder's thread and wait for the reply."""
         try:
             request = _Request(Event.FromString(payload))
         except DecodeError as error:
-            raise OperationError("a request that can't be decoded") from error
+            raise OperationError("control request can't be decoded") from error
         self._requests.put(request)
-        if not request.done.wait(_ANSWER_TIMEOUT_S):
-            raise OperationError("the recorder is too busy to answer")
-        if request.refusal:
-            raise OperationError(request.refusal)
-        return request.answer.SerializeToString()
+        if not request.done.wait(_REPLY_TIMEOUT_S):
+            raise OperationError(
+                f"the recorder did not reply within {_REPLY_TIMEOUT_S:g} s: it is overloaded; try again"
+            )
+        if request.error:
+            raise OperationError(request.error)
+        return request.reply.SerializeToString()
 
-    def _do(self, request: _Request) -> None:
+    def _execute(self, request: _Request) -> None:
         event = request.event
         try:
             if event.kind == Event.SESSION_START:
-                request.answer = self._by_hand.begin(event.rig, self._clock.wall_ns())
+                request.reply = self._manual_sessions.start(event.rig, self._clock.wall_ns())
             elif event.kind == Event.SESSION_END:
-                request.answer = self._by_hand.end(event.rig)
+                request.reply = self._manual_sessions.stop(event.rig)
             else:
-                raise OperationError("a request that the recorder does not know")
-            self._service.emit(request.answer)
-            self._service.log.set_sessions(self._by_hand.sessions)
+                raise OperationError(f"unknown control request {event.kind}; expected SESSION_START or SESSION_END")
+            self._service.emit(request.reply)
+            self._service.log.set_sessions(self._manual_sessions.sessions)
         except HilrigError as error:
-            request.refusal = str(error)
+            request.error = str(error)
         request.done.set()
 
-    # -- questions to others ----------------------------------------------------------------------------------------
+    # -- configuration of rigs --------------------------------------------------------------------------------------
 
-    def _ask_config(self, rig: str) -> None:
-        # Not again while an answer is awaited.
-        if self._asked.get(rig, 0) > self._clock.monotonic_ns():
+    def _request_config(self, rig: str) -> None:
+        # A request is pending, or is retried later.
+        if self._config_due_ns.get(rig, 0) > self._clock.monotonic_ns():
             return
-        self._asked[rig] = self._clock.monotonic_ns() + 3600 * SECOND_NS
-        self._asking.submit(self._fetch_config, rig)
+        self._config_due_ns[rig] = self._clock.monotonic_ns() + 3600 * SECOND_NS
+        self._config_executor.submit(self._fetch_config, rig)
 
     def _fetch_config(self, rig: str) -> None:
         config = None
         try:
             key = CONFIG.key(self._service.lab.name, rig)
-            for answer in self._service.bus.ask(key, timeout_s=_CONFIG_TIMEOUT_S):
-                if not answer.error:
-                    config = CONFIG.decode(answer.payload)
+            for reply in self._service.bus.ask(key, timeout_s=_CONFIG_TIMEOUT_S):
+                if not reply.error:
+                    config = CONFIG.decode(reply.payload)
         except (DecodeError, OperationError) as error:
-            logger.warning("configuration of %s: %s", rig, error)
+            logger.warning("%s: configuration can't be read: %s", rig, error)
         finally:
             self._configs.put((rig, config))
 
-    def _take_config(self, rig: str, config: RigConfig | None) -> None:
+    def _accept_config(self, rig: str, config: RigConfig | None) -> None:
         if config is None:
-            self._asked[rig] = self._clock.monotonic_ns() + _CONFIG_RETRY_NS
+            self._config_due_ns[rig] = self._clock.monotonic_ns() + _CONFIG_RETRY_NS
         else:
-            self._asked.pop(rig, None)
-            self._files.configure(config)
+            self._config_due_ns.pop(rig, None)
+            self._store.configure(config)
 
-    # -- the end ----------------------------------------------------------------------------------------------------
+    # -- shutdown ---------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Finish every file."""
+        """Stop all threads and finish every file."""
         self._stream.close()
         self._control.close()
-        self._asking.shutdown(wait=False, cancel_futures=True)
-        self._book.stop()
-        if not self._disk.close(_FINISH_TIMEOUT_S):
-            logger.error("the disk is too slow: some files keep their .part name, to be recovered")
-        self._housekeeping.close()
-        self._files.release()
+        self._config_executor.shutdown(wait=False, cancel_futures=True)
+        self._sessions.stop()
+        if not self._sync_worker.close(_FINISH_TIMEOUT_S):
+            logger.error(
+                "the disk is too slow: some files keep the suffix .part; they will be recovered at the next start"
+            )
+        self._maintenance.close()
+        self._store.release()

@@ -1,1 +1,1 @@
-"""The lab as people watch it: what its services say of themselves, put together, and a page of it for browsers."""
+"""Web console: a read-only live view of a lab for browsers."""

@@ -1,7 +1,7 @@
-"""What a browser is given: the page, what happens in the lab as server-sent events, recordings and their reports.
+"""Web application of the console: the page, the lab's state as server-sent events, recordings and their reports.
 
-Everything is read, nothing is changed. Each browser waits for the next frame and takes the newest there is when its
-connection has taken the last one: one that is slow sees fewer.
+All routes are read-only. Each browser receives the newest frame as soon as its connection has sent the previous one, so
+a slow browser skips frames.
 """
 
 import asyncio
@@ -19,51 +19,51 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, Guard, Guarded
-from hilrig_console.catalog import Shelf
-from hilrig_console.subscriber import Feed
-from hilrig_console.view_model import Frame, Seen
+from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, AccessPolicy, AuthMiddleware
+from hilrig_console.catalog import RecordingCatalog
+from hilrig_console.subscriber import LabSubscriber
+from hilrig_console.view_model import ClientState, Frame
 from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 0.2
-"""Between frames."""
-BROWSERS: Final = 64
-"""That follow the lab at once."""
-FILES: Final = Path(__file__).with_name("static")
+"""Period of the frames, s."""
+MAX_BROWSERS: Final = 64
+"""Upper limit of simultaneous event streams."""
+STATIC_FOLDER: Final = Path(__file__).with_name("static")
 PAGE_FILES: Final = ("console.css", "console.js", "icon.svg")
 
 logger = logging.getLogger(__name__)
 
 
 class Broadcast:
-    """The newest frame, for all browsers; `close` ends their streams."""
+    """Broadcasts the newest frame to the event streams of all browsers."""
 
-    def __init__(self, make: Callable[[], Frame]) -> None:
-        self._make = make
+    def __init__(self, make_frame: Callable[[], Frame]) -> None:
+        self._make_frame = make_frame
         self._frame: Frame | None = None
         self._next = asyncio.Event()
         self.browsers = 0
         self.closed = False
 
     def close(self) -> None:
-        """End every stream within a period; from any thread."""
+        """End every stream within a period; may be called from any thread."""
         self.closed = True
 
-    async def make(self) -> None:
-        """Make a frame, if somebody looks."""
-        # On another thread: with hundreds of rigs it takes a while, and downloads go on.
-        self._frame = await asyncio.to_thread(self._make) if self.browsers else None
-        woken, self._next = self._next, asyncio.Event()
-        woken.set()
+    async def publish(self) -> None:
+        """Make a frame if a browser is connected, and wake up the streams."""
+        # In another thread: a frame of hundreds of rigs takes long, and must not block downloads.
+        self._frame = await asyncio.to_thread(self._make_frame) if self.browsers else None
+        published, self._next = self._next, asyncio.Event()
+        published.set()
 
     async def stream(self, event: int) -> AsyncIterator[str]:
-        """What one browser gets that has seen the events up to a number."""
-        seen = Seen(event=event)
+        """Yield the server-sent events for a browser that has received the events up to a number."""
+        state = ClientState(event=event)
         self.browsers += 1
         try:
             while not self.closed:
                 await self._next.wait()
-                text, seen = ("", seen) if self._frame is None else self._frame.news(seen)
+                text, state = ("", state) if self._frame is None else self._frame.updates(state)
                 if text:
                     yield text
         finally:
@@ -71,12 +71,12 @@ class Broadcast:
 
 
 class Console:
-    """The pages of one lab."""
+    """Routes of the console of one lab."""
 
-    def __init__(self, feed: Feed, shelf: Shelf, guard: Guard) -> None:
-        self._feed = feed
-        self._shelf = shelf
-        self._page = (FILES / "index.html").read_text(encoding="utf-8")
+    def __init__(self, subscriber: LabSubscriber, catalog: RecordingCatalog, policy: AccessPolicy) -> None:
+        self._subscriber = subscriber
+        self._catalog = catalog
+        self._page = (STATIC_FOLDER / "index.html").read_text(encoding="utf-8")
         self.broadcast: Broadcast | None = None
         routes = [
             Route("/", self._index),
@@ -88,14 +88,14 @@ class Console:
             Route(HEALTH_PATH, self._health),
             *(Route(f"/{name}", self._file) for name in PAGE_FILES),
         ]
-        app = Starlette(routes=routes, lifespan=self._life, exception_handlers={HilrigError: _sorry})  # type: ignore[dict-item]
-        self.app: ASGIApp = Guarded(app, guard)
+        app = Starlette(routes=routes, lifespan=self._lifespan, exception_handlers={HilrigError: _error_response})  # type: ignore[dict-item]
+        self.app: ASGIApp = AuthMiddleware(app, policy)
 
     @asynccontextmanager
-    async def _life(self, app: Starlette) -> AsyncIterator[None]:
+    async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
         del app
         self.broadcast = Broadcast(self._frame)
-        tasks = [asyncio.create_task(_repeat(work)) for work in (self.broadcast.make, self._look)]
+        tasks = [asyncio.create_task(_repeat(task)) for task in (self.broadcast.publish, self._refresh_recordings)]
         yield
         for task in tasks:
             task.cancel()
@@ -103,12 +103,12 @@ class Console:
             await asyncio.gather(*tasks)
 
     def _frame(self) -> Frame:
-        return self._feed.frame({"runs": self._shelf.version})
+        return self._subscriber.frame({"runs": self._catalog.version})
 
-    async def _look(self) -> None:
-        """Keep the list of recordings fresh while somebody looks."""
+    async def _refresh_recordings(self) -> None:
+        """Refresh the list of recordings while a browser is connected."""
         if self._stream.browsers:
-            await asyncio.to_thread(self._shelf.look)
+            await asyncio.to_thread(self._catalog.refresh)
 
     @property
     def _stream(self) -> Broadcast:
@@ -120,48 +120,50 @@ class Console:
         return HTMLResponse(self._page)
 
     async def _file(self, request: Request) -> Response:
-        return FileResponse(FILES / request.url.path[1:])
+        return FileResponse(STATIC_FOLDER / request.url.path[1:])
 
     async def _health(self, request: Request) -> Response:
         del request
-        return PlainTextResponse("well\n")
+        return PlainTextResponse("ok\n")
 
     async def _live(self, request: Request) -> Response:
-        if self._stream.browsers >= BROWSERS:
-            return PlainTextResponse(f"{BROWSERS} browsers look already\n", HTTPStatus.SERVICE_UNAVAILABLE)
+        if self._stream.browsers >= MAX_BROWSERS:
+            return PlainTextResponse(
+                f"limit of {MAX_BROWSERS} connected browsers reached\n", HTTPStatus.SERVICE_UNAVAILABLE
+            )
         last = request.headers.get("last-event-id", "")
         stream = self._stream.stream(int(last) if last.isascii() and last.isdigit() else 0)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
     async def _scenes(self, request: Request) -> Response:
         del request
-        return JSONResponse(self._feed.scenes())
+        return JSONResponse(self._subscriber.scenes())
 
     async def _runs(self, request: Request) -> Response:
-        return JSONResponse(self._shelf.listed(request.query_params.get("words", "")))
+        return JSONResponse(self._catalog.search(request.query_params.get("query", "")))
 
     async def _recording(self, request: Request) -> Response:
-        file = self._shelf.file(request.path_params["path"])
+        file = self._catalog.file(request.path_params["path"])
         return FileResponse(file, filename=file.name, media_type="application/octet-stream")
 
     async def _report(self, request: Request) -> Response:
-        page = await asyncio.to_thread(self._shelf.report, request.path_params["path"])
+        page = await asyncio.to_thread(self._catalog.report, request.path_params["path"])
         text = await asyncio.to_thread(page.read_text, "utf-8")
         return HTMLResponse(text, headers={"Content-Security-Policy": REPORT_POLICY})
 
 
-async def _repeat(work: Callable[[], Awaitable[None]]) -> None:
-    """Do it every period; a mistake in it once is no reason to stop."""
+async def _repeat(task: Callable[[], Awaitable[None]]) -> None:
+    """Run a task every period; an exception is logged and does not stop the repetition."""
     while True:
         try:
-            await work()
+            await task()
         except Exception:
-            logger.exception("%s failed", work)
+            logger.exception("%s failed", task)
         await asyncio.sleep(PERIOD_S)
 
 
-async def _sorry(request: Request, error: HilrigError) -> Response:
-    """A page that says in one sentence what is wrong."""
+async def _error_response(request: Request, error: HilrigError) -> Response:
+    """Return an error page with the message of the error."""
     del request
     status = HTTPStatus.NOT_FOUND if isinstance(error, InputError) else HTTPStatus.SERVICE_UNAVAILABLE
     text = f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>hilrig</title><p>{escape(str(error))}</p></html>\n"

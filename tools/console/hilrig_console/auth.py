@@ -1,7 +1,7 @@
-"""Who may look at the page: this machine, or who knows the password; and what the page may do in a browser.
+"""Access control of the console: password, host names, cross-site requests and security headers.
 
-A foreign page can make a browser ask anything of this machine, under a name of its own that it lets lead here
-("DNS rebinding"). So a question must name an address, or a name that is ours.
+A foreign site can resolve its own name to this host ("DNS rebinding") and make a browser send requests to the console.
+Therefore the Host header of a request must be an IP address or an allowed name.
 """
 
 import base64
@@ -17,49 +17,49 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from hilrig_console.login_throttle import Patience
+from hilrig_console.login_throttle import LoginThrottle
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 
-SHORTEST_PASSWORD: Final = 8
+MIN_PASSWORD_CHARS: Final = 8
 PAGE_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""The page has files of this server alone, and no script or style within it."""
+"""Content security policy of the page: only files of this server, no inline scripts or styles."""
 REPORT_POLICY: Final = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""A report is one file with all that it needs, and has no script."""
-HEADERS: Final = {
+"""Content security policy of a report: a self-contained file without scripts."""
+SECURITY_HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
 HEALTH_PATH: Final = "/health"
-"""Asked by health checks, and tells nothing but that there is a console."""
+"""Path of health checks; needs no password."""
 
 
 @dataclass(frozen=True, slots=True)
-class Guard:
-    """Whom a console answers."""
+class AccessPolicy:
+    """Access policy of a console: password and allowed host names."""
 
     password: str = ""
-    """Empty: everybody who reaches it."""
-    names: frozenset[str] = frozenset()
-    """Names of this host, beside `localhost` and every address."""
+    """Empty: no password needed."""
+    allowed_hosts: frozenset[str] = frozenset()
+    """Allowed names in the Host header, in addition to `localhost` and IP addresses."""
 
-    def is_ours(self, host: str) -> bool:
-        """Whether a Host header, "name", "name:port" or "[address]:port", names this host."""
+    def allows_host(self, host: str) -> bool:
+        """Return whether a Host header ("name", "name:port" or "[address]:port") is allowed."""
         name, bracket, _ = host.removeprefix("[").partition("]")
         if not bracket:
             name = host.partition(":")[0]
         name = name.lower().rstrip(".")
-        return name == "localhost" or name in self.names or _is_address(name)
+        return name == "localhost" or name in self.allowed_hosts or _is_ip_address(name)
 
-    def knows(self, authorization: str) -> bool:
-        """Whether an Authorization header has the password; the user's name does not matter."""
+    def accepts_password(self, authorization: str) -> bool:
+        """Return whether an Authorization header has the password; the user name is ignored."""
         if not self.password:
             return True
         kind, _, credentials = authorization.partition(" ")
@@ -67,21 +67,21 @@ class Guard:
             given = base64.b64decode(credentials, validate=True).partition(b":")[2]
         except (binascii.Error, ValueError):
             return False
-        # In a time that does not tell how much of it is right.
+        # Comparison in constant time, which reveals nothing about the password.
         return kind.lower() == "basic" and hmac.compare_digest(given, self.password.encode())
 
 
-class Guarded:
-    """An application behind a guard, with the headers that keep its pages to themselves."""
+class AuthMiddleware:
+    """ASGI middleware that enforces an access policy and adds security headers."""
 
-    def __init__(self, app: ASGIApp, guard: Guard, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, app: ASGIApp, policy: AccessPolicy, clock: Clock = SYSTEM_CLOCK) -> None:
         self._app = app
-        self._guard = guard
-        self._patience = Patience()
+        self._policy = policy
+        self._throttle = LoginThrottle()
         self._monotonic_ns = clock.monotonic_ns
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or refuse (ASGI)."""
+        """Handle an ASGI request: pass it to the application or reject it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -91,50 +91,50 @@ class Guarded:
                 headers = MutableHeaders(scope=message)
                 headers.setdefault("Content-Security-Policy", PAGE_POLICY)
                 headers.setdefault("Cache-Control", "no-store")
-                headers.update(HEADERS)
+                headers.update(SECURITY_HEADERS)
             await send(message)
 
         client = scope.get("client") or ("", 0)
-        refusal = self._refusal(scope["path"], Headers(scope=scope), client[0])
-        await (refusal or self._app)(scope, receive, send_with_headers)
+        rejection = self._rejection(scope["path"], Headers(scope=scope), client[0])
+        await (rejection or self._app)(scope, receive, send_with_headers)
 
-    def _refusal(self, path: str, headers: Headers, address: str) -> PlainTextResponse | None:
-        guard = self._guard
-        if not guard.is_ours(headers.get("host", "")):
-            what = "this console is not called so; ask for it by its address, or start it with --name\n"
-            return PlainTextResponse(what, HTTPStatus.MISDIRECTED_REQUEST)
-        # Browsers say where a question comes from; what another site's page embeds is not for it.
+    def _rejection(self, path: str, headers: Headers, address: str) -> PlainTextResponse | None:
+        policy = self._policy
+        if not policy.allows_host(headers.get("host", "")):
+            text = "unknown host name: open this console by its IP address, or add the name with --name\n"
+            return PlainTextResponse(text, HTTPStatus.MISDIRECTED_REQUEST)
+        # Browsers send the origin of a request; embedding in pages of other sites is not allowed.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
-            return PlainTextResponse("not for other sites\n", HTTPStatus.FORBIDDEN)
-        return None if path == HEALTH_PATH else self._stranger(headers.get("authorization", ""), address)
+            return PlainTextResponse("cross-site requests are not allowed\n", HTTPStatus.FORBIDDEN)
+        return None if path == HEALTH_PATH else self._challenge(headers.get("authorization", ""), address)
 
-    def _stranger(self, authorization: str, address: str) -> PlainTextResponse | None:
+    def _challenge(self, authorization: str, address: str) -> PlainTextResponse | None:
         now_ns = self._monotonic_ns()
-        if authorization and (wait_ns := self._patience.wait_ns(address, now_ns)):
-            later = {"Retry-After": str(-(-wait_ns // 1_000_000_000))}
-            what = "too many wrong passwords from this address; try again later\n"
-            return PlainTextResponse(what, HTTPStatus.TOO_MANY_REQUESTS, later)
-        if self._guard.knows(authorization):
+        if authorization and (wait_ns := self._throttle.wait_ns(address, now_ns)):
+            retry_after = {"Retry-After": str(-(-wait_ns // 1_000_000_000))}
+            text = "too many wrong passwords from this address; try again later\n"
+            return PlainTextResponse(text, HTTPStatus.TOO_MANY_REQUESTS, retry_after)
+        if self._policy.accepts_password(authorization):
             return None
         if authorization:
-            self._patience.wrong(address, now_ns)
-        asks = {"WWW-Authenticate": 'Basic realm="hilrig console", charset="UTF-8"'}
-        return PlainTextResponse("a password is needed\n", HTTPStatus.UNAUTHORIZED, asks)
+            self._throttle.record_failure(address, now_ns)
+        challenge = {"WWW-Authenticate": 'Basic realm="hilrig console", charset="UTF-8"'}
+        return PlainTextResponse("password required\n", HTTPStatus.UNAUTHORIZED, challenge)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a host's name or address."""
+    """Return whether a host name or address is reachable from this host only."""
     if host == "localhost":
         return True
-    return _is_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    return _is_ip_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback
 
 
-def own_names(names: Iterable[str]) -> frozenset[str]:
-    """Names as they are compared, without those that are empty."""
+def normalize_host_names(names: Iterable[str]) -> frozenset[str]:
+    """Return host names in lower case without trailing dots; empty names are left out."""
     return frozenset(name.lower().rstrip(".") for name in names if name)
 
 
-def _is_address(name: str) -> bool:
+def _is_ip_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:

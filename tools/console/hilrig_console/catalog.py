@@ -1,7 +1,6 @@
-"""The recordings of a lab: their list, kept fresh, and a report of each on demand.
+"""Catalog of the recordings of a lab: a list that is refreshed periodically, and reports on demand.
 
-Only what stands in the list is given out. Listing and reporting are done by processes of their own, so that neither
-holds up the page.
+Only listed files are served. Listing and reporting run in worker processes, so that they do not block the page.
 """
 
 import tempfile
@@ -18,121 +17,126 @@ from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
 PERIOD_S: Final = 2.0
-"""Between looks at the folder, while somebody looks at the page."""
-REST: Final = 10
-"""So many times as long as the work of a look took is rested from it."""
-MEASURED_S: Final = 0.5
-"""How long a look may read recordings for their latency; the next one goes on."""
+"""Shortest period of listing the folder while a browser is connected, s."""
+LIST_REST_FACTOR: Final = 10
+"""Pause after listing, as a multiple of its CPU time."""
+MEASURE_BUDGET_S: Final = 0.5
+"""Time limit per listing for measuring the latency of recordings, s; the next listing continues."""
 LIST_TIMEOUT_S: Final = 120.0
 REPORT_TIMEOUT_S: Final = 180.0
-REPORTS: Final = 50
-"""Reports that are kept, count; one takes some 300 KB."""
-SHOWN: Final = 100
-"""Recordings of one answer."""
+MAX_CACHED_REPORTS: Final = 50
+"""Upper limit of cached reports; a report has about 300 KB."""
+MAX_LISTED: Final = 100
+"""Upper limit of recordings in one reply."""
 
 
-class Librarian:
-    """What is done in the process that lists."""
+class ListWorker:
+    """Lists the recordings of a folder, in a worker process."""
 
     def __init__(self, folder: Path) -> None:
         self._index = RunIndex(folder)
 
     def entries(self) -> tuple[list[RunEntry], float]:
-        """Every recording, newest first, with latencies as far as the time allowed; and the processor time taken, s.
+        """Return all recordings, newest first, and the CPU time of the listing, s.
+
+        Latencies are measured within `MEASURE_BUDGET_S`.
 
         Raises:
-            InputError: there is no such folder.
+            InputError: the folder does not exist.
         """
-        begun_s = time.process_time()
+        start_s = time.process_time()
         entries = self._index.load()
-        spent_s, listed_s = time.process_time() - begun_s, time.monotonic()
+        spent_s, listed_s = time.process_time() - start_s, time.monotonic()
         for number, entry in enumerate(entries):
-            if time.monotonic() - listed_s > MEASURED_S:
+            if time.monotonic() - listed_s > MEASURE_BUDGET_S:
                 break
             (entries[number],) = self._index.measure([entry])
         self._index.save()
         return entries, spent_s
 
 
-class Reporter:
-    """What is done in the process that reports."""
+class ReportWorker:
+    """Writes reports of recordings, in a worker process."""
 
     def write(self, recording: Path, page: Path) -> None:
         """Write the report of a recording.
 
         Raises:
-            InputError: the recording can't be reported.
+            InputError: the recording can't be read.
         """
-        # Each report has a process of its own, which loads what draws only then.
-        from hilrig_replay.report.report import report
+        # Imported here: each report runs in a new process, and the process of the console must not load matplotlib.
+        from hilrig_replay.report.report import build_report
 
-        page.write_text(report([recording]).html, encoding="utf-8")
+        page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
-class Shelf:
-    """The recordings below a folder; a context manager. Its methods may be called from any thread."""
+class RecordingCatalog:
+    """Recordings below a folder; a context manager. The methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.version = 0
-        """Changes when the list does."""
-        self.trouble = "the recordings are being listed"
-        """Why there is no list; empty: there is."""
+        """Changes when the list changes."""
+        self.error = "the recordings are being listed"
+        """Reason why the list is missing or outdated; empty: none."""
         self._entries: list[RunEntry] = []
         self._by_path: dict[str, RunEntry] = {}
         self._due_s = 0.0
-        self._librarian = Worker(Librarian, folder)
-        self._reporter = Worker(Reporter)
+        self._list_worker = Worker(ListWorker, folder)
+        self._report_worker = Worker(ReportWorker)
         self._reporting = threading.Lock()
         self._reports: OrderedDict[tuple[str, int, int], Path] = OrderedDict()
         self._cache = tempfile.TemporaryDirectory(prefix="hilrig-console-", ignore_cleanup_errors=True)
 
-    def look(self) -> None:
-        """List the folder anew, if it is time."""
+    def refresh(self) -> None:
+        """List the folder again if the period has passed."""
         if time.monotonic() < self._due_s:
             return
-        spent_s, trouble = 0.0, ""
+        spent_s, message = 0.0, ""
         try:
-            entries, spent_s = self._librarian.call("entries", timeout_s=LIST_TIMEOUT_S)
+            entries, spent_s = self._list_worker.call("entries", timeout_s=LIST_TIMEOUT_S)
         except InputError as error:
-            entries, trouble = [], str(error)
+            entries, message = [], str(error)
         except HilrigError as error:
-            entries, trouble = self._entries, f"the recordings can't be listed: {error}"
-        self._due_s = time.monotonic() + max(PERIOD_S, REST * spent_s)
-        if (entries, trouble) != (self._entries, self.trouble):
-            self._entries, self.trouble = entries, trouble
+            entries, message = self._entries, f"can't list the recordings: {error}"
+        self._due_s = time.monotonic() + max(PERIOD_S, LIST_REST_FACTOR * spent_s)
+        if (entries, message) != (self._entries, self.error):
+            self._entries, self.error = entries, message
             self._by_path = {entry.path: entry for entry in entries}
             self.version += 1
 
-    def listed(self, words: str) -> dict[str, Any]:
-        """The newest recordings whose rig, session, controller or ending has all of the words, as plain values."""
-        wanted = words.lower().split()
-        found = [entry for entry in self._entries if all(word in _text(entry) for word in wanted)]
+    def search(self, query: str) -> dict[str, Any]:
+        """Return the newest recordings that contain every term of the query, as JSON values.
+
+        Searched are rig, session, controller and ending.
+        """
+        terms = query.lower().split()
+        found = [entry for entry in self._entries if all(term in _search_text(entry) for term in terms)]
         return {
             "version": self.version,
-            "trouble": self.trouble,
+            "error": self.error,
             "total": len(self._entries),
             "found": len(found),
-            "runs": [_row(entry) for entry in found[:SHOWN]],
+            "runs": [_row(entry) for entry in found[:MAX_LISTED]],
         }
 
     def file(self, path: str) -> Path:
-        """Where a listed recording is.
+        """Return the path of a listed recording.
 
         Raises:
-            InputError: it is not listed, or gone.
+            InputError: the recording is not listed or does not exist anymore.
         """
         entry = self._by_path.get(path)
         found = None if entry is None else (self.folder / entry.path).resolve()
         if found is None or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
-            raise InputError(f"no recording {path!r} is listed")
+            raise InputError(f"unknown recording {path!r}")
         return found
 
     def report(self, path: str) -> Path:
-        """The page of a listed recording; it is made if there is none yet.
+        """Return the report page of a listed recording; it is created if it is not cached.
 
         Raises:
-            HilrigError: there is no such recording, or it can't be reported.
+            HilrigError: the recording is unknown, or its report can't be created.
         """
         recording = self.file(path)
         info = recording.stat()
@@ -144,28 +148,28 @@ class Shelf:
                 return page
             page = Path(tempfile.mkstemp(dir=self._cache.name, suffix=".html")[1])
             try:
-                self._reporter.call("write", recording, page, timeout_s=REPORT_TIMEOUT_S)
+                self._report_worker.call("write", recording, page, timeout_s=REPORT_TIMEOUT_S)
             except HilrigError:
                 page.unlink()
                 raise
             finally:
-                # Its memory is given back.
-                self._reporter.end()
+                # Ends the process to free its memory.
+                self._report_worker.stop()
             self._reports[key] = page
-            if len(self._reports) > REPORTS:
+            if len(self._reports) > MAX_CACHED_REPORTS:
                 self._reports.popitem(last=False)[1].unlink(missing_ok=True)
             return page
 
-    def __enter__(self) -> "Shelf":
+    def __enter__(self) -> "RecordingCatalog":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._librarian.close()
-        self._reporter.close()
+        self._list_worker.close()
+        self._report_worker.close()
         self._cache.cleanup()
 
 
-def _text(entry: RunEntry) -> str:
+def _search_text(entry: RunEntry) -> str:
     return f"{entry.path} {entry.rig} {entry.controller} {entry.ended} {entry.trouble}".lower()
 
 

@@ -1,4 +1,4 @@
-"""The last events of a lab, numbered, so that whoever has seen some gets the rest. Pure."""
+"""Ring buffer of the latest events of a lab, with sequence numbers for clients that reconnect. Pure."""
 
 import json
 from collections import deque
@@ -9,24 +9,25 @@ from google.protobuf.message import DecodeError
 from hilrig_schemas import Event
 from hilrig_schemas.topics import EVENT
 
-KEPT: Final = 200
-LONGEST: Final = 500
-"""Characters of an event's text that are shown."""
+MAX_EVENTS: Final = 200
+"""Capacity of the buffer, events."""
+MAX_TEXT_CHARS: Final = 500
+"""Upper limit of the shown text of an event, characters."""
 
 
-class EventLog:
-    """What happened, the oldest first.
+class EventBuffer:
+    """Buffer of the latest events, oldest first, with ascending numbers.
 
-    Numbers go on from `start`; taken from a clock, they are larger than those of an earlier run, so that a page that
-    lived longer than the console does not miss what is new.
+    The numbers continue from `start`. If `start` is taken from a clock, they are larger than those of an earlier
+    console process, so that a page that stays open across a restart receives all new events.
     """
 
     def __init__(self, start: int) -> None:
         self.last = start
-        self._events: deque[tuple[int, str]] = deque(maxlen=KEPT)
+        self._events: deque[tuple[int, str]] = deque(maxlen=MAX_EVENTS)
 
-    def hear(self, payload: bytes) -> None:
-        """Take an encoded event; what is none is left out."""
+    def add(self, payload: bytes) -> None:
+        """Add an encoded event; an invalid message is ignored."""
         try:
             event = EVENT.decode(payload)
         except DecodeError:
@@ -34,8 +35,8 @@ class EventLog:
         self.last += 1
         self._events.append((self.last, json.dumps(_row(self.last, event), ensure_ascii=False)))
 
-    def all(self) -> tuple[tuple[int, str], ...]:
-        """Each with its number, as JSON."""
+    def entries(self) -> tuple[tuple[int, str], ...]:
+        """Return the number and the JSON text of each event."""
         return tuple(self._events)
 
 
@@ -46,11 +47,11 @@ def _row(number: int, event: Event) -> dict[str, Any]:
         "rig": event.rig,
         "kind": _name(Event.Kind, event.kind),
         "severity": _name(Event.Severity, event.severity),
-        "text": event.text[:LONGEST],
+        "text": event.text[:MAX_TEXT_CHARS],
         "source": event.source,
     }
 
 
 def _name(kind: Any, number: int) -> str:
-    """A newer version may send what this one has no name for."""
+    """Return the name of an enum value, or its number if a newer version sent an unknown value."""
     return str(kind.Name(number)).lower() if number in kind.values() else str(number)

@@ -1,43 +1,43 @@
-"""How often an address may try passwords: some at once, as browsers do with an old one, then one now and then.
+"""Rate limiter of wrong passwords per client address: a burst, then one attempt per interval.
 
-A guess that comes too early is not looked at, so that neither many connections nor the time of an answer help whoever
-guesses. Pure: time is passed in.
+The burst covers browsers that retry an old password. An attempt during the wait is rejected without checking the
+password, so parallel connections and response times give no advantage. Pure: time is passed in.
 """
 
 import ipaddress
 from collections import OrderedDict
 from typing import Final
 
-AT_ONCE: Final = 20
-"""Wrong passwords after which an address has to wait."""
-PERIOD_NS: Final = 5_000_000_000
-"""One more may be tried after so long."""
-ADDRESSES: Final = 4096
-"""That are remembered; beyond, the one that guessed longest ago is forgotten."""
+BURST_ATTEMPTS: Final = 20
+"""Wrong passwords of an address before it must wait."""
+RETRY_INTERVAL_NS: Final = 5_000_000_000
+"""Interval of further attempts, ns."""
+MAX_ADDRESSES: Final = 4096
+"""Capacity of the table; beyond it, the address with the oldest attempt is evicted."""
 
 
-class Patience:
-    """What is left of it for each address."""
+class LoginThrottle:
+    """Rate limiter with one time per address (generic cell rate algorithm)."""
 
     def __init__(self) -> None:
-        self._worn_until_ns: OrderedDict[str, int] = OrderedDict()
+        self._blocked_until_ns: OrderedDict[str, int] = OrderedDict()
 
     def wait_ns(self, address: str, now_ns: int) -> int:
-        """How long an address has to wait until its next password is looked at; 0: not at all."""
-        worn_ns = self._worn_until_ns.get(_place(address), 0) - now_ns
-        return max(0, worn_ns - (AT_ONCE - 1) * PERIOD_NS)
+        """Return the time until the next password of an address is checked, ns; 0: now."""
+        ahead_ns = self._blocked_until_ns.get(_throttle_key(address), 0) - now_ns
+        return max(0, ahead_ns - (BURST_ATTEMPTS - 1) * RETRY_INTERVAL_NS)
 
-    def wrong(self, address: str, now_ns: int) -> None:
-        """An address gave a wrong password."""
-        place = _place(address)
-        self._worn_until_ns[place] = max(self._worn_until_ns.get(place, 0), now_ns) + PERIOD_NS
-        self._worn_until_ns.move_to_end(place)
-        if len(self._worn_until_ns) > ADDRESSES:
-            self._worn_until_ns.popitem(last=False)
+    def record_failure(self, address: str, now_ns: int) -> None:
+        """Record a wrong password of an address."""
+        key = _throttle_key(address)
+        self._blocked_until_ns[key] = max(self._blocked_until_ns.get(key, 0), now_ns) + RETRY_INTERVAL_NS
+        self._blocked_until_ns.move_to_end(key)
+        if len(self._blocked_until_ns) > MAX_ADDRESSES:
+            self._blocked_until_ns.popitem(last=False)
 
 
-def _place(address: str) -> str:
-    """An address; of IPv6 its network, for a host has as many in that as it likes."""
+def _throttle_key(address: str) -> str:
+    """Return the IPv4 address, or the /64 network of an IPv6 address, because a host may use any address in it."""
     try:
         known = ipaddress.ip_address(address)
     except ValueError:

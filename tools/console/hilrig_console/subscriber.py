@@ -1,7 +1,7 @@
-"""The bus into a page: one subscription of each kind, whatever the number of browsers.
+"""Bus subscriber of the console: updates the view model, with one subscription per topic for all browsers.
 
-The states are subscribed to only while somebody looks, for they are many. What the rigs look like is asked one rig
-after the other: each answer is work for a simulation that has a loop to close.
+States are subscribed to only while a browser is connected, because of their data rate. The configurations of the rigs
+are queried one after the other, because each reply takes time of a simulation.
 """
 
 import logging
@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_console.view_model import Frame, Page
+from hilrig_console.view_model import Frame, ViewModel
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
@@ -23,48 +23,48 @@ from hilrig_schemas import RigConfig
 from hilrig_schemas.topics import CONFIG, EVENT, HEALTH, STATES
 
 RETRY_S: Final = 2.0
-"""Between tries to join the bus."""
-TURN_S: Final = 0.2
-"""How often the feed looks whether there is something to ask."""
-ROSTERS_S: Final = 10.0
-"""How often it is asked where the rigs are reached."""
-NEWCOMERS_S: Final = 1.0
-"""The same while there are rigs of which that is not known yet."""
-ASKED_A_TURN: Final = 4
-"""Rigs that are asked what they look like, one after the other, before the next turn."""
-LEFT_S: Final = 5.0
-"""So long after the last browser has left, states are still taken: one that is loaded anew comes back at once."""
-_BATCHES: Final = 64
+"""Delay between attempts to connect to the bus, s."""
+POLL_PERIOD_S: Final = 0.2
+"""Period in which due queries are sent, s."""
+SERVICES_PERIOD_S: Final = 10.0
+"""Period of the query for the addresses of the rigs, s."""
+NEW_RIG_PERIOD_S: Final = 1.0
+"""Period of this query while the address of a rig is unknown, s."""
+MAX_QUERIES_PER_POLL: Final = 4
+"""Upper limit of configuration queries per poll."""
+VIEWER_TIMEOUT_S: Final = 5.0
+"""Time without browsers after which states are unsubscribed, s; a reloaded page shows states at once."""
+_MAX_QUEUED_BATCHES: Final = 64
 
 logger = logging.getLogger(__name__)
 
 
-class Feed:
-    """Keeps a page up to date from a thread of its own; a context manager."""
+class LabSubscriber:
+    """Updates a view model from the bus in a thread; a context manager."""
 
     def __init__(self, lab: LabConfig) -> None:
         self._lab = lab
-        self._page = Page(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
-        self._states: deque[bytes] = deque(maxlen=_BATCHES)
-        self._looked_s = -LEFT_S
+        self._model = ViewModel(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
+        self._states: deque[bytes] = deque(maxlen=_MAX_QUEUED_BATCHES)
+        self._viewed_s = -VIEWER_TIMEOUT_S
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
-    def frame(self, more: dict[str, Any]) -> Frame:
-        """What there is to show now; as long as it is asked for, somebody looks."""
+    def frame(self, extra: dict[str, Any]) -> Frame:
+        """Return the current frame; calling this keeps the subscription of the states."""
         now_s = time.monotonic()
-        self._looked_s = now_s
-        page = self._page
-        with page.lock:
-            page.poses.hear([self._states.popleft() for _ in range(len(self._states))], now_s)
-            return page.frame(now_s, more)
+        self._viewed_s = now_s
+        model = self._model
+        with model.lock:
+            model.poses.add([self._states.popleft() for _ in range(len(self._states))], now_s)
+            return model.frame(now_s, extra)
 
     def scenes(self) -> list[Any]:
-        """What stands still around the arms; rigs name theirs by its number."""
-        with self._page.lock:
-            return list(self._page.poses.scenes)
+        """Return the static scenes; a rig refers to its scene by its number."""
+        with self._model.lock:
+            return list(self._model.poses.scenes)
 
-    def __enter__(self) -> "Feed":
+    def __enter__(self) -> "LabSubscriber":
         self._thread.start()
         return self
 
@@ -76,53 +76,55 @@ class Feed:
         while not self._stopping.is_set():
             try:
                 with ZenohBus(self._lab.bus, "tool") as bus:
-                    self._say("")
-                    self._follow(bus)
+                    self._set_bus_error("")
+                    self._receive(bus)
             except HilrigError as error:
-                self._say(str(error))
+                self._set_bus_error(str(error))
             except Exception:
-                # The page says so, and goes on with a new connection.
-                logger.exception("following the bus failed")
-                self._say("following the bus failed; the console's log says why")
+                # The page shows the error, and the next iteration connects again.
+                logger.exception("receiving from the bus failed")
+                self._set_bus_error("receiving from the bus failed; see the log of the console")
             self._stopping.wait(RETRY_S)
 
-    def _say(self, trouble: str) -> None:
-        with self._page.lock:
-            self._page.link(trouble)
+    def _set_bus_error(self, error: str) -> None:
+        with self._model.lock:
+            self._model.set_bus_error(error)
 
-    def _follow(self, bus: Bus) -> None:
+    def _receive(self, bus: Bus) -> None:
         bus.subscribe(HEALTH.key(self._lab.name, "*", "*"), self._on_health)
         bus.subscribe(EVENT.key(self._lab.name, "*"), self._on_event)
         states: Handle | None = None
-        asked_s = -ROSTERS_S
-        while not self._stopping.wait(TURN_S):
+        queried_s = -SERVICES_PERIOD_S
+        while not self._stopping.wait(POLL_PERIOD_S):
             now_s = time.monotonic()
-            watched = now_s - self._looked_s < LEFT_S
-            if watched and states is None:
-                states = bus.subscribe_newest(STATES.key(self._lab.name, "*", "*"), self._on_states, _BATCHES)
-            elif not watched and states is not None:
+            is_viewed = now_s - self._viewed_s < VIEWER_TIMEOUT_S
+            if is_viewed and states is None:
+                states = bus.subscribe_newest(
+                    STATES.key(self._lab.name, "*", "*"), self._on_states, _MAX_QUEUED_BATCHES
+                )
+            elif not is_viewed and states is not None:
                 states.close()
                 states = None
-            if watched and self._are_rosters_due(now_s, now_s - asked_s):
-                asked_s = now_s
+            if is_viewed and self._is_service_query_due(now_s, now_s - queried_s):
+                queried_s = now_s
                 found = rosters(bus, self._lab.name)
-                with self._page.lock:
-                    self._page.know(found)
-            self._ask_what_rigs_look_like(bus)
+                with self._model.lock:
+                    self._model.set_addresses(found)
+            self._query_configurations(bus)
 
-    def _are_rosters_due(self, now_s: float, age_s: float) -> bool:
-        if not NEWCOMERS_S < age_s <= ROSTERS_S:
-            return age_s > ROSTERS_S
-        with self._page.lock:
-            return self._page.has_newcomers(now_s)
+    def _is_service_query_due(self, now_s: float, age_s: float) -> bool:
+        if not NEW_RIG_PERIOD_S < age_s <= SERVICES_PERIOD_S:
+            return age_s > SERVICES_PERIOD_S
+        with self._model.lock:
+            return self._model.has_unknown_addresses(now_s)
 
-    def _ask_what_rigs_look_like(self, bus: Bus) -> None:
-        with self._page.lock:
-            rigs = self._page.poses.unknown()[:ASKED_A_TURN]
+    def _query_configurations(self, bus: Bus) -> None:
+        with self._model.lock:
+            rigs = self._model.poses.unconfigured()[:MAX_QUERIES_PER_POLL]
         for rig in rigs:
             config = _config(bus, self._lab.name, rig)
-            with self._page.lock:
-                self._page.poses.learn(rig, config)
+            with self._model.lock:
+                self._model.poses.configure(rig, config)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         del key
@@ -130,13 +132,13 @@ class Feed:
             health = HEALTH.decode(payload)
         except DecodeError:
             return
-        with self._page.lock:
-            self._page.view.hear(health, time.monotonic())
+        with self._model.lock:
+            self._model.view.hear(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
         del key
-        with self._page.lock:
-            self._page.events.hear(payload)
+        with self._model.lock:
+            self._model.events.add(payload)
 
     def _on_states(self, key: str, payload: bytes) -> None:
         del key

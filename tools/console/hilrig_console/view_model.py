@@ -1,7 +1,7 @@
-"""The page's model: everything that is known of a lab as the messages that a browser gets. Pure but for its lock.
+"""View model of the console page: the state of a lab as server-sent events. Pure except for its lock.
 
-A browser gets `lab` when a report has come (once a second), `poses` a few times a second, `event` as they happen. Each
-is the whole of it, made once for all browsers: a slow one leaves some out and misses nothing.
+A browser receives `lab` once per second, `poses` several times per second, and each `event`. `lab` and `poses` contain
+the complete state and are encoded once for all browsers, so a slow browser may skip some of them.
 """
 
 import json
@@ -10,15 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hilrig_console.events import EventLog
-from hilrig_console.poses import Poses
+from hilrig_console.events import EventBuffer
+from hilrig_console.poses import PoseCache
 from hilrig_monitoring.lab_view import LabView
 from hilrig_schemas import Roster
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """What a browser has."""
+class ClientState:
+    """Messages that a browser has received."""
 
     lab: str = ""
     poses: str = ""
@@ -27,46 +27,46 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What there is to show, at one time."""
+    """State of the lab at one time, encoded as JSON."""
 
     lab: str
     poses: str
     events: tuple[tuple[int, str], ...]
 
-    def news(self, seen: Seen) -> tuple[str, Seen]:
-        """What is new to a browser, as server-sent events, and what it has then; an empty text: nothing."""
+    def updates(self, state: ClientState) -> tuple[str, ClientState]:
+        """Return the server-sent events that update a browser (empty: none), and its new state."""
         parts = []
-        if self.lab != seen.lab:
+        if self.lab != state.lab:
             parts.append(f"event: lab\ndata: {self.lab}\n\n")
         parts += [
-            f"event: event\nid: {number}\ndata: {event}\n\n" for number, event in self.events if number > seen.event
+            f"event: event\nid: {number}\ndata: {event}\n\n" for number, event in self.events if number > state.event
         ]
-        if self.poses != seen.poses:
+        if self.poses != state.poses:
             parts.append(f"event: poses\ndata: {self.poses}\n\n")
         last = self.events[-1][0] if self.events else 0
-        return "".join(parts), Seen(self.lab, self.poses, max(seen.event, last))
+        return "".join(parts), ClientState(self.lab, self.poses, max(state.event, last))
 
 
-class Page:
-    """A lab as it is shown; `lock` is held while it is changed or read."""
+class ViewModel:
+    """State of a lab as shown on the page; hold `lock` while using it."""
 
     def __init__(self, lab: str, rigs: tuple[str, ...], start: int) -> None:
         self.lock = threading.Lock()
         self.view = LabView(rigs)
-        self.poses = Poses()
-        self.events = EventLog(start)
+        self.poses = PoseCache()
+        self.events = EventBuffer(start)
         self._lab = lab
-        self._trouble = ""
+        self._bus_error = ""
         self._addresses: dict[str, str] = {}
         self._lab_text = ""
         self._lab_due_s = 0.0
 
-    def link(self, trouble: str) -> None:
-        """Say why the bus can't be read; empty: it can."""
-        self._trouble = trouble
+    def set_bus_error(self, error: str) -> None:
+        """Set the reason why the bus is unavailable; empty: connected."""
+        self._bus_error = error
 
-    def know(self, rosters: list[Roster]) -> None:
-        """Take where the rigs are reached, as the edges say."""
+    def set_addresses(self, rosters: list[Roster]) -> None:
+        """Set the addresses of the rigs from the announcements of the edges."""
         self._addresses = {
             rig: address
             for roster in rosters
@@ -74,23 +74,23 @@ class Page:
             for rig, address in zip(roster.rigs, roster.addresses, strict=False)
         }
 
-    def has_newcomers(self, now_s: float) -> bool:
-        """Whether an edge serves a rig of which it is not known where it is reached."""
+    def has_unknown_addresses(self, now_s: float) -> bool:
+        """Return whether an edge serves a rig whose address is unknown."""
         return any(rig.served and rig.rig not in self._addresses for rig in self.view.rigs(now_s))
 
-    def frame(self, now_s: float, more: Mapping[str, Any]) -> Frame:
-        """What there is to show at `now_s`; `more` goes into the lab's part."""
+    def frame(self, now_s: float, extra: Mapping[str, Any]) -> Frame:
+        """Return the frame at `now_s`; `extra` is added to its `lab` message."""
         if now_s >= self._lab_due_s:
             self._lab_due_s = now_s + 1.0
-            self._lab_text = _json(self._lab_now(now_s) | dict(more))
-        return Frame(self._lab_text, _json(self.poses.drawn(now_s)), self.events.all())
+            self._lab_text = _json(self._lab_values(now_s) | dict(extra))
+        return Frame(self._lab_text, _json(self.poses.as_dict(now_s)), self.events.entries())
 
-    def _lab_now(self, now_s: float) -> dict[str, Any]:
-        known = self.view.as_dict(now_s)
-        for rig in known["rigs"]:
+    def _lab_values(self, now_s: float) -> dict[str, Any]:
+        values = self.view.as_dict(now_s)
+        for rig in values["rigs"]:
             rig["address"] = self._addresses.get(rig["rig"], "")
-        # Its time makes it news although nothing changed: a page that hears nothing takes the console for gone.
-        return {"lab": self._lab, "at_s": now_s, "link": self._trouble, "scenes": len(self.poses.scenes)} | known
+        # The time changes the message every second: a page without messages reports a lost connection.
+        return {"lab": self._lab, "at_s": now_s, "link": self._bus_error, "scenes": len(self.poses.scenes)} | values
 
 
 def _json(value: Any) -> str:

@@ -1,7 +1,6 @@
-"""A process of its own for work that takes long or much memory: one call at a time, started when there is one.
+"""Worker process for tasks that need much time or memory: runs one call at a time, and is started on demand.
 
-It steps back behind whatever else runs on the machine, and ends with the process that started it, whose end it learns
-from the pipe between them.
+The process has low priority. It ends with its parent process, which it detects by the closed pipe between them.
 """
 
 import contextlib
@@ -22,47 +21,47 @@ logger = logging.getLogger(__name__)
 
 
 class Worker:
-    """Calls methods of what `make(*arguments)` gives, in a process of its own."""
+    """Calls methods of the object returned by `factory(*arguments)`, in a worker process."""
 
-    def __init__(self, make: Callable[..., Any], *arguments: Any) -> None:
-        self._made = (make, arguments)
-        self._turn = threading.Lock()
+    def __init__(self, factory: Callable[..., Any], *arguments: Any) -> None:
+        self._factory = (factory, arguments)
+        self._lock = threading.Lock()
         self._closed = False
         self._process: Any = None
         self._pipe: Any = None
 
     def call(self, method: str, *arguments: Any, timeout_s: float) -> Any:
-        """What the method gives; whoever else calls meanwhile waits for his turn.
+        """Call a method and return its result; concurrent calls are executed one after the other.
 
         Raises:
             HilrigError: the method raised it.
-            OperationError: it takes too long, the process ended, or the worker is closed.
+            OperationError: the call timed out, the process ended, or the worker is closed.
         """
-        with self._turn:
+        with self._lock:
             self._start()
             if self._closed:
-                self._end()
-                raise OperationError("it is being closed")
+                self._stop()
+                raise OperationError("the worker is being closed")
             try:
                 self._pipe.send((method, arguments))
                 if not self._pipe.poll(timeout_s):
-                    self._end()
-                    raise OperationError(f"it takes longer than {timeout_s:.0f} s")
-                done, value = self._pipe.recv()
+                    self._stop()
+                    raise OperationError(f"no result within {timeout_s:.0f} s")
+                succeeded, value = self._pipe.recv()
             except (EOFError, OSError) as error:
-                self._end()
-                raise OperationError("the process that does it ended; memory may be short") from error
-        if not done:
+                self._stop()
+                raise OperationError("the worker process ended unexpectedly (out of memory?)") from error
+        if not succeeded:
             raise value
         return value
 
-    def end(self) -> None:
-        """End the process, when it has done what it does; the next call starts another."""
-        with self._turn:
-            self._end()
+    def stop(self) -> None:
+        """Stop the process after its current call; the next call starts a new one."""
+        with self._lock:
+            self._stop()
 
     def close(self) -> None:
-        """End the process at once, and start none any more; whoever waits for a call is told that it ended."""
+        """Kill the process and reject further calls; a waiting call raises an error."""
         self._closed = True
         process = self._process
         if process is not None:
@@ -70,15 +69,15 @@ class Worker:
 
     def _start(self) -> None:
         if self._process is None or not self._process.is_alive():
-            self._end()
+            self._stop()
             self._pipe, other = _SPAWN.Pipe()
-            process = _SPAWN.Process(target=_serve, args=(other, *self._made), daemon=True)
+            process = _SPAWN.Process(target=_serve, args=(other, *self._factory), daemon=True)
             process.start()
             other.close()
-            # Known to `close` only now that it can be ended.
+            # Visible to `close` only when the process can be killed.
             self._process = process
 
-    def _end(self) -> None:
+    def _stop(self) -> None:
         process, pipe, self._process, self._pipe = self._process, self._pipe, None, None
         if pipe is not None:
             pipe.close()
@@ -87,19 +86,19 @@ class Worker:
             process.join()
 
 
-def _serve(pipe: Connection, make: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    # Ctrl-C reaches all processes of a terminal; this one ends with its parent.
+def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    # Ctrl-C is sent to all processes of a terminal; this process ends with its parent.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     yield_to_others()
-    worker = make(*arguments)
+    worker = factory(*arguments)
     with contextlib.suppress(EOFError, OSError):
         while True:
-            method, given = pipe.recv()
+            method, method_arguments = pipe.recv()
             try:
-                answer = True, getattr(worker, method)(*given)
+                reply = True, getattr(worker, method)(*method_arguments)
             except HilrigError as error:
-                answer = False, error
+                reply = False, error
             except Exception:
                 logger.exception("%s failed", method)
-                answer = False, OperationError("it failed; the log says why")
-            pipe.send(answer)
+                reply = False, OperationError("the worker failed; see the log of the console")
+            pipe.send(reply)

@@ -1,1 +1,1 @@
-"""How much delay, jitter and loss a controller bears: theory, the loop in virtual time, and the live loop beside it."""
+"""Robustness studies of a control loop against delay, jitter and loss: theory, simulation and live measurements."""

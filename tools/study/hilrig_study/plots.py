@@ -1,4 +1,4 @@
-"""A study's pictures: cost over the plane with theory's boundary and margins on it, and traces at chosen points."""
+"""Plots of a study: cost over the parameter plane with theoretical stability limits, and traces at chosen points."""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from hilrig_replay.plots.latency_plot import save_figure
-from hilrig_replay.plots.palette import INK, RUN_COLORS
+from hilrig_replay.plots.output import save_figure
+from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
 from hilrig_sim.arm.model import JOINT_SCALE
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
@@ -32,7 +32,7 @@ _LETTERS: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A run at a chosen point."""
+    """Simulated run at a chosen point of the plane."""
 
     letter: str
     point: PointConfig
@@ -40,16 +40,16 @@ class Trace:
     time_s: Floats
     """(T,)."""
     error: Floats
-    """Position less goal; degrees, degrees, mm, degrees, (T, 4)."""
+    """Position minus set point; degrees, degrees, mm, degrees, (T, 4)."""
     effort: Floats
     """N·m, N·m, N, N·m, (T, 4)."""
     outcome: str
-    """In words."""
+    """Human-readable outcome."""
 
 
 @dataclass(frozen=True, slots=True)
-class Dot:
-    """A point of the plane as it was measured on the live loop."""
+class Marker:
+    """Plot marker of a point that was measured on the live loop."""
 
     x: float
     y: float
@@ -57,7 +57,7 @@ class Dot:
 
 
 def traces(study: StudyConfig, folder: Path) -> list[Trace]:
-    """Run the study's chosen points.
+    """Simulate the points in the study's `traces`.
 
     Raises:
         InputError: as `run_cells`.
@@ -71,20 +71,20 @@ def traces(study: StudyConfig, folder: Path) -> list[Trace]:
         step_s = float(cells["step_ms"][0]) * 1e-3
         time_s: Floats = np.asarray(np.arange(len(outcome.positions)) * step_s, dtype=np.float64)
         goal = study.task.scenario().goal(time_s).T
-        said = "comes to rest" if results["settled"][0] else "does not come to rest"
+        outcome_text = "settles" if results["settled"][0] else "does not settle"
         if not math.isnan(results["failed_s"][0]):
-            said = f"fails at {results['failed_s'][0]:.2f} s"
-        # A run that has failed is over: what is parked is no trace.
-        going = np.where(np.isnan(results["failed_s"]) | (time_s <= results["failed_s"]), 1.0, np.nan)[:, np.newaxis]
-        error = going * (outcome.positions[:, :, 0] - goal) * JOINT_SCALE
-        found.append(Trace(letter, point, number, time_s, error, going * outcome.efforts[:, :, 0], said))
+            outcome_text = f"fails at {results['failed_s'][0]:.2f} s"
+        # After a failure the simulated arm is parked: show no data.
+        active = np.where(np.isnan(results["failed_s"]) | (time_s <= results["failed_s"]), 1.0, np.nan)[:, np.newaxis]
+        error = active * (outcome.positions[:, :, 0] - goal) * JOINT_SCALE
+        found.append(Trace(letter, point, number, time_s, error, active * outcome.efforts[:, :, 0], outcome_text))
     return found
 
 
 def plane_figure(
-    study: StudyConfig, swept: SweepResult, number: int, points: Sequence[Trace] = (), dots: Sequence[Dot] = ()
+    study: StudyConfig, swept: SweepResult, number: int, points: Sequence[Trace] = (), markers: Sequence[Marker] = ()
 ) -> Figure:
-    """The plane of one controller: mean cost in colour, grey where runs failed, theory as lines, points and dots."""
+    """Plot the plane of one controller: mean cost as color (gray: failed runs), theory as lines, points and markers."""
     shown = [trace for trace in points if trace.controller == number]
     figure = Figure(figsize=(11, 5.2) if shown else (7, 5.2), layout="constrained", dpi=100)
     if shown:
@@ -113,7 +113,7 @@ def plane_figure(
     for axis, config in ((axes.xaxis, study.x), (axes.yaxis, study.y)):
         if config.spacing == "log":
             (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
-    theory = [one for one in swept.theory if one.controller == number]
+    theory = [entry for entry in swept.theory if entry.controller == number]
     predicts = study.controllers[number].kind == "lqr" and study.controllers[number].compensate
     _draw_theory(axes, study, theory, predicts)
     _draw_radius(axes, study, swept, number)
@@ -131,11 +131,11 @@ def plane_figure(
         (True, "#7CFC00", "live: as predicted"),
         (False, "#ff4d4d", "live: not as predicted"),
     ):
-        mine = [dot for dot in dots if dot.as_predicted is as_predicted]
+        mine = [marker for marker in markers if marker.as_predicted is as_predicted]
         if mine:
             axes.scatter(
-                [dot.x for dot in mine],
-                [dot.y for dot in mine],
+                [marker.x for marker in mine],
+                [marker.y for marker in mine],
                 c=color,
                 edgecolors="black",
                 s=46,
@@ -144,9 +144,9 @@ def plane_figure(
             )
     axes.set_xlim(*_ends(study.x))
     axes.set_ylim(*_ends(study.y))
-    axes.set_xlabel(study.x.label, color=INK)
-    axes.set_ylabel(study.y.label, color=INK)
-    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=INK)
+    axes.set_xlabel(study.x.label, color=TEXT_COLOR)
+    axes.set_ylabel(study.y.label, color=TEXT_COLOR)
+    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=TEXT_COLOR)
     axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")
@@ -164,45 +164,45 @@ def _ends(axis: AxisConfig) -> tuple[float, float]:
 
 
 def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], predicts: bool) -> None:
-    """Boundaries over the gain, where one axis is the gain and the other a time that is added."""
+    """Draw stability limits over the gain, if one axis is the gain and the other an added delay or jitter."""
     what = (study.x.what, study.y.what)
     if "gain" not in what or not theory:
         return
     other = what[0] if what[1] == "gain" else what[1]
-    gain = np.array([one.gain for one in theory])
+    gain = np.array([entry.gain for entry in theory])
     order = np.argsort(gain)
     lines: list[tuple[str, str, str, list[float]]] = []
-    # One that predicts over the latency that it measures bears less of what it does not know of.
-    unknown = ", if not measured" if predicts else ""
-    drawn = not all(math.isnan(one.mean_square_until) for one in theory)
+    # The margins of a predictor are for a latency that it does not measure.
+    unknown = ", unmeasured" if predicts else ""
+    random = not all(math.isnan(entry.mean_square_until) for entry in theory)
     if other == "delay_ms":
-        label = "spectral radius 1, without what is drawn" if drawn else "exact: spectral radius 1"
-        lines.append((label, BOUNDARY, "-", [one.stable_until_ms for one in theory]))
-        lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(one, "delay") for one in theory]))
+        label = "spectral radius 1, constant delay only" if random else "exact: spectral radius 1"
+        lines.append((label, BOUNDARY, "-", [entry.stable_until_ms for entry in theory]))
+        lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(entry, "delay") for entry in theory]))
     if other in ("delay_ms", "jitter_ms"):
-        lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(one, "jitter") for one in theory]))
-    if drawn:
-        lines.append(("stable in the mean square", MEAN_SQUARE, "-.", [one.mean_square_until for one in theory]))
-    most = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
+        lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(entry, "jitter") for entry in theory]))
+    if random:
+        lines.append(("mean-square stability limit", MEAN_SQUARE, "-.", [entry.mean_square_until for entry in theory]))
+    largest = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
     for label, color, style, values_ms in lines:
         values = np.array(values_ms)[order]
-        # What lies beyond the plane is drawn at its edge, so that lines do not end without a word.
-        values = np.where(values < 0, np.nan, np.minimum(values, 2 * most))
-        if not (values <= most).any():
+        # Values beyond the plane are clipped outside its edge, so that the lines extend to the edge.
+        values = np.where(values < 0, np.nan, np.minimum(values, 2 * largest))
+        if not (values <= largest).any():
             continue
         across, up = (values, gain[order]) if other == what[0] else (gain[order], values)
         axes.plot(across, up, color=color, linestyle=style, linewidth=1.8, label=label)
 
 
-def _margin_ms(one: GainTheory, kind: str) -> float:
-    """A margin as delay that may be added; less than none is none, for the loop's own latency is counted."""
-    if one.nominal is None or not one.nominal.stable:
+def _margin_ms(theory: GainTheory, kind: str) -> float:
+    """Return a margin as additional delay, ms; NaN if the loop is unstable at its nominal latency."""
+    if theory.nominal is None or not theory.nominal.stable:
         return math.nan
-    return 1e3 * (one.nominal.delay_margin_s if kind == "delay" else one.nominal.jitter_margin_s)
+    return 1e3 * (theory.nominal.delay_margin_s if kind == "delay" else theory.nominal.jitter_margin_s)
 
 
 def _draw_radius(axes: Axes, study: StudyConfig, swept: SweepResult, number: int) -> None:
-    """The contour of radius 1 on planes of which the gain is no axis."""
+    """Draw the contour of spectral radius 1 on planes without a gain axis."""
     if "gain" in (study.x.what, study.y.what):
         return
     radius = swept.plane(study, number, swept.radius)
@@ -217,21 +217,21 @@ def _draw_traces(panels: Sequence[Axes], shown: Sequence[Trace], study: StudyCon
                 trace.time_s, trace.error[:, joint], color=RUN_COLORS[joint], linewidth=1.0, label=f"{name}, {unit}"
             )
         where = f"{study.x.label} {trace.point.x:g}; {study.y.label} {trace.point.y:g}"
-        axes.set_title(f"{trace.letter}: {trace.outcome} ({where})", fontsize=8, loc="left", color=INK)
+        axes.set_title(f"{trace.letter}: {trace.outcome} ({where})", fontsize=8, loc="left", color=TEXT_COLOR)
         axes.tick_params(labelsize=7)
         axes.grid(color="#e5e5e5", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-        most = float(np.nanmax(np.abs(trace.error[:, :2]), initial=1e-3))
-        axes.set_ylim(-1.1 * most, 1.1 * most)
+        largest = float(np.nanmax(np.abs(trace.error[:, :2]), initial=1e-3))
+        axes.set_ylim(-1.1 * largest, 1.1 * largest)
     panels[0].legend(fontsize=7, loc="upper right", title="error", title_fontsize=7)
-    panels[-1].set_xlabel("time, s", fontsize=8, color=INK)
+    panels[-1].set_xlabel("time, s", fontsize=8, color=TEXT_COLOR)
 
 
-def save_pictures(figure: Figure, stem: Path) -> list[Path]:
-    """Write a picture as PNG and SVG.
+def save_plots(figure: Figure, stem: Path) -> list[Path]:
+    """Write a figure as PNG and SVG and return the paths.
 
     Raises:
-        OperationError: it can't be written.
+        OperationError: a file can't be written.
     """
     paths = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
     for path in paths:

@@ -1,4 +1,4 @@
-"""A study for the rerun viewer: the plane of each controller as an image, the traces as curves over time."""
+"""Export of a study to the rerun viewer: cost planes as tensors, traces as time series."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,10 +16,10 @@ from hilrig_study.sweep import SweepResult
 
 
 def save_study_rrd(study: StudyConfig, swept: SweepResult, shown: Sequence[Trace], path: Path) -> None:
-    """Write the study as a rerun recording with its layout.
+    """Write the study as a rerun recording with a layout.
 
     Raises:
-        InputError: its folder is not there.
+        InputError: the folder does not exist.
         OperationError: the file can't be written.
     """
     names = [f"{number + 1} {controller.name}" for number, controller in enumerate(study.controllers)]
@@ -38,7 +38,7 @@ def save_study_rrd(study: StudyConfig, swept: SweepResult, shown: Sequence[Trace
             rr.TextDocument(
                 f"# {study.title}\nRows: {study.y.label}, {study.y.points[0]:g} to {study.y.points[-1]:g}. "
                 f"Columns: {study.x.label}, {study.x.points[0]:g} to {study.x.points[-1]:g}. "
-                "Colour: log10 of the mean cost; the highest where a run failed.",
+                "Color: log10 of the mean cost; the highest value where a run failed.",
                 media_type=rr.MediaType.MARKDOWN,
             ),
             static=True,
@@ -47,8 +47,8 @@ def save_study_rrd(study: StudyConfig, swept: SweepResult, shown: Sequence[Trace
             cost = swept.plane(study, number, swept.results["cost"])
             finite = cost[np.isfinite(cost)]
             worst = 10 * float(finite.max()) if finite.size else 1.0
-            picture = np.log10(np.maximum(np.where(np.isfinite(cost), cost, worst), 1e-9))
-            rr.log(_entity("plane", name), rr.Tensor(picture, dim_names=(study.y.what, study.x.what)), static=True)
+            image = np.log10(np.maximum(np.where(np.isfinite(cost), cost, worst), 1e-9))
+            rr.log(_entity("plane", name), rr.Tensor(image, dim_names=(study.y.what, study.x.what)), static=True)
         for trace in shown:
             index = rr.TimeColumn(SIM_TIME, duration=trace.time_s)
             for joint, symbol in enumerate(JOINT_SYMBOLS):

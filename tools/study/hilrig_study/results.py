@@ -1,4 +1,4 @@
-"""What a study found, for other tools: every run as a row of a Parquet file, the rest as JSON."""
+"""Result files of a study: a Parquet table with one row per run, and a JSON summary."""
 
 import json
 import math
@@ -20,7 +20,7 @@ JOINTS = ("theta1", "theta2", "d3", "theta4")
 
 
 def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
-    """One row a run: what it was, what it did, and what theory says of it; units in the names, angles in rad."""
+    """Return one row per run: parameters, outcome and spectral radius; units are in the names, angles in rad."""
     names = np.array([controller.name for controller in study.controllers])
     columns: dict[str, Any] = {"controller": names[swept.cells["controller"]].tolist()}
     for name in (CELL.names or ())[3:]:
@@ -34,14 +34,14 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
 
 
 def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
-    """The study, its machine, and theory and outcome by controller and gain, as plain values."""
+    """Return the study, the machine, and outcome and theory per controller and gain, as JSON values."""
     controllers = []
     for number, controller in enumerate(study.controllers):
         settled = swept.plane(study, number, swept.results["settled"])
         theory = []
-        for one in swept.theory:
-            if one.controller == number:
-                theory.append({key: value for key, value in asdict(one).items() if key != "controller"})
+        for entry in swept.theory:
+            if entry.controller == number:
+                theory.append({key: value for key, value in asdict(entry).items() if key != "controller"})
         controllers.append(
             {
                 "name": controller.name,
@@ -51,7 +51,7 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
             }
         )
     simulated_s = len(swept.cells) * study.loop.duration_s
-    whole = {
+    values = {
         "title": study.title,
         "study": study.model_dump(mode="json"),
         "software": f"hilrig {version('hilrig')}",
@@ -62,12 +62,12 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
         "times_real_time": simulated_s / swept.seconds,
         "controllers": controllers,
     }
-    plain: dict[str, Any] = _plain(whole)
+    plain: dict[str, Any] = _plain(values)
     return plain
 
 
 def _plain(value: Any) -> Any:
-    """JSON knows no infinity and no NaN: both become null."""
+    """Return the value with infinity and NaN replaced by null, since JSON has neither."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -78,15 +78,15 @@ def _plain(value: Any) -> Any:
 
 
 def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
-    """Write `runs.parquet` and `study.json`, with `more` at its top level; gives what the JSON holds.
+    """Write `runs.parquet` and `study.json`, with `more` at its top level, and return the JSON values.
 
     Raises:
-        OperationError: the folder can't be written.
+        OperationError: a file can't be written.
     """
-    said: dict[str, Any] = summary(study, swept) | _plain(more)
+    written: dict[str, Any] = summary(study, swept) | _plain(more)
     try:
         pyarrow.parquet.write_table(run_table(study, swept), folder / "runs.parquet")
-        (folder / "study.json").write_text(json.dumps(said, indent=1), encoding="utf-8")
+        (folder / "study.json").write_text(json.dumps(written, indent=1), encoding="utf-8")
     except OSError as error:
-        raise OperationError(f"{folder}: results can't be written there: {error.strerror or error}") from error
-    return said
+        raise OperationError(f"{folder}: can't write the results: {error.strerror or error}") from error
+    return written

@@ -1,7 +1,7 @@
-"""A study's file: what is swept, by which controllers, in which task. Validated; every mistake is named with its place.
+"""Study file: swept parameters, controllers and motion task, validated with one error per invalid key.
 
-Units are those in which people type, in the name where there may be doubt (`delay_ms`); joint vectors are degrees,
-degrees, mm, degrees, as in `lab.toml`; gains are SI.
+The name of a key contains its unit where it is not obvious (`delay_ms`). Joint vectors are degrees, degrees, mm,
+degrees, as in `lab.toml`; gains are in SI units.
 """
 
 import math
@@ -22,155 +22,155 @@ from hilrig_runtime.config.validation import mistakes_in
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_NAMES, RigParameters
 from hilrig_sim.parameters import rig_parameters
-from hilrig_study.controllers.controllers import ComputedTorque, Controller, Pid
+from hilrig_study.controllers.control_laws import ComputedTorque, Controller, Pid
 from hilrig_study.controllers.lqr import PredictiveLqr
-from hilrig_study.controllers.user_controller import StudentController
+from hilrig_study.controllers.user_controller import UserController
+from hilrig_study.linear_model import LinearPlant, linearize
 from hilrig_study.simulation.simulated_loop import Scenario
 from hilrig_study.simulation.timing import LoopTiming
-from hilrig_study.theory.linear import LinearPlant, linearise
 
 Floats = NDArray[np.float64]
 
 Gains = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Swept = Literal["gain", "delay_ms", "jitter_ms", "loss", "step_ms", "poll_ms"]
-MOST_CELLS: Final = 1_000_000
+MAX_RUNS: Final = 1_000_000
 _LABELS: Final[dict[str, str]] = {
     "gain": "gain factor",
     "delay_ms": "added delay, ms",
     "jitter_ms": "added jitter, ms",
-    "loss": "share of commands lost",
-    "step_ms": "step of the simulation, ms",
-    "poll_ms": "period of the polls, ms",
+    "loss": "fraction of commands lost",
+    "step_ms": "simulation step, ms",
+    "poll_ms": "poll period, ms",
 }
 
 
 class LoopConfig(Section):
-    """The loop's own times, before anything is added."""
+    """Timing of the loop without injected delays."""
 
     step_ms: Annotated[float, Field(ge=0.5, le=1000)] = 20.0
     """Step of the simulation, ms."""
     poll_ms: Positive = 20.0
-    """From one poll of the controller to the next, ms."""
+    """Poll period of the controller, ms."""
     phase_ms: NotNegative = 5.0
-    """From a tick to the first read, ms."""
+    """Time from a tick to the first read, ms."""
     compute_ms: NotNegative = 1.0
-    """From a read to its write at the edge: the controller's time and its network, ms."""
+    """Time from a read to its write at the edge: computation and network round trip of the controller, ms."""
     transport_ms: NotNegative = 0.4
-    """Over the bus, each way, ms."""
+    """Transport time over the bus, per direction, ms."""
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
     """Length of a run, s."""
 
     def timing(self, step_ms: float | None = None, poll_ms: float | None = None) -> LoopTiming:
-        """The same in ns; a step or a period from elsewhere.
+        """Return the timing in ns; `step_ms` and `poll_ms` override the configured values.
 
         Raises:
-            InputError: the controller takes longer than its period.
+            InputError: the time from read to write is longer than the poll period.
         """
         times = (step_ms or self.step_ms, poll_ms or self.poll_ms, self.phase_ms, self.compute_ms, self.transport_ms)
         return LoopTiming(*(round(ms * 1e6) for ms in times))
 
 
-class TaskConfig(Section):
-    """What the arm is to do."""
+class MotionTaskConfig(Section):
+    """Motion task of a study."""
 
     pose: Vector4 = (17.0, 46.0, 80.0, 11.0)
-    """Where it is to be; degrees, degrees, mm, degrees."""
+    """Target pose; degrees, degrees, mm, degrees."""
     offset: Vector4 = (3.0, 3.0, 5.0, 3.0)
-    """Where it starts, from the pose."""
+    """Start position relative to the pose."""
     amplitude: Vector4 = (0.0, 0.0, 0.0, 0.0)
-    """Of a sine about the pose that is to be followed."""
+    """Amplitude of a set-point sine around the pose."""
     frequency_hz: NotNegative = 0.0
-    """Of that sine."""
+    """Frequency of the set-point sine, Hz."""
     limit: tuple[Positive, Positive, Positive, Positive] = (30.0, 30.0, 50.0, 30.0)
-    """A run whose error gets larger has failed."""
+    """Failure limit: a run fails when an error exceeds it."""
 
     def scenario(self) -> Scenario:
-        """The same in SI units."""
+        """Return the task in SI units."""
         return Scenario(_si(self.pose), _si(self.offset), _si(self.amplitude), self.frequency_hz, _si(self.limit))
 
 
 class ControllerConfig(Section):
-    """One controller, and its ways; which keys count depends on its kind."""
+    """One controller and the impairment of its links; the kind determines which keys are used."""
 
     name: str = Field(default="PD", min_length=1, max_length=40)
     kind: Literal["pd", "pid", "computed_torque", "lqr", "file"] = "pd"
     kp: Gains = (23.0, 14.0, 30.0, 0.25)
-    """pd, pid: N·m/rad, N·m/rad, N/m, N·m/rad. A gain factor multiplies kp, kd and ki."""
+    """pd, pid: N·m/rad, N·m/rad, N/m, N·m/rad. The gain factor multiplies kp, kd and ki."""
     kd: Gains = (4.6, 2.9, 2.0, 0.03)
-    """pd, pid: N·m·s/rad and so on."""
+    """pd, pid: N·m·s/rad, joint 3 in N·s/m."""
     ki: Gains = (0.0, 0.0, 0.0, 0.0)
-    """pid: N·m/(rad·s) and so on."""
+    """pid: N·m/(rad·s), joint 3 in N/(m·s)."""
     filter_ms: NotNegative = 20.0
-    """Time constant of the filter on velocities, ms; 0: plain differences."""
+    """Time constant of the velocity filter, ms; 0: no filter."""
     omega: Positive = 8.0
-    """computed_torque: natural frequency of each joint, rad/s. A gain factor multiplies it."""
+    """computed_torque: natural frequency of each joint, rad/s. The gain factor multiplies it."""
     zeta: Positive = 1.0
     """computed_torque: damping ratio."""
     effort_weight: Positive = 1.0
-    """lqr: what (1 N·m)² costs beside (1°)². A gain factor divides it by its square."""
+    """lqr: weight of (1 N·m)² relative to (1°)². It is divided by the square of the gain factor."""
     compensate: bool = True
-    """lqr: predict over the measured loop latency."""
+    """lqr: whether to predict over the measured loop latency."""
     impairment: ImpairmentSetting | None = None
-    """What is on its ways; default: the study's."""
+    """Impairment of its links; default: the study's."""
     file: Path | None = None
-    """file: a Python file with a class Controller, relative to the study's file; it gets the gain factor."""
+    """file: Python file with a class Controller, relative to the study file; the gain factor is passed to it."""
 
     @model_validator(mode="after")
-    def _file_goes_with_its_kind(self) -> "ControllerConfig":
+    def _require_file_for_its_kind(self) -> "ControllerConfig":
         if (self.kind == "file") != (self.file is not None):
-            raise ValueError('kind = "file" and a file go together')
+            raise ValueError('kind = "file" requires the key file, and file requires kind = "file"')
         return self
 
     def build(
-        self, rig: RigParameters, near: LinearPlant, period_s: float, gain: Floats, folder: Path = Path()
+        self, rig: RigParameters, plant_model: LinearPlant, period_s: float, gain: Floats, folder: Path = Path()
     ) -> Controller:
-        """The controller for runs with these gain factors, (N,).
+        """Build the controller for runs with these gain factors, (N,).
 
         Raises:
-            InputError: a student's file can't be used.
+            InputError: the controller file is not usable.
         """
         filter_s = self.filter_ms / 1e3
         match self.kind:
             case "computed_torque":
                 return ComputedTorque(rig.arm, period_s, self.omega * np.tile(gain, (4, 1)), self.zeta, filter_s)
             case "lqr":
-                return PredictiveLqr(near, period_s, self.effort_weight / gain**2, compensate=self.compensate)
+                return PredictiveLqr(plant_model, period_s, self.effort_weight / gain**2, compensate=self.compensate)
             case "file":
                 assert self.file is not None
-                return StudentController(folder / self.file, period_s, gain)
+                return UserController(folder / self.file, period_s, gain)
         kp, kd, ki = (np.array(values)[:, np.newaxis] * gain for values in (self.kp, self.kd, self.ki))
         return Pid(rig.arm, period_s, kp, kd, ki if self.kind == "pid" else np.zeros_like(kp), filter_s)
 
 
 class AxisConfig(Section):
-    """What is swept, over which values."""
+    """Swept parameter and its values."""
 
     what: Swept
     values: tuple[Number, ...] = ()
-    """The values themselves; or:"""
+    """List of values; alternative to `range`."""
     range: tuple[Number, Number] | None = None
     """First and last of `count` values."""
     count: Annotated[int, Field(ge=2, le=2000)] = 21
     spacing: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
-    def _values_make_sense(self) -> "AxisConfig":
+    def _check_values(self) -> "AxisConfig":
         if bool(self.values) == (self.range is not None):
-            raise ValueError("give either values or a range")
+            raise ValueError("give exactly one of values and range")
         least = 0.0 if self.what in ("delay_ms", "jitter_ms", "loss") else math.ulp(0.0)
         for value in self.values or self.range or ():
             if value < least:
-                what = f"{self.what} must {'not be negative' if least == 0 else 'be positive'}"
-                raise ValueError(f"{what}, found {value:g}")
+                bound = "≥ 0" if least == 0 else "> 0"
+                raise ValueError(f"{self.what} must be {bound}, got {value:g}")
             if self.what == "loss" and value > 1:
-                raise ValueError(f"loss is a share from 0 to 1, found {value:g}")
+                raise ValueError(f"loss must be between 0 and 1, got {value:g}")
         if self.spacing == "log" and self.range is not None and min(self.range) <= 0:
-            raise ValueError("a logarithmic range has no 0 in it")
+            raise ValueError(f"a logarithmic range must be > 0, got {min(self.range):g}")
         return self
 
     @property
     def points(self) -> Floats:
-        """The values, (count,)."""
+        """Values, (count,)."""
         if self.range is None:
             return np.array(self.values)
         space = np.geomspace if self.spacing == "log" else np.linspace
@@ -178,58 +178,58 @@ class AxisConfig(Section):
 
     @property
     def label(self) -> str:
-        """For an axis of a picture."""
+        """Axis label of a plot."""
         return _LABELS[self.what]
 
 
 class PointConfig(Section):
-    """A point of the plane that is looked at more closely: its traces are drawn, or it is run live."""
+    """Selected point of the plane, whose trace is plotted or which is measured live."""
 
     x: Number
     y: Number
     controller: str = ""
-    """Default: the first."""
+    """Name of the controller; default: the first one."""
 
 
 class StudyConfig(Section):
-    """A whole study."""
+    """Complete study file."""
 
     title: str = "Study"
     plant: Literal["arm", "linear"] = "arm"
-    """The arm itself with its registers and stops, or the linear system near the pose."""
+    """Nonlinear arm with hard stops, or linear model near the pose."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
     runs: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Runs of each cell, which differ in what is drawn: more than one where something is random."""
+    """Runs per cell with different random draws; a cell without random values is run once."""
     arm: ArmConfig = ArmConfig()
     loop: LoopConfig = LoopConfig()
-    task: TaskConfig = TaskConfig()
+    task: MotionTaskConfig = MotionTaskConfig()
     impairment: ImpairmentSetting = ImpairmentSetting()
-    """What is on both ways before the sweep adds to the command's."""
+    """Impairment of both links; swept delay, jitter and loss are added to the command link."""
     controllers: Annotated[tuple[ControllerConfig, ...], Field(min_length=1)] = (ControllerConfig(),)
     x: AxisConfig
     y: AxisConfig
     traces: tuple[PointConfig, ...] = ()
     live: tuple[PointConfig, ...] = ()
-    """Points that --live runs over Modbus TCP."""
+    """Points that --live measures over Modbus TCP."""
     live_duration_s: Annotated[float, Field(ge=2, le=600)] = 10.0
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "StudyConfig":
+    def _check_consistency(self) -> "StudyConfig":
         if self.x.what == self.y.what:
-            raise ValueError(f"x and y both sweep {self.x.what}")
+            raise ValueError(f"x and y sweep the same parameter {self.x.what}")
         names = [controller.name for controller in self.controllers]
         if len(set(names)) < len(names):
-            raise ValueError("two controllers have the same name")
+            raise ValueError(f"controller names must be unique, got {', '.join(names)}")
         for point in (*self.traces, *self.live):
             if point.controller and point.controller not in names:
-                raise ValueError(f"no controller is called {point.controller!r}; there are {', '.join(names)}")
+                raise ValueError(f"unknown controller {point.controller!r}: expected one of {', '.join(names)}")
         cells = len(self.x.points) * len(self.y.points) * len(names) * self.runs
-        if cells > MOST_CELLS:
-            raise ValueError(f"{cells:,} runs are more than {MOST_CELLS:,}: take fewer values")
+        if cells > MAX_RUNS:
+            raise ValueError(f"too many runs: at most {MAX_RUNS:,}, got {cells:,}; use fewer values")
         return self
 
     @model_validator(mode="after")
-    def _starts_between_its_stops(self) -> "StudyConfig":
+    def _check_start_position(self) -> "StudyConfig":
         joints = zip(
             JOINT_NAMES,
             self.task.pose,
@@ -241,16 +241,16 @@ class StudyConfig(Section):
         for joint, pose, offset, lower, upper in joints:
             if not lower <= pose + offset <= upper:
                 raise ValueError(
-                    f"task: {joint} would start at {pose + offset:g} (pose {pose:g}, offset {offset:g}): "
-                    f"expected {lower:g} to {upper:g}"
+                    f"task: {joint} must start between its stops {lower:g} and {upper:g}, "
+                    f"got {pose + offset:g} (pose {pose:g} + offset {offset:g})"
                 )
         return self
 
     def with_files(self, paths: Sequence[Path]) -> "StudyConfig":
-        """The same with more controllers, each out of a Python file and called like it.
+        """Return the study with additional controllers from Python files, named after the files.
 
         Raises:
-            InputError: there is no such file.
+            InputError: a file does not exist.
         """
         for path in paths:
             if not path.is_file():
@@ -259,16 +259,16 @@ class StudyConfig(Section):
         return self.model_copy(update={"controllers": (*self.controllers, *more)})
 
     def rig(self, step_ms: float | None = None) -> RigParameters:
-        """The arm's parameters with this step; it starts where the task does, with nothing around it.
+        """Return the rig parameters for a step, with the task's start position and an empty scene.
 
         Raises:
-            InputError: they do not fit together.
+            InputError: the parameters are inconsistent.
         """
         lab = self.lab(step_ms)
         return rig_parameters(lab, lab.rigs[0])
 
     def lab(self, step_ms: float | None = None) -> LabConfig:
-        """A lab with this arm alone, which starts where the task does."""
+        """Return a lab with one rig, the task's start position and an empty scene."""
         step = step_ms or self.loop.step_ms
         substeps = max(1, math.ceil(step / 20.0))
         start = tuple(p + o for p, o in zip(self.task.pose, self.task.offset, strict=True))
@@ -283,44 +283,46 @@ class StudyConfig(Section):
             raise InputError("; ".join(mistakes_in(error))) from error
 
     def ways(self, controller: int) -> Ways:
-        """What is on a controller's ways before the sweep adds to the command's."""
+        """Return the link impairments of a controller, without the swept values."""
         own = self.controllers[controller].impairment
         return (self.impairment if own is None else own).ways
 
-    def near(self) -> LinearPlant:
-        """The arm near the task's pose.
+    def linear_plant(self) -> LinearPlant:
+        """Return the linear model of the arm at the task's pose.
 
         Raises:
             InputError: the pose is at or beyond a stop.
         """
-        return linearise(self.rig().arm, _si(self.task.pose))
+        return linearize(self.rig().arm, _si(self.task.pose))
 
-    def discretised(self, step_ms: float) -> tuple[Floats, Floats]:
-        """Φ, (8, 8), and Γ, (8, 4), of the arm near the task's pose, as the study steps it: by the simulation's
-        integrator, or exactly."""
+    def discretized_plant(self, step_ms: float) -> tuple[Floats, Floats]:
+        """Return Φ, (8, 8), and Γ, (8, 4), of the linear model, discretized as the study steps its plant.
+
+        The method is the simulation's integrator for the nonlinear arm, and exact for the linear model.
+        """
         sim = self.rig(step_ms).sim
-        how = (sim.integrator, sim.substeps) if self.plant == "arm" else ()
-        return self.near().discretise(sim.step_ns * 1e-9, *how)
+        method = (sim.integrator, sim.substeps) if self.plant == "arm" else ()
+        return self.linear_plant().discretize(sim.step_ns * 1e-9, *method)
 
 
 def load_study(path: Path) -> StudyConfig:
-    """Read a study's file.
+    """Read and validate a study file.
 
     Raises:
-        InputError: it can't be read, is no TOML, or says something that is no study; every mistake is named.
+        InputError: the file can't be read, is not valid TOML, or is not a valid study; the message has every error.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError(f"{path}: can't be read: {reason}") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: no valid TOML: {error}") from error
+        raise InputError(f"{path}: invalid TOML: {error}") from error
     try:
         study = StudyConfig.model_validate(values)
     except ValidationError as error:
         raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes_in(error))) from error
-    study.near()
+    study.linear_plant()
     study.loop.timing()
     return study
 

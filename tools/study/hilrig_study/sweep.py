@@ -1,8 +1,8 @@
-"""A study's plane of cells, run in virtual time in batches on all cores, with what theory says of each.
+"""Parameter sweep of a study: simulates all cells in batches on all cores and computes the theory of each.
 
-A cell is a controller and a point (x, y); it is run `runs` times with seeds of its own. Cells that share the step and
-the poll's period step together. What is drawn depends on the study's seed and the cell alone, so a study gives the same
-numbers on one core and on many.
+A cell is a controller and a point (x, y); it is simulated `runs` times with different seeds. Cells with the same step
+and poll period are simulated together. Random draws depend only on the seed of the study and the number of the run, so
+the results do not depend on the number of cores.
 """
 
 import math
@@ -24,12 +24,12 @@ from hilrig_study.simulation.simulated_loop import Outcome, simulate
 from hilrig_study.simulation.timing import LoopTiming, Timeline, poll_count, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.theory.gain_theory import GainTheory, gain_theory
-from hilrig_study.theory.mean_square import TICKS, stable_until
+from hilrig_study.theory.mean_square import CHAIN_TICKS, stable_until
 
 Floats = NDArray[np.float64]
 
-BATCH: Final = 1000
-"""Runs that step together: their arrays stay in a core's cache."""
+MAX_BATCH_RUNS: Final = 1000
+"""Upper limit of runs per batch, chosen so that the arrays of a batch fit into the cache of a core."""
 
 CELL: Final = np.dtype(
     [
@@ -45,7 +45,7 @@ CELL: Final = np.dtype(
         ("poll_ms", "<f8"),
     ]
 )
-"""One row a run."""
+"""Row type of a run's parameters."""
 
 RESULT: Final = np.dtype(
     [
@@ -57,25 +57,25 @@ RESULT: Final = np.dtype(
         ("loop_p99_ms", "<f8"),
     ]
 )
-"""What a run did; units as in `Outcome`."""
+"""Row type of a run's results; units as in `Outcome`."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """All runs of a study, and its theory."""
+    """Results of all runs of a study, and the theory."""
 
     cells: NDArray[np.void]
     """(R,), fields as `CELL`."""
     results: NDArray[np.void]
     """(R,), fields as `RESULT`."""
     radius: Floats
-    """Spectral radius of each run's loop; NaN where its delay is not constant or its controller has no law, (R,)."""
+    """Spectral radius of each run's loop, (R,); NaN: its delay is random, or its controller has no linear model."""
     theory: tuple[GainTheory, ...]
     seconds: float
-    """What it took."""
+    """Duration of the sweep."""
 
     def plane(self, study: StudyConfig, controller: int, values: NDArray[np.generic]) -> Floats:
-        """A value a run, (R,), as the mean of each cell, (len(y), len(x))."""
+        """Return the mean over the runs of each cell, (len(y), len(x)), of one value per run, (R,)."""
         mine = self.cells["controller"] == controller
         shape = (len(study.y.points), len(study.x.points))
         total, count = np.zeros(shape), np.zeros(shape)
@@ -85,13 +85,13 @@ class SweepResult:
         return total / count
 
 
-_Asked = tuple[int, float, float, float]
-"""Controller, gain, step and period, ms."""
+_TheoryKey = tuple[int, float, float, float]
+"""Controller, gain, step, ms, and poll period, ms."""
 _Theory = tuple[GainTheory, dict[float, float]]
 
 
-def cells_of(study: StudyConfig) -> NDArray[np.void]:
-    """Every run of a study, (R,), fields as `CELL`."""
+def all_cells(study: StudyConfig) -> NDArray[np.void]:
+    """Return all runs of a study, (R,), fields as `CELL`."""
     x, y = study.x.points, study.y.points
     controllers, iy, ix, runs = (
         index.ravel()
@@ -108,9 +108,9 @@ def cells_of(study: StudyConfig) -> NDArray[np.void]:
     cells["gain"], cells["step_ms"], cells["poll_ms"] = 1.0, study.loop.step_ms, study.loop.poll_ms
     cells[study.x.what], cells[study.y.what] = x[ix], y[iy]
     if "poll_ms" not in (study.x.what, study.y.what) and study.loop.poll_ms == study.loop.step_ms:
-        # A loop that polls once a step goes on doing so.
+        # A loop with one poll per step keeps one poll per step.
         cells["poll_ms"] = cells["step_ms"]
-    # Where nothing is drawn, a second run would be the first again.
+    # Without random draws, further runs would repeat the first one.
     chosen: NDArray[np.void] = cells[(cells["run"] == 0) | ~_constant(study, cells)]
     return chosen
 
@@ -118,26 +118,28 @@ def cells_of(study: StudyConfig) -> NDArray[np.void]:
 def run_cells(
     study: StudyConfig, cells: NDArray[np.void], folder: Path = Path(), *, keep: bool = False
 ) -> tuple[NDArray[np.void], Outcome]:
-    """Run cells that share controller, step and period; their results, (R,), and what the runs did, with `keep` whole.
+    """Simulate cells with the same controller, step and period; return the results, (R,), and the outcome.
+
+    With `keep`, the outcome contains the traces.
 
     Raises:
-        InputError: a controller raised or gave no numbers, or a value is none that a loop can have.
+        InputError: a controller raised an exception or returned invalid efforts, or a value is out of range.
     """
     first = cells[0]
     timing = study.loop.timing(float(first["step_ms"]), float(first["poll_ms"]))
     ticks = max(1, round(study.loop.duration_s * 1e9 / timing.step_ns))
     lines = timelines(study, cells, timing, ticks)
-    rig, near, scenario = study.rig(float(first["step_ms"])), study.near(), study.task.scenario()
+    rig, plant_model, scenario = study.rig(float(first["step_ms"])), study.linear_plant(), study.task.scenario()
     plant: StudyPlant
     if study.plant == "arm":
         plant = ArmPlant(rig, scenario.start, scenario.pose, len(cells))
     else:
-        plant = LinearArms(near, *study.discretised(float(first["step_ms"])), scenario.start, len(cells))
+        plant = LinearArms(plant_model, *study.discretized_plant(float(first["step_ms"])), scenario.start, len(cells))
     gain = np.ascontiguousarray(cells["gain"])
     config = study.controllers[first["controller"]]
-    controller = config.build(rig, near, timing.period_ns * 1e-9, gain, folder)
+    controller = config.build(rig, plant_model, timing.period_ns * 1e-9, gain, folder)
     outcome = simulate(
-        plant, controller, scenario, lines, ticks=ticks, holding=near.holding, keep=np.full(len(cells), keep)
+        plant, controller, scenario, lines, ticks=ticks, holding=plant_model.holding, keep=np.full(len(cells), keep)
     )
     results = np.zeros(len(cells), RESULT)
     results["cost"], results["settled"], results["failed_s"] = outcome.cost, outcome.settled, outcome.failed_s
@@ -153,16 +155,16 @@ def run_cells(
 
 
 def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDArray[np.void]:
-    """The run of one point of the plane, which need not be one of the sweep's: (1,), fields as `CELL`."""
+    """Return the run of any point of the plane, (1,), fields as `CELL`."""
     axes = {"x": {"what": study.x.what, "values": (x,)}, "y": {"what": study.y.what, "values": (y,)}}
     plane = {"x": AxisConfig.model_validate(axes["x"]), "y": AxisConfig.model_validate(axes["y"]), "runs": 1}
-    cells = cells_of(study.model_copy(update=plane))
+    cells = all_cells(study.model_copy(update=plane))
     mine: NDArray[np.void] = cells[cells["controller"] == controller]
     return mine
 
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
-    """The timeline of each cell's run, all of one controller; runs whose times are the same share one."""
+    """Return the timeline of each run, all of one controller; runs with equal timing share one object."""
     ways = study.ways(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
     known: dict[tuple[float, ...], Timeline] = {}
@@ -170,7 +172,7 @@ def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, t
     for cell in cells:
         delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
         random = jitter_ms > 0 or loss > 0 or not ways.do_nothing
-        # A run's draws depend on the study's seed and its number alone: cells beside each other meet the same luck.
+        # The draws depend only on the study's seed and the run number: all cells use common random numbers.
         key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
         if key not in known:
             seed = np.random.SeedSequence(study.seed, spawn_key=(int(cell["run"]),))
@@ -190,45 +192,50 @@ def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, t
 
 
 def sweep(
-    study: StudyConfig, folder: Path, tick: Callable[[float], None], *, workers: int | None = None, theory: bool = True
+    study: StudyConfig,
+    folder: Path,
+    progress: Callable[[float], None],
+    *,
+    workers: int | None = None,
+    theory: bool = True,
 ) -> SweepResult:
-    """Run a study on all cores.
+    """Simulate a study on all cores.
 
     Args:
         study: the study.
-        folder: of the study's file: students' files are named from there.
-        tick: hears the share of the work that is done.
-        workers: processes; default: one a core.
-        theory: whether theory is asked too.
+        folder: folder of the study file; controller files are relative to it.
+        progress: called with the completed fraction of the work.
+        workers: number of processes; default: one per core.
+        theory: whether the theory is computed too.
 
     Raises:
         InputError: as `run_cells`.
     """
-    begin = time.perf_counter()
-    cells = cells_of(study)
-    parts = list(_batches(cells))
+    start_s = time.perf_counter()
+    cells = all_cells(study)
+    batch_rows = list(_batches(cells))
     delays = sorted(set(cells["delay_ms"].tolist()))
-    asked = np.unique(cells[["controller", "gain", "step_ms", "poll_ms"]]) if theory else cells[:0]
+    keys = np.unique(cells[["controller", "gain", "step_ms", "poll_ms"]]) if theory else cells[:0]
     results = np.zeros(len(cells), RESULT)
     radius = np.full(len(cells), np.nan)
     found: list[GainTheory] = []
     constant = _constant(study, cells)
-    total, done = len(parts) * 20 + len(asked), 0
-    with all_cores(len(parts) + len(asked), workers) as executor:
+    total, done = len(batch_rows) * 20 + len(keys), 0
+    with all_cores(len(batch_rows) + len(keys), workers) as executor:
         batches: dict[Future[NDArray[np.void]], NDArray[np.intp]] = {
-            executor.submit(_results_of, study, cells[rows], folder): rows for rows in parts
+            executor.submit(_results_of, study, cells[rows], folder): rows for rows in batch_rows
         }
-        theories: dict[Future[_Theory | None], _Asked] = {
-            executor.submit(_theory_of, study, row, delays): row for row in asked.tolist()
+        theories: dict[Future[_Theory | None], _TheoryKey] = {
+            executor.submit(_theory_of, study, row, delays): row for row in keys.tolist()
         }
         for batch in as_completed(batches):
             results[batches[batch]] = batch.result()
             done += 20
-            tick(done / total)
-        for one in as_completed(theories):
-            one.result()
+            progress(done / total)
+        for completed in as_completed(theories):
+            completed.result()
             done += 1
-            tick(done / total)
+            progress(done / total)
         for theory_future, row in theories.items():
             answer = theory_future.result()
             if answer is None:
@@ -238,51 +245,51 @@ def sweep(
             mine = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
             mine &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
             radius[mine] = [answer[1][delay] for delay in cells["delay_ms"][mine].tolist()]
-    return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - begin)
+    return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - start_s)
 
 
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Where nothing is random."""
-    nothing = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
-    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & nothing[cells["controller"]])
+    """Return which runs have no random values, (R,)."""
+    unimpaired = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
+    return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & unimpaired[cells["controller"]])
 
 
 def _batches(cells: NDArray[np.void]) -> Iterator[NDArray[np.intp]]:
-    """Rows of runs that can step together, at most `BATCH` each."""
+    """Yield the rows of runs that can be simulated together, at most `MAX_BATCH_RUNS` each."""
     groups: dict[tuple[float, ...], list[int]] = {}
     for row, cell in enumerate(cells[["controller", "step_ms", "poll_ms"]].tolist()):
         groups.setdefault(cell, []).append(row)
     for rows in groups.values():
-        for begin in range(0, len(rows), BATCH):
-            yield np.array(rows[begin : begin + BATCH], dtype=np.intp)
+        for first in range(0, len(rows), MAX_BATCH_RUNS):
+            yield np.array(rows[first : first + MAX_BATCH_RUNS], dtype=np.intp)
 
 
 def _results_of(study: StudyConfig, cells: NDArray[np.void], folder: Path) -> NDArray[np.void]:
     return run_cells(study, cells, folder)[0]
 
 
-def _theory_of(study: StudyConfig, asked: _Asked, delays_ms: Sequence[float]) -> _Theory | None:
-    controller, gain, step_ms, poll_ms = asked
+def _theory_of(study: StudyConfig, key: _TheoryKey, delays_ms: Sequence[float]) -> _Theory | None:
+    controller, gain, step_ms, poll_ms = key
     found = gain_theory(study, controller, gain, step_ms, poll_ms, delays_ms)
     if found is None:
         return None
-    return replace(found[0], mean_square_until=_mean_square_until(study, asked)), found[1]
+    return replace(found[0], mean_square_until=_mean_square_until(study, key)), found[1]
 
 
-def _mean_square_until(study: StudyConfig, asked: _Asked) -> float:
-    controller, gain, step_ms, poll_ms = asked
+def _mean_square_until(study: StudyConfig, key: _TheoryKey) -> float:
+    controller, gain, step_ms, poll_ms = key
     config, axes = study.controllers[controller], (study.x, study.y)
     others = [axis for axis in axes if axis.what in ("delay_ms", "jitter_ms", "loss")]
-    drawn = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
+    random = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
     predicts = config.kind == "lqr" and config.compensate
-    if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not drawn or predicts or poll_ms != step_ms:
+    if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not random or predicts or poll_ms != step_ms:
         return math.nan
     timing = study.loop.timing(step_ms, poll_ms)
 
     def ages_at(value: float) -> NDArray[np.int64]:
         cell = np.zeros(1, CELL)
         cell["controller"], cell["step_ms"], cell["poll_ms"], cell[others[0].what] = controller, step_ms, poll_ms, value
-        (line,) = timelines(study, cell, timing, TICKS)
+        (line,) = timelines(study, cell, timing, CHAIN_TICKS)
         return line.ages()
 
     return stable_until(study, controller, gain, step_ms, np.sort(others[0].points).tolist(), ages_at)

@@ -1,1 +1,1 @@
-"""From recording streams to the messages of a session: queue, sessions and pre-roll."""
+"""Assigns received messages to sessions: ingest queue, session tracking and pre-roll."""

@@ -1,6 +1,7 @@
-"""Sessions that a person begins and ends with `hilrig record`; the recorder keeps them, as the edge keeps the others.
+"""Manual sessions: started and stopped with `hilrig record`, and owned by the recorder.
 
-Beginning one only says so on the recorder's own log stream: from there on it is a session like any other.
+Starting one publishes an event on the recorder's own recording stream. From then on it is recorded like a session of an
+edge.
 """
 
 import random
@@ -11,47 +12,52 @@ from hilrig_runtime.process.session_id import session_id
 from hilrig_schemas import Event, OpenSession
 
 
-class HandSessions:
-    """At most one session by hand for each rig that `is_there`."""
+class ManualSessions:
+    """The open manual sessions, at most one per rig.
 
-    def __init__(self, is_there: Callable[[str], bool], letters: random.Random) -> None:
-        self._is_there = is_there
-        self._letters = letters
+    Args:
+        rig_exists: whether this recorder records a rig of that name.
+        rng: random generator of the session ids.
+    """
+
+    def __init__(self, rig_exists: Callable[[str], bool], rng: random.Random) -> None:
+        self._rig_exists = rig_exists
+        self._rng = rng
         self._open: dict[str, OpenSession] = {}
 
     @property
     def sessions(self) -> list[OpenSession]:
-        """Those that go on, as the log stream states them."""
+        """The open sessions, as announced on the recording stream."""
         return list(self._open.values())
 
     def restore(self, session: OpenSession) -> None:
-        """Go on with a session of a recorder that did not end it."""
+        """Continue a session that a previous recorder did not end."""
         self._open.setdefault(session.rig, session)
 
-    def begin(self, rig: str, wall_ns: int) -> Event:
-        """Begin one; the event to send.
+    def start(self, rig: str, wall_ns: int) -> Event:
+        """Start a session; returns the event to publish.
 
         Raises:
-            OperationError: there is no such rig, or it is being recorded by hand already.
+            OperationError: the rig does not exist, or has an open manual session.
         """
-        if not self._is_there(rig):
-            raise OperationError(f"there is no rig {rig!r} in this lab: `hilrig rig list` names those that there are")
+        if not self._rig_exists(rig):
+            raise OperationError(f"there is no rig {rig!r} in this lab; `hilrig rig list` lists the rigs")
         if rig in self._open:
-            raise OperationError(f"{rig} is being recorded by hand already: {self._open[rig].session}")
-        session = session_id(rig, wall_ns, self._letters)
+            raise OperationError(f"{rig}: manual recording {self._open[rig].session} is already running")
+        session = session_id(rig, wall_ns, self._rng)
         self._open[rig] = OpenSession(rig=rig, session=session, start_wall_ns=wall_ns)
-        return self._event(Event.SESSION_START, rig, session, "begun by hand")
+        return self._event(Event.SESSION_START, rig, session, "started manually")
 
-    def end(self, rig: str) -> Event:
-        """End one; the event to send.
+    def stop(self, rig: str) -> Event:
+        """End a session; returns the event to publish.
 
         Raises:
-            OperationError: the rig is not being recorded by hand.
+            OperationError: the rig has no open manual session.
         """
         session = self._open.pop(rig, None)
         if session is None:
-            raise OperationError(f"{rig} is not being recorded by hand")
-        return self._event(Event.SESSION_END, rig, session.session, "ended by hand")
+            raise OperationError(f"{rig}: no manual recording is running")
+        return self._event(Event.SESSION_END, rig, session.session, "ended manually")
 
     @staticmethod
     def _event(kind: Event.Kind, rig: str, session: str, reason: str) -> Event:

@@ -1,65 +1,65 @@
-"""The last seconds of one rig, in sessions or not, so that a session's file can begin before its start.
+"""Pre-roll buffer: the last seconds of one rig, so that a session's file can begin before the start of the session.
 
-Messages are encoded as they come and wait until they are cut off as a block, about once a second: a block goes into
-every file that is open, and stays as pre-roll for the next. Nothing about a message is kept but its record: for a large
-lab these are a hundred thousand, and keeping them must not cost as much as recording them.
+Messages are encoded on arrival and collected until they are flushed as a block, about once a second. A block is written
+to every open file and stays in the buffer as pre-roll of the next session. Only the encoded records are stored: in a
+large lab these are a hundred thousand, and buffering must cost less than recording.
 """
 
 from collections import deque
 from dataclasses import dataclass, field
 
 from hilrig_recorder.ingest.recording import Recording
-from hilrig_recorder.ingest.sources import Source
+from hilrig_recorder.ingest.sources import PublisherState
 
 
 @dataclass(slots=True, eq=False)
-class RigLog:
-    """What is kept of a rig; times are wall clock, ns, where they are not said to be monotonic."""
+class PreRollBuffer:
+    """Buffered messages, publishers and open recordings of a rig; times are wall clock, ns, except `due_ns`."""
 
     name: str
     due_ns: int = 0
-    """When the next block is cut off, monotonic clock."""
+    """Time of the next block, monotonic clock, ns."""
     recordings: list[Recording] = field(default_factory=list)
-    sources: dict[str, Source] = field(default_factory=dict)
-    """The run of each service, by name, that sends of this rig."""
-    waiting: list[bytes] = field(default_factory=list)
-    """Messages that are in no block yet; always the same list."""
+    publishers: dict[str, PublisherState] = field(default_factory=dict)
+    """The current instance of each service that publishes messages of this rig, by source."""
+    pending: list[bytes] = field(default_factory=list)
+    """Messages that are not in a block yet; always the same list object."""
     _blocks: deque[tuple[int, list[bytes]]] = field(default_factory=deque)
     _losses: deque[tuple[int, int, int]] = field(default_factory=deque)
 
-    def cut(self, wall_ns: int) -> None:
-        """Make a block of what waits, and give it to the recordings."""
-        if not self.waiting:
+    def flush_block(self, wall_ns: int) -> None:
+        """Move the pending messages into a block and write it to the open recordings."""
+        if not self.pending:
             return
-        block = self.waiting.copy()
-        self.waiting.clear()
+        block = self.pending.copy()
+        self.pending.clear()
         self._blocks.append((wall_ns, block))
-        # A recording whose disk fails takes itself out.
+        # A recording whose write fails removes itself from the list.
         for recording in self.recordings.copy():
-            recording.take(block)
+            recording.write(block)
 
-    def lose(self, wall_ns: int, transport: int, recorder: int) -> None:
-        """Count messages that are missing, in every recording and for those that begin soon."""
+    def record_loss(self, wall_ns: int, transport: int, recorder: int) -> None:
+        """Count lost messages, in the open recordings and in those that start within the pre-roll time."""
         self._losses.append((wall_ns, transport, recorder))
         for recording in self.recordings:
-            self._state(recording, transport, recorder)
+            self._count_loss(recording, transport, recorder)
 
-    def begin(self, recording: Recording, horizon_ns: int) -> None:
-        """Let a recording begin with what arrived since `horizon_ns`; what waits must have been cut off before."""
+    def add(self, recording: Recording, horizon_ns: int) -> None:
+        """Add a recording and write the messages that arrived since `horizon_ns`. Call `flush_block` before."""
         for _, transport, recorder in self._losses:
-            self._state(recording, transport, recorder)
+            self._count_loss(recording, transport, recorder)
         self.recordings.append(recording)
-        recording.take([record for _, block in self._blocks for record in block], horizon_ns)
+        recording.write([record for _, block in self._blocks for record in block], horizon_ns)
 
     @staticmethod
-    def _state(recording: Recording, transport: int, recorder: int) -> None:
-        recording.tally.lost_transport += transport
-        recording.tally.lost_recorder += recorder
-        recording.stated += transport + recorder
+    def _count_loss(recording: Recording, transport: int, recorder: int) -> None:
+        recording.counters.lost_transport += transport
+        recording.counters.lost_recorder += recorder
+        recording.counted_losses += transport + recorder
 
-    def forget(self, horizon_ns: int, wall_ns: int) -> None:
-        """Drop what is older than `horizon_ns`."""
-        # A clock set back would keep what is stamped in its future for ever.
+    def evict(self, horizon_ns: int, wall_ns: int) -> None:
+        """Remove blocks and losses older than `horizon_ns`."""
+        # Entries stamped in the future are removed too: after a backward clock step they would stay for hours.
         while self._blocks and not horizon_ns <= self._blocks[0][0] <= wall_ns:
             self._blocks.popleft()
         while self._losses and not horizon_ns <= self._losses[0][0] <= wall_ns:

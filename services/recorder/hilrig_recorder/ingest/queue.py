@@ -1,9 +1,8 @@
-"""From the bus to the recorder: a bounded queue, and what had to be dropped when it was full.
+"""The ingest queue: a bounded queue between the bus and the recorder's thread that counts dropped messages.
 
-The bus's callback decodes a batch's envelope (not the messages in it), stamps its arrival and enqueues it. When the
-queue is full the messages of a batch are dropped but not forgotten: their number for each key takes the batch's
-place in the queue, so that what follows is not mistaken for a loss on the way. Events are kept, for they begin and
-end sessions.
+The bus callback decodes the envelope of a batch (not its messages), stamps its arrival and enqueues it. If the queue is
+full, the messages of the batch are dropped, and their number per key is enqueued in place of the batch. So later
+messages do not look like the first ones after a transport loss. Events are kept, because they start and end sessions.
 """
 
 import threading
@@ -19,59 +18,59 @@ from hilrig_schemas import LogBatch
 from hilrig_schemas.topics import EVENT
 
 _EVENT_SUFFIX: Final = f"/{EVENT.name}"
-EVENT_LIMIT: Final = 10_000
-"""Events kept of what was dropped; a recorder that is stuck for hours must not grow without end."""
+MAX_EVENTS_PER_OVERFLOW: Final = 10_000
+"""Maximum number of events kept from dropped batches; it bounds the memory of a recorder that is blocked for hours."""
 
 
 @dataclass(slots=True)
-class Drop:
-    """Messages of one key that were dropped."""
+class DroppedMessages:
+    """Messages of one key that were dropped because the queue was full."""
 
     count: int = 0
     last_sequence: int = 0
 
 
 @dataclass(slots=True)
-class Arrival:
-    """A batch as it came in, or what is left of one or more that had to be dropped."""
+class ReceivedBatch:
+    """A received batch, or an overflow marker that replaces one or more dropped batches."""
 
     batch: LogBatch
     wall_ns: int
     """Arrival, wall clock, ns."""
-    dropped: dict[str, Drop] = field(default_factory=dict)
-    """What is missing from it because the queue was full, by key."""
-    batches: int = 1
-    """How many batches it stands for."""
-    waiting: int = 0
-    """Messages that count against the queue's capacity."""
+    dropped: dict[str, DroppedMessages] = field(default_factory=dict)
+    """Messages dropped because the queue was full, by key."""
+    batch_count: int = 1
+    """Number of batches that it represents."""
+    message_count: int = 0
+    """Messages that count against the capacity of the queue."""
 
 
-class Intake:
-    """The queue; `offer` is for the bus's thread, `take` for the recorder's."""
+class IngestQueue:
+    """The queue; the bus thread calls `put`, the recorder's thread calls `get`."""
 
     def __init__(self, capacity: int, clock: Clock) -> None:
         self.capacity = capacity
         self.received = 0
-        """Messages taken in."""
+        """Messages received, including dropped ones."""
         self.dropped = 0
         """Messages dropped because the queue was full."""
         self.malformed = 0
         """Batches that could not be decoded."""
         self._wall_ns = clock.wall_ns
-        self._queue: SimpleQueue[Arrival] = SimpleQueue()
-        self._taken = 0
-        self._entered = 0
-        # Drops of a source pile up in one entry of the queue until a batch of that source gets in again.
-        self._dropping: dict[str, Arrival] = {}
+        self._queue: SimpleQueue[ReceivedBatch] = SimpleQueue()
+        self._removed = 0
+        self._added = 0
+        # One overflow marker per source, until a batch of that source is enqueued again.
+        self._markers: dict[str, ReceivedBatch] = {}
         self._lock = threading.Lock()
 
     @property
     def depth(self) -> int:
-        """Messages that wait."""
-        return self._entered - self._taken
+        """Messages in the queue."""
+        return self._added - self._removed
 
-    def offer(self, key: str, payload: bytes) -> None:  # noqa: ARG002
-        """Take a batch from the bus; never blocks."""
+    def put(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+        """Enqueue a batch from the bus; never blocks."""
         wall_ns = self._wall_ns()
         try:
             batch = LogBatch.FromString(payload)
@@ -84,52 +83,52 @@ class Intake:
             return
         with self._lock:
             self.received += count
-            # An empty queue takes a batch of any size: a small capacity must not lock a large lab out.
+            # An empty queue accepts a batch of any size, so that a small capacity does not exclude a large lab.
             if self.depth + count <= self.capacity or not self.depth:
-                self._entered += count
-                if self._dropping:
-                    self._dropping.pop(batch.source, None)
-                self._queue.put(Arrival(batch, wall_ns, waiting=count))
+                self._added += count
+                if self._markers:
+                    self._markers.pop(batch.source, None)
+                self._queue.put(ReceivedBatch(batch, wall_ns, message_count=count))
             else:
                 self._drop(batch, wall_ns)
 
     def _drop(self, batch: LogBatch, wall_ns: int) -> None:
-        pile = self._dropping.get(batch.source)
-        if pile is not None and pile.batch.incarnation != batch.incarnation:
-            pile = None
-        fresh = pile is None
-        if pile is None:
-            pile = self._dropping[batch.source] = Arrival(
-                LogBatch(source=batch.source, incarnation=batch.incarnation), wall_ns, batches=0
+        marker = self._markers.get(batch.source)
+        if marker is not None and marker.batch.incarnation != batch.incarnation:
+            marker = None
+        is_new = marker is None
+        if marker is None:
+            marker = self._markers[batch.source] = ReceivedBatch(
+                LogBatch(source=batch.source, incarnation=batch.incarnation), wall_ns, batch_count=0
             )
         kept: list[Entry] = []
         for entry in entries_of(batch):
             key, sequence, *_ = entry
-            if key.endswith(_EVENT_SUFFIX) and len(pile.batch.keys) + len(kept) < EVENT_LIMIT:
+            if key.endswith(_EVENT_SUFFIX) and len(marker.batch.keys) + len(kept) < MAX_EVENTS_PER_OVERFLOW:
                 kept.append(entry)
                 continue
-            drop = pile.dropped.setdefault(key, Drop())
-            drop.count += 1
-            drop.last_sequence = sequence
+            dropped = marker.dropped.setdefault(key, DroppedMessages())
+            dropped.count += 1
+            dropped.last_sequence = sequence
             self.dropped += 1
-        put_entries(pile.batch, kept)
-        pile.batch.sequence = batch.sequence
-        pile.batches += 1
+        put_entries(marker.batch, kept)
+        marker.batch.sequence = batch.sequence
+        marker.batch_count += 1
         if batch.complete_sessions or batch.sessions:
-            pile.batch.complete_sessions = batch.complete_sessions
-            del pile.batch.sessions[:]
-            pile.batch.sessions.extend(batch.sessions)
-        if fresh:
-            self._queue.put(pile)
+            marker.batch.complete_sessions = batch.complete_sessions
+            del marker.batch.sessions[:]
+            marker.batch.sessions.extend(batch.sessions)
+        if is_new:
+            self._queue.put(marker)
 
-    def take(self, timeout_s: float) -> Arrival | None:
-        """The next batch in order of arrival; None: nothing came in time."""
+    def get(self, timeout_s: float) -> ReceivedBatch | None:
+        """The next batch in order of arrival; None: no batch arrived within the timeout."""
         try:
-            arrival = self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
+            received = self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
         except Empty:
             return None
         with self._lock:
-            if self._dropping.get(arrival.batch.source) is arrival:
-                del self._dropping[arrival.batch.source]
-            self._taken += arrival.waiting
-        return arrival
+            if self._markers.get(received.batch.source) is received:
+                del self._markers[received.batch.source]
+            self._removed += received.message_count
+        return received

@@ -1,39 +1,39 @@
-"""A session that is being recorded: what belongs into its file, and what is known of its completeness."""
+"""A session that is being recorded: selects the messages of its file and counts losses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL, message_head
+from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL, parse_message_header
 
 SECOND_NS: Final = 1_000_000_000
 POSTROLL_NS: Final = SECOND_NS // 2
-"""Messages stamped later than this after a session's end are not in its file."""
+"""Messages published later than this after the end of a session are not written to its file."""
 
 
 @dataclass(slots=True)
-class Tally:
-    """What is known of a recording's completeness."""
+class LossCounters:
+    """Counts of losses and timing faults of one file; the names are keys of its metadata record `hilrig.summary`."""
 
     lost_transport: int = 0
-    """Messages missing from what a sender sent and the queue did not drop."""
+    """Messages lost between a publisher and the ingest queue."""
     lost_recorder: int = 0
-    """Messages dropped here: the queue was full, or the disk did not take them."""
+    """Messages lost in the recorder: the ingest queue was full, or a write failed."""
     lost_batches: int = 0
-    """Batches missing from the streams of the rig's services; their messages are counted above where they can be."""
+    """Batches missing in the recording streams of the rig's services. Their messages are counted above if possible."""
     overruns: int = 0
     """Overrun events of the simulation."""
     missed_steps: int = 0
-    """Steps given up, as those events say."""
+    """Simulation steps that were skipped, according to these events."""
     clock_steps: int = 0
-    """Wall clocks that were set meanwhile, here or at a sender."""
+    """Wall clock steps during the session, on this machine or at a publisher."""
 
 
-class Sink(Protocol):
-    """Where a recording's messages go."""
+class RecordingSink(Protocol):
+    """Destination of the messages of a recording: an open file."""
 
     def write(self, records: Sequence[bytes], /) -> None:
-        """Take encoded messages, and write them. It must not raise: trouble with a file is the file's own."""
+        """Write encoded messages. It must not raise: the sink handles write errors itself."""
 
 
 @dataclass(slots=True, eq=False)
@@ -43,75 +43,78 @@ class Recording:
     rig: str
     session: str
     controller: str
-    keeper: str
-    """Source that began it and will end it, "<service>/<instance>"."""
+    owner: str
+    """Source that started the session and will end it, "<service>/<instance>"."""
     start_wall_ns: int
-    """Its beginning, sender's wall clock, ns."""
+    """Start of the session, wall clock of the owner, ns."""
     opened_ns: int
-    """When it was opened here, monotonic clock, ns."""
-    tally: Tally = field(default_factory=Tally)
-    sink: Sink = field(init=False, repr=False)
-    """Its file; another one after a rotation."""
+    """When the recording was opened, monotonic clock, ns."""
+    counters: LossCounters = field(default_factory=LossCounters)
+    sink: RecordingSink = field(init=False, repr=False)
+    """Its file; replaced at each rotation."""
     seen: set[tuple[int, int, int]] | None = None
-    """Messages (channel, sequence, publish time) that an earlier file of this session holds; None: none is known."""
+    """(channel id, sequence, publish time) of messages in the previous segment; None: no duplicates are expected."""
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """Last sequence and publish time of each channel in that earlier file."""
+    """(sequence, publish time) of the last message in the previous segment, by channel id."""
     horizon_ns: dict[int, int] = field(default_factory=dict)
-    """Publish time of each channel before which `seen` does not say what that earlier file holds."""
-    stated: int = 0
-    """Messages that its tally has as lost already; a gap to that earlier file may be the same ones."""
+    """Publish time by channel id; `seen` does not cover older messages of the previous segment, so they are skipped."""
+    counted_losses: int = 0
+    """Losses already counted in `counters`; a gap after the previous segment may contain the same messages."""
     end_wall_ns: int | None = None
-    """Its end, sender's wall clock, ns; None: it goes on."""
+    """End of the session, wall clock of the owner, ns; None: the session is open."""
     end_reason: str = ""
     ended_ns: int = 0
-    """When its end was learnt, monotonic clock, ns."""
-    missing_statements: int = 0
-    """How often in a row its keeper stated its sessions without it."""
+    """When the end was received, monotonic clock, ns."""
+    missing_announcements: int = 0
+    """Consecutive session announcements of the owner that did not contain this session."""
 
-    def take(self, records: Sequence[bytes], not_before_ns: int = 0) -> None:
-        """Write what belongs into this file, of what arrived at `not_before_ns` (wall clock) or later."""
+    def write(self, records: Sequence[bytes], not_before_ns: int = 0) -> None:
+        """Write those messages that belong to this file and arrived at `not_before_ns` (wall clock) or later."""
         if self.seen is not None or self.end_wall_ns is not None or not_before_ns:
-            records = [record for record in records if self._wants(record, not_before_ns)]
+            records = [record for record in records if self._accepts(record, not_before_ns)]
         if records:
             self.sink.write(records)
 
-    def _wants(self, record: bytes, not_before_ns: int) -> bool:
-        head = message_head(record)
-        if head.log_time < not_before_ns:
+    def _accepts(self, record: bytes, not_before_ns: int) -> bool:
+        header = parse_message_header(record)
+        if header.log_time < not_before_ns:
             return False
-        if self.end_wall_ns is not None and head.publish_time > self.end_wall_ns + POSTROLL_NS:
+        if self.end_wall_ns is not None and header.publish_time > self.end_wall_ns + POSTROLL_NS:
             return False
         if self.seen is None:
             return True
-        channel_id, sequence, publish_ns = head.channel_id, head.sequence, head.publish_time
+        channel_id, sequence, publish_ns = header.channel_id, header.sequence, header.publish_time
         if (channel_id, sequence, publish_ns) in self.seen or publish_ns < self.horizon_ns.get(channel_id, 0):
             return False
-        # The first new message of a channel with one sender tells what was missed between the files.
+        # The first new message of a channel with a single publisher shows how many messages are missing between the
+        # segments.
         if channel_id != EVENT_CHANNEL and channel_id in self.last:
             last_sequence, last_publish_ns = self.last.pop(channel_id)
             if publish_ns > last_publish_ns and sequence > last_sequence:
                 gap = sequence - last_sequence - 1
-                known = min(gap, self.stated)
-                self.stated -= known
-                self.tally.lost_recorder += gap - known
+                known = min(gap, self.counted_losses)
+                self.counted_losses -= known
+                self.counters.lost_recorder += gap - known
         return True
 
 
-class Shelf(Protocol):
-    """Where recordings are put; implemented by the recorder's files, and by a list in a test."""
+class RecordingStore(Protocol):
+    """Storage of recordings; implemented by `storage.store.FileStore`."""
 
-    def open(self, recording: Recording) -> Sink | None:
-        """Begin a recording's file; None: it must not or cannot be recorded. It may set `recording.seen` and
-        `recording.last`."""
+    def open(self, recording: Recording) -> RecordingSink | None:
+        """Open the file of a recording; None: it must not or can't be recorded.
+
+        It may set `recording.seen`, `recording.last` and `recording.horizon_ns`.
+        """
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
-        """End a recording's file; `end` is one word for programs, `reason` a sentence for people."""
+        """Finish the file of a recording; `end` is a machine-readable cause, `reason` a sentence."""
 
-    def lost(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
-        """Note where messages are missing."""
+    def record_loss(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
+        """Record a loss in the file: number of messages lost in transport and in the recorder."""
 
-    def source(self, recording: Recording, source: str, incarnation: int) -> None:
-        """Note that a run of a service contributes to a recording."""
+    def record_source(self, recording: Recording, source: str, incarnation: int) -> None:
+        """Record in the file that an instance of a service contributes to the recording."""
 
-    def refuse(self, what: str) -> None:
-        """Tell the operator about something that was not understood."""
+    def report_rejected(self, message: str) -> None:
+        """Report input that is not recorded to the operator."""

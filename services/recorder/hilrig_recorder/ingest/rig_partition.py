@@ -1,24 +1,28 @@
-"""Which rigs are one recorder's, where several share a lab. Pure."""
+"""Partition of the rigs of a lab among its recorders. Pure."""
 
 from collections.abc import Sequence
 
 
-class Share:
-    """The share of a recorder that was given the rigs `mine` of the rigs `listed` in the lab's file.
+class RigPartition:
+    """The rigs that one recorder records.
 
-    Rigs that are not in the file, because they were added while the lab runs, are the one's that has the first rig of
-    the file: so each rig is somebody's, and nobody needs to be asked.
+    Rigs that are added while the lab runs belong to the recorder of the first configured rig. So each rig has exactly
+    one recorder, without communication between the recorders.
+
+    Args:
+        configured: all rigs in the lab file.
+        assigned: the rigs assigned to this recorder.
     """
 
-    def __init__(self, listed: Sequence[str], mine: Sequence[str]) -> None:
-        self._listed = frozenset(listed)
-        self._mine = frozenset(mine)
-        self._has_added = listed[0] in self._mine
+    def __init__(self, configured: Sequence[str], assigned: Sequence[str]) -> None:
+        self._configured = frozenset(configured)
+        self._assigned = frozenset(assigned)
+        self._has_added = configured[0] in self._assigned
 
-    def has(self, rig: str) -> bool:
-        """Whether a rig is this recorder's."""
-        return rig in self._mine or (self._has_added and rig not in self._listed)
+    def contains(self, rig: str) -> bool:
+        """Whether this recorder records the rig."""
+        return rig in self._assigned or (self._has_added and rig not in self._configured)
 
-    def lists(self, rig: str) -> bool:
-        """Whether it is, and stands in the lab's file."""
-        return rig in self._mine
+    def contains_configured(self, rig: str) -> bool:
+        """Whether this recorder records the rig, and the rig is in the lab file."""
+        return rig in self._assigned

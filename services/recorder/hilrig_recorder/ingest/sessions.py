@@ -1,9 +1,9 @@
-"""Which rig is in which session, and what therefore goes into which file: the recorder's core, without clock or disk.
+"""Tracks the sessions of all rigs and decides which messages are written to which file. Without clock, bus and disk.
 
-A session begins with its `SESSION_START` event, or when its keeper states it (the event may be lost, or older than
-the recorder); it ends with `SESSION_END`, when its keeper states its sessions without it, or when the keeper has
-been silent too long. Its file stays open a little longer, until the streams of the rig's other services have
-passed the end, by their own stamps. Of the messages nothing is decoded but events.
+A session starts with its `SESSION_START` event, or when its owner announces it (the event may be lost, or older than
+the recorder). It ends with its `SESSION_END` event, when its owner announces its sessions without it, or when the owner
+is silent for too long. After the end its file stays open for a drain time, until the recording streams of all services
+of the rig have passed the end, according to their own time stamps. Only events are decoded, no other messages.
 """
 
 import re
@@ -12,220 +12,238 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_recorder.ingest.preroll import RigLog
-from hilrig_recorder.ingest.queue import Arrival
-from hilrig_recorder.ingest.recording import SECOND_NS, Recording, Shelf
-from hilrig_recorder.ingest.sources import CLOCK_STEP_NS, SETTLING_NS, Source, Sources, Stream
+from hilrig_recorder.ingest.preroll import PreRollBuffer
+from hilrig_recorder.ingest.queue import ReceivedBatch
+from hilrig_recorder.ingest.recording import SECOND_NS, Recording, RecordingStore
+from hilrig_recorder.ingest.sources import (
+    SETTLE_TIME_NS,
+    WALL_CLOCK_STEP_THRESHOLD_NS,
+    KeyStream,
+    PublisherState,
+    PublisherTracker,
+)
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL, encode_message
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_schemas import Event, LogBatch
 from hilrig_schemas.topics import is_name, parse_rig_key
 
-BLOCK_NS: Final = 8 * SECOND_NS // 10
-"""Messages wait so long at most before they are written: with the batch, the tick and the sync less than a second."""
-LINGER_MIN_NS: Final = SECOND_NS // 5
-"""A file stays open at least so long after its session's end."""
-IDLE_NS: Final = SECOND_NS
-"""A service with nothing to send still states its sessions within this time."""
-LINGER_MAX_NS: Final = 10 * SECOND_NS
-"""A service that has not passed the end by then is not waited for: its log stream's cache reaches no further back."""
-KEEPER_SILENCE_NS: Final = 30 * SECOND_NS
-"""A session whose keeper is silent so long has ended."""
-RETRY_NS: Final = 10 * SECOND_NS
-"""A session that could not be recorded is tried again after this."""
-_PHASES: Final = 10
-_MEMORY_NS: Final = 120 * SECOND_NS
+BLOCK_PERIOD_NS: Final = 8 * SECOND_NS // 10
+"""Maximum time until a received message is written. With batching, tick and sync, messages are safe within 1 s."""
+DRAIN_MIN_NS: Final = SECOND_NS // 5
+"""Minimum time that a file stays open after the end of its session."""
+IDLE_ANNOUNCEMENT_NS: Final = SECOND_NS
+"""A service without messages to publish announces its sessions within this period."""
+DRAIN_MAX_NS: Final = 10 * SECOND_NS
+"""Maximum time that a file stays open after the end of its session; the caches of recording streams are not longer."""
+OWNER_TIMEOUT_NS: Final = 30 * SECOND_NS
+"""A session ends when its owner is silent for this time."""
+RETRY_PERIOD_NS: Final = 10 * SECOND_NS
+"""Time until a session that could not be recorded is tried again."""
+MAX_REJECTIONS: Final = 1000
+"""Maximum number of different rejected inputs that are reported."""
+_BLOCK_PHASES: Final = 10
+_ENDED_SESSION_MEMORY_NS: Final = 120 * SECOND_NS
 _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
 
 
-class SessionBook:
-    """Follows the log streams; time is passed in: arrival on the wall clock, and `now_ns` of the monotonic clock.
+class SessionTracker:
+    """Processes received batches. Times are passed in: arrival on the wall clock, `now_ns` on the monotonic clock.
 
-    What is sent of rigs that are not `mine` is passed over: another recorder has them.
+    Args:
+        lab: name of the lab.
+        preroll_s: length of the pre-roll, s.
+        store: storage of the recordings.
+        is_assigned: whether this recorder records a rig; messages of other rigs are ignored.
     """
 
-    def __init__(self, lab: str, preroll_s: float, shelf: Shelf, mine: Callable[[str], bool] = lambda _: True) -> None:
+    def __init__(
+        self,
+        lab: str,
+        preroll_s: float,
+        store: RecordingStore,
+        is_assigned: Callable[[str], bool] = lambda _: True,
+    ) -> None:
         self._lab = lab
-        self._is_mine = mine
+        self._is_assigned = is_assigned
         self._preroll_ns = round(preroll_s * SECOND_NS)
-        self._shelf = shelf
-        self._rigs: dict[str, RigLog] = {}
-        self._sources = Sources()
+        self._store = store
+        self._rigs: dict[str, PreRollBuffer] = {}
+        self._publishers = PublisherTracker()
         self._recordings: dict[str, Recording] = {}
-        self._over: dict[str, int] = {}
+        self._blocked_until: dict[str, int] = {}
+        """Sessions that are not opened before this time, monotonic clock, ns: ended, or opening failed."""
         self._wall_ns = 0
         self._clock_offset_ns: int | None = None
-        self._clock_step_ns = -SETTLING_NS
-        self._refused: set[str] = set()
+        self._clock_step_ns = -SETTLE_TIME_NS
+        self._rejected: set[str] = set()
         self.lost_transport = 0
         self.lost_recorder = 0
 
     @property
     def recordings(self) -> list[Recording]:
-        """The recordings that are open."""
+        """The open recordings."""
         return list(self._recordings.values())
 
-    def has_heard_of(self, rig: str) -> bool:
-        """Whether anything of a rig has been sent."""
+    def has_received(self, rig: str) -> bool:
+        """Whether any message of a rig was received."""
         return rig in self._rigs
 
-    # -- what comes in ----------------------------------------------------------------------------------------------
+    # -- messages ---------------------------------------------------------------------------------------------------
 
-    def accept(self, arrival: Arrival, now_ns: int) -> None:
-        """Take one batch."""
-        batch = arrival.batch
-        log_time = self._wall_ns = arrival.wall_ns
-        source = self._source(arrival, now_ns)
-        streams = source.streams
+    def accept(self, received: ReceivedBatch, now_ns: int) -> None:
+        """Process one batch."""
+        batch = received.batch
+        log_time = self._wall_ns = received.wall_ns
+        publisher = self._update_publisher(received, now_ns)
+        streams = publisher.streams
         for key, sequence, publish_ns, payload in entries_of(batch):
-            stream = streams.get(key) or self._stream(source, key, now_ns)
+            stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is None:
                 continue
             if sequence != stream.expected:
-                missing = stream.missing(sequence)
+                missing = stream.missing_before(sequence)
                 if missing < 0:
                     continue
                 if missing:
-                    self._lose(source, stream, missing, 0)
+                    self._record_loss(publisher, stream, missing, 0)
             stream.expected = sequence + 1
             channel_id = stream.channel_id
             stream.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
             if channel_id == EVENT_CHANNEL:
-                self._event(source, payload, publish_ns, now_ns)
-        for key, drop in arrival.dropped.items():
-            stream = streams.get(key) or self._stream(source, key, now_ns)
+                self._handle_event(publisher, payload, publish_ns, now_ns)
+        for key, dropped in received.dropped.items():
+            stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is not None:
-                missing = drop.last_sequence + 1 - stream.expected if stream.expected else drop.count
-                stream.expected = drop.last_sequence + 1
-                self._lose(source, stream, max(0, missing - drop.count), drop.count)
+                missing = dropped.last_sequence + 1 - stream.expected if stream.expected else dropped.count
+                stream.expected = dropped.last_sequence + 1
+                self._record_loss(publisher, stream, max(0, missing - dropped.count), dropped.count)
         if batch.sessions or batch.complete_sessions:
-            self._statement(source, batch, now_ns)
+            self._handle_announcement(publisher, batch, now_ns)
 
-    def _source(self, arrival: Arrival, now_ns: int) -> Source:
-        source = self._sources.of(arrival, now_ns)
-        missing, clock_stepped = source.heard(arrival, now_ns)
+    def _update_publisher(self, received: ReceivedBatch, now_ns: int) -> PublisherState:
+        publisher = self._publishers.publisher_of(received, now_ns)
+        missing, clock_stepped = publisher.update(received, now_ns)
         if missing:
-            for recording in self._of_source(source):
-                recording.tally.lost_batches += missing
+            for recording in self._recordings_of(publisher):
+                recording.counters.lost_batches += missing
         if clock_stepped:
             self._count_clock_step(now_ns)
-        return source
+        return publisher
 
-    def _stream(self, source: Source, key: str, now_ns: int) -> Stream | None:
-        if key in source.streams:
+    def _add_stream(self, publisher: PublisherState, key: str, now_ns: int) -> KeyStream | None:
+        if key in publisher.streams:
             return None
-        source.streams[key] = None
+        publisher.streams[key] = None
         try:
             parsed = parse_rig_key(key)
         except ValueError as error:
-            self._refuse(f"{source.name}: {error}")
+            self._reject(f"{publisher.name}: {error}")
             return None
         channel_id = CHANNEL_OF_TOPIC.get(parsed.topic.name)
         if channel_id is None or parsed.lab != self._lab or not is_name(parsed.rig):
-            self._refuse(f"{source.name}: {key} is nothing that lab {self._lab} records")
+            self._reject(f"{publisher.name}: key {key} is not a recorded topic of lab {self._lab}")
             return None
-        if not self._is_mine(parsed.rig):
+        if not self._is_assigned(parsed.rig):
             return None
         rig = self._rig(parsed.rig, now_ns)
-        stream = Stream(key, rig.name, channel_id, 1 if source.fresh else 0, rig.waiting.append)
-        source.streams[key] = stream
+        stream = KeyStream(key, rig.name, channel_id, 1 if publisher.restarted else 0, rig.pending.append)
+        publisher.streams[key] = stream
         if channel_id != EVENT_CHANNEL:
-            source.steady.add(rig.name)
-        if rig.sources.get(source.name) is not source:
-            rig.sources[source.name] = source
+            publisher.continuous_rigs.add(rig.name)
+        if rig.publishers.get(publisher.name) is not publisher:
+            rig.publishers[publisher.name] = publisher
             for recording in rig.recordings:
-                self._shelf.source(recording, source.name, source.incarnation)
+                self._store.record_source(recording, publisher.name, publisher.incarnation)
         return stream
 
-    def _rig(self, name: str, now_ns: int) -> RigLog:
+    def _rig(self, name: str, now_ns: int) -> PreRollBuffer:
         rig = self._rigs.get(name)
         if rig is None:
-            # In turns, so that the blocks of a large lab are not all written at once. The first is written soon: what
-            # comes first was fetched, after a restart, and may not be there to be fetched again after the next.
-            phase_ns = BLOCK_NS * (len(self._rigs) % _PHASES) // _PHASES
-            rig = self._rigs[name] = RigLog(name, now_ns + phase_ns - BLOCK_NS)
+            # The block times of the rigs are staggered, so that a large lab does not write all blocks at once. The
+            # first block is written soon: after a restart it contains cached messages, which may not stay available.
+            phase_ns = BLOCK_PERIOD_NS * (len(self._rigs) % _BLOCK_PHASES) // _BLOCK_PHASES
+            rig = self._rigs[name] = PreRollBuffer(name, now_ns + phase_ns - BLOCK_PERIOD_NS)
         return rig
 
-    def _lose(self, source: Source, stream: Stream, transport: int, recorder: int) -> None:
+    def _record_loss(self, publisher: PublisherState, stream: KeyStream, transport: int, recorder: int) -> None:
         self.lost_transport += transport
         self.lost_recorder += recorder
         rig = self._rigs[stream.rig]
-        rig.lose(self._wall_ns, transport, recorder)
+        rig.record_loss(self._wall_ns, transport, recorder)
         for recording in rig.recordings:
-            self._shelf.lost(recording, source.name, stream.key, transport, recorder)
+            self._store.record_loss(recording, publisher.name, stream.key, transport, recorder)
 
-    def _refuse(self, what: str) -> None:
-        # Each thing once, and not without end.
-        if what not in self._refused and len(self._refused) < 1000:
-            self._refused.add(what)
-            self._shelf.refuse(what)
+    def _reject(self, message: str) -> None:
+        # Each message is reported once.
+        if message not in self._rejected and len(self._rejected) < MAX_REJECTIONS:
+            self._rejected.add(message)
+            self._store.report_rejected(message)
 
     def _count_clock_step(self, now_ns: int) -> None:
-        # One setting is seen at each sender on the machine, and here.
+        # One clock step is detected here and at each publisher of the same machine.
         if now_ns - self._clock_step_ns > SECOND_NS:
             for recording in self._recordings.values():
-                recording.tally.clock_steps += 1
+                recording.counters.clock_steps += 1
         self._clock_step_ns = now_ns
 
     # -- sessions ---------------------------------------------------------------------------------------------------
 
-    def _event(self, source: Source, payload: bytes, publish_ns: int, now_ns: int) -> None:
+    def _handle_event(self, publisher: PublisherState, payload: bytes, publish_ns: int, now_ns: int) -> None:
         try:
             event = Event.FromString(payload)
         except DecodeError:
-            self._refuse(f"{source.name}: an event that can't be decoded")
+            self._reject(f"{publisher.name}: event can't be decoded")
             return
         if event.kind == Event.SESSION_START:
-            self._begin(source.name, event.rig, event.session, event.session_data.controller, event.wall_ns, now_ns)
+            self._open(publisher.name, event.rig, event.session, event.session_data.controller, event.wall_ns, now_ns)
         elif event.kind == Event.SESSION_END:
-            self._over[event.session] = now_ns + _MEMORY_NS
+            self._blocked_until[event.session] = now_ns + _ENDED_SESSION_MEMORY_NS
             recording = self._recordings.get(event.session)
             if recording is not None:
                 self._end(recording, event.session_data.reason or "ended", publish_ns, now_ns)
         elif event.kind == Event.OVERRUN:
-            # An overrun without a rig is one of the whole simulation.
-            for recording in self._of_source(source):
+            # An overrun event without a rig concerns all rigs of the simulation.
+            for recording in self._recordings_of(publisher):
                 if event.rig in ("", recording.rig):
-                    recording.tally.overruns += 1
-                    recording.tally.missed_steps += event.overrun_data.missed_steps
+                    recording.counters.overruns += 1
+                    recording.counters.missed_steps += event.overrun_data.missed_steps
 
-    def _statement(self, source: Source, batch: LogBatch, now_ns: int) -> None:
+    def _handle_announcement(self, publisher: PublisherState, batch: LogBatch, now_ns: int) -> None:
         listed = {session.session: session for session in batch.sessions}
         for session in listed.values():
-            self._begin(source.name, session.rig, session.session, session.controller, session.start_wall_ns, now_ns)
+            self._open(publisher.name, session.rig, session.session, session.controller, session.start_wall_ns, now_ns)
         if not batch.complete_sessions:
             return
         for recording in self._recordings.values():
-            if recording.keeper != source.name or recording.end_wall_ns is not None:
+            if recording.owner != publisher.name or recording.end_wall_ns is not None:
                 continue
             if recording.session in listed:
-                recording.missing_statements = 0
+                recording.missing_announcements = 0
                 continue
-            # A statement may be older than the event that was sent with it.
-            recording.missing_statements += 1
-            if recording.missing_statements >= 2:
-                self._end(recording, f"{source.name} does not keep it any more", source.last_publish_ns, now_ns)
+            # One announcement may be older than the event in the same batch.
+            recording.missing_announcements += 1
+            if recording.missing_announcements >= 2:
+                reason = f"{publisher.name} no longer announces the session"
+                self._end(recording, reason, publisher.last_publish_ns, now_ns)
 
-    def _begin(
-        self, keeper: str, rig_name: str, session: str, controller: str, start_wall_ns: int, now_ns: int
-    ) -> None:
-        if session in self._recordings or session in self._over or not self._is_mine(rig_name):
+    def _open(self, owner: str, rig_name: str, session: str, controller: str, start_wall_ns: int, now_ns: int) -> None:
+        if session in self._recordings or session in self._blocked_until or not self._is_assigned(rig_name):
             return
         if not _SESSION_ID.fullmatch(session) or not is_name(rig_name):
-            self._refuse(f"{keeper}: {session!r} of {rig_name!r} is no name for a recording")
+            self._reject(f"{owner}: session {session!r} of rig {rig_name!r} has an invalid name")
             return
         rig = self._rig(rig_name, now_ns)
-        recording = Recording(rig_name, session, controller, keeper, start_wall_ns, now_ns)
-        sink = self._shelf.open(recording)
+        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns)
+        sink = self._store.open(recording)
         if sink is None:
-            self._over[session] = now_ns + RETRY_NS
+            self._blocked_until[session] = now_ns + RETRY_PERIOD_NS
             return
         recording.sink = sink
         self._recordings[session] = recording
-        for source in rig.sources.values():
-            self._shelf.source(recording, source.name, source.incarnation)
-        rig.cut(self._wall_ns)
-        rig.begin(recording, self._wall_ns - self._preroll_ns)
+        for publisher in rig.publishers.values():
+            self._store.record_source(recording, publisher.name, publisher.incarnation)
+        rig.flush_block(self._wall_ns)
+        rig.add(recording, self._wall_ns - self._preroll_ns)
 
     def _end(self, recording: Recording, reason: str, end_wall_ns: int, now_ns: int) -> None:
         if recording.end_wall_ns is None:
@@ -233,86 +251,86 @@ class SessionBook:
             recording.end_reason = reason
             recording.ended_ns = now_ns
 
-    def _of_source(self, source: Source) -> list[Recording]:
+    def _recordings_of(self, publisher: PublisherState) -> list[Recording]:
         return [
             recording
             for recording in self._recordings.values()
-            if self._rigs[recording.rig].sources.get(source.name) is source
+            if self._rigs[recording.rig].publishers.get(publisher.name) is publisher
         ]
 
     # -- time -------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int, wall_ns: int) -> None:
-        """Do what time brings, some times a second: cut off blocks, close what has ended, watch the clock."""
+        """Do periodic work, several times per second: flush blocks, close ended recordings, detect clock steps."""
         offset_ns = wall_ns - now_ns
-        if self._clock_offset_ns is not None and abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
+        if self._clock_offset_ns is not None and abs(offset_ns - self._clock_offset_ns) > WALL_CLOCK_STEP_THRESHOLD_NS:
             self._count_clock_step(now_ns)
         self._clock_offset_ns = offset_ns
         for rig in self._rigs.values():
             if now_ns >= rig.due_ns:
-                rig.due_ns = max(rig.due_ns + BLOCK_NS, now_ns)
-                rig.cut(wall_ns)
-                rig.forget(wall_ns - self._preroll_ns, wall_ns)
-        heard = self._sources.last_heard()
+                rig.due_ns = max(rig.due_ns + BLOCK_PERIOD_NS, now_ns)
+                rig.flush_block(wall_ns)
+                rig.evict(wall_ns - self._preroll_ns, wall_ns)
+        last_received = self._publishers.last_received()
         for recording in self.recordings:
-            if recording.seen is not None and now_ns - recording.opened_ns > SETTLING_NS:
-                # What could come twice has come.
+            if recording.seen is not None and now_ns - recording.opened_ns > SETTLE_TIME_NS:
+                # All cached messages were received: no more duplicates.
                 recording.seen = None
             if recording.end_wall_ns is None:
-                self._watch_keeper(recording, heard.get(recording.keeper, 0), now_ns)
-            elif self._is_complete(recording, now_ns):
+                self._check_owner(recording, last_received.get(recording.owner, 0), now_ns)
+            elif self._is_drained(recording, now_ns):
                 self._close(recording, "ended", recording.end_reason)
-        for session, until_ns in list(self._over.items()):
+        for session, until_ns in list(self._blocked_until.items()):
             if now_ns > until_ns:
-                del self._over[session]
-        for source in self._sources.forget(now_ns):
+                del self._blocked_until[session]
+        for publisher in self._publishers.evict_silent(now_ns):
             for rig in self._rigs.values():
-                if rig.sources.get(source.name) is source:
-                    del rig.sources[source.name]
+                if rig.publishers.get(publisher.name) is publisher:
+                    del rig.publishers[publisher.name]
 
-    def _watch_keeper(self, recording: Recording, heard_ns: int, now_ns: int) -> None:
-        if now_ns - max(heard_ns, recording.opened_ns) > KEEPER_SILENCE_NS:
-            reason = f"{recording.keeper} was not heard for {KEEPER_SILENCE_NS // SECOND_NS} s"
-            # Not over for good: when the keeper comes back and states it, it goes on in a next file.
-            self._rigs[recording.rig].cut(self._wall_ns)
+    def _check_owner(self, recording: Recording, last_received_ns: int, now_ns: int) -> None:
+        if now_ns - max(last_received_ns, recording.opened_ns) > OWNER_TIMEOUT_NS:
+            reason = f"no message from {recording.owner} for {OWNER_TIMEOUT_NS // SECOND_NS} s"
+            # The session is not blocked: when the owner announces it again, it continues in a new segment.
+            self._rigs[recording.rig].flush_block(self._wall_ns)
             self.drop(recording)
-            self._shelf.close(recording, "keeper lost", reason)
+            self._store.close(recording, "keeper lost", reason)
 
-    def _is_complete(self, recording: Recording, now_ns: int) -> bool:
-        lingered_ns = now_ns - recording.ended_ns
-        if lingered_ns >= LINGER_MAX_NS:
+    def _is_drained(self, recording: Recording, now_ns: int) -> bool:
+        draining_ns = now_ns - recording.ended_ns
+        if draining_ns >= DRAIN_MAX_NS:
             return True
         end_wall_ns = recording.end_wall_ns or 0
-        # A stream is in order: it has passed the end when its stamps have, or, where nothing is left to be sent,
-        # when a batch of it has come well after the end.
-        return lingered_ns >= LINGER_MIN_NS and all(
-            source.last_publish_ns >= end_wall_ns or source.last_ns >= recording.ended_ns + IDLE_NS
-            for source in self._rigs[recording.rig].sources.values()
-            if recording.rig in source.steady
+        # A stream is in order. It has passed the end when its publish times have. A publisher without messages has
+        # passed the end when one of its batches arrived well after the end.
+        return draining_ns >= DRAIN_MIN_NS and all(
+            publisher.last_publish_ns >= end_wall_ns or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            for publisher in self._rigs[recording.rig].publishers.values()
+            if recording.rig in publisher.continuous_rigs
         )
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write all pending messages."""
         for rig in self._rigs.values():
-            rig.cut(self._wall_ns)
+            rig.flush_block(self._wall_ns)
 
     def stop(self) -> None:
-        """Close every recording: the recorder ends."""
+        """Close every recording, because the recorder stops."""
         for recording in self.recordings:
             if recording.end_wall_ns is None:
-                self._close(recording, "recorder stopped", "the recorder was stopped while the session went on")
+                self._close(recording, "recorder stopped", "the recorder was stopped during the session")
             else:
                 self._close(recording, "ended", recording.end_reason)
 
     def drop(self, recording: Recording) -> None:
-        """Take out a recording whose file could not go on, without closing it; its session may be opened again."""
+        """Remove a recording without closing its file; its session may be opened again."""
         self._recordings.pop(recording.session, None)
         rig = self._rigs.get(recording.rig)
         if rig is not None and recording in rig.recordings:
             rig.recordings.remove(recording)
 
     def _close(self, recording: Recording, end: str, reason: str) -> None:
-        self._rigs[recording.rig].cut(self._wall_ns)
+        self._rigs[recording.rig].flush_block(self._wall_ns)
         self.drop(recording)
-        self._over[recording.session] = recording.ended_ns + _MEMORY_NS
-        self._shelf.close(recording, end, reason)
+        self._blocked_until[recording.session] = recording.ended_ns + _ENDED_SESSION_MEMORY_NS
+        self._store.close(recording, end, reason)

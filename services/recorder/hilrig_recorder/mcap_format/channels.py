@@ -1,7 +1,6 @@
-"""What every recording has in common: its channels, in a fixed order, and their schemas.
+"""Channels and schemas of every recording, in a fixed order.
 
-A channel has the same id in every file, so a message is encoded once for however many files it goes into, and before
-it is known whether it goes into any.
+A channel has the same id in every file. So a message is encoded once, before it is known which files it is written to.
 """
 
 import struct
@@ -15,7 +14,7 @@ from mcap.records import Channel, Schema
 from hilrig_schemas.topics import EVENT, RECORDED
 
 SCHEMA_VERSION: Final = "hilrig.v1"
-"""The protobuf package of the messages; it changes when a message becomes unreadable for older readers."""
+"""The protobuf package of the messages. It changes when older readers can no longer read a message."""
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _FIXED_LENGTH: Final = _MESSAGE.size - 9
@@ -24,7 +23,7 @@ _pack: Final = _MESSAGE.pack
 
 
 def file_descriptor_set(message: type[Message]) -> bytes:
-    """The schema of a message as MCAP wants it: a `FileDescriptorSet` with every dependency before its user."""
+    """The MCAP schema of a message: a `FileDescriptorSet` in which dependencies precede the files that import them."""
     files = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -49,12 +48,12 @@ CHANNELS: Final = tuple(
     for number, topic in enumerate(RECORDED.values(), start=1)
 )
 CHANNEL_OF_TOPIC: Final = {name: number for number, name in enumerate(RECORDED, start=1)}
-"""Channel id of a topic's name."""
+"""Channel id by topic name."""
 EVENT_CHANNEL: Final = CHANNEL_OF_TOPIC[EVENT.name]
 
 
-class MessageHead(NamedTuple):
-    """What stands before a message's bytes in its record; times are wall clock, ns."""
+class MessageHeader(NamedTuple):
+    """Fields of a message record before its payload; times are wall clock, ns."""
 
     channel_id: int
     sequence: int
@@ -62,12 +61,12 @@ class MessageHead(NamedTuple):
     publish_time: int
 
 
-def message_head(record: bytes) -> MessageHead:
-    """The head of a record that `encode_message` made."""
-    return MessageHead(*_MESSAGE.unpack_from(record)[2:])
+def parse_message_header(record: bytes) -> MessageHeader:
+    """The header of a record made by `encode_message`."""
+    return MessageHeader(*_MESSAGE.unpack_from(record)[2:])
 
 
 def encode_message(channel_id: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> bytes:
-    """One MCAP message record; times are wall clock, ns. MCAP keeps 32 bits of the sequence number."""
+    """One MCAP message record; times are wall clock, ns. MCAP stores the low 32 bits of the sequence number."""
     length = _FIXED_LENGTH + len(payload)
     return _pack(_OPCODE, length, channel_id, sequence & 0xFFFFFFFF, log_time, publish_time) + payload

@@ -1,4 +1,4 @@
-"""A chunk of a recording: messages compressed together, with the index that leads a reader to each of them. Pure."""
+"""Encodes chunks of a recording: compressed blocks of messages, each with its message index. Pure."""
 
 import struct
 import zlib
@@ -9,13 +9,13 @@ import zstandard
 from mcap.opcode import Opcode
 
 CHUNK_BYTES: Final = 64 * 1024
-"""No chunk is larger, uncompressed, unless a single message is."""
+"""Maximum uncompressed size of a chunk; only a single larger message exceeds it."""
 
 Compress = Callable[[bytes], bytes]
 
 _COMPRESSION: Final = b"zstd"
-# A table that stays in the first cache, and one try at each second byte: 1 to 4 % larger than at level 1, in little
-# more than half the time. Compressing is the largest part of what a message costs.
+# The hash table fits into the L1 cache, and only every second byte is searched. Files are 1 to 4 % larger than at level
+# 1, in little more than half the time. Compression is the largest part of the cost of a message.
 _COMPRESSOR: Final = zstandard.ZstdCompressionParameters(
     window_log=16,
     chain_log=14,
@@ -27,44 +27,45 @@ _COMPRESSOR: Final = zstandard.ZstdCompressionParameters(
 )
 
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
-_INDEX_HEAD: Final = struct.Struct("<BQHI")
-_CHUNK_INDEX_HEAD: Final = struct.Struct("<BQQQQQI")
+_INDEX_HEADER: Final = struct.Struct("<BQHI")
+_CHUNK_INDEX_HEADER: Final = struct.Struct("<BQQQQQI")
 _CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
-"""Of a message's record."""
-_RECORD_HEAD: Final = struct.Struct("<BQ")
+"""Reads channel id and log time of a message record."""
+_RECORD_HEADER: Final = struct.Struct("<BQ")
 
 
-class ChunkNote(NamedTuple):
-    """What the index at a file's end needs of a chunk; times are wall clock, ns."""
+class ChunkInfo(NamedTuple):
+    """The entry of a chunk in the summary section of the file; times are wall clock, ns."""
 
     start: int
     """Offset in the file."""
     first_ns: int
     last_ns: int
     data_size: int
-    """Bytes, compressed."""
+    """Compressed size, bytes."""
     raw_size: int
+    """Uncompressed size, bytes."""
     counts: tuple[tuple[int, int], ...]
-    """Channel and number of its messages; their indexes follow the chunk in this order."""
+    """(channel id, number of messages), in the order of the message indexes that follow the chunk."""
 
     @property
     def messages(self) -> int:
-        """How many there are."""
+        """Number of messages."""
         return sum(count for _, count in self.counts)
 
     def index_record(self) -> bytes:
-        """The record that leads a reader to it."""
+        """The chunk index record."""
         chunk_size = _CHUNK.size + self.data_size
         offset = self.start + chunk_size
         channel_offsets = b""
         for channel_id, count in self.counts:
             channel_offsets += _CHANNEL_OFFSET.pack(channel_id, offset)
-            offset += _INDEX_HEAD.size + 16 * count
-        head = _CHUNK_INDEX_HEAD.pack(
+            offset += _INDEX_HEADER.size + 16 * count
+        head = _CHUNK_INDEX_HEADER.pack(
             Opcode.CHUNK_INDEX.value,
-            _CHUNK_INDEX_HEAD.size + len(channel_offsets) + _CHUNK_INDEX_TAIL.size - 9,
+            _CHUNK_INDEX_HEADER.size + len(channel_offsets) + _CHUNK_INDEX_TAIL.size - 9,
             self.first_ns,
             self.last_ns,
             self.start,
@@ -78,12 +79,15 @@ class ChunkNote(NamedTuple):
 
 
 def compressor() -> Compress:
-    """What compresses chunks; for one thread, and best shared by all files of it: its tables then stay in the cache."""
+    """A function that compresses chunks, for use in one thread.
+
+    All files of a thread should share it: its tables then stay in the CPU cache.
+    """
     return zstandard.ZstdCompressor(compression_params=_COMPRESSOR).compress
 
 
-def cut(records: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
-    """Messages in runs that make a chunk each."""
+def split_into_chunks(records: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
+    """Split message records into groups that fit into one chunk each."""
     begin = size = 0
     for at, record in enumerate(records):
         length = len(record)
@@ -96,11 +100,11 @@ def cut(records: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
 
 
 def encode_chunk(records: Sequence[bytes], compress: Compress) -> bytes:
-    """A chunk and the message indexes that follow it, as they stand in a file.
+    """Encode a chunk record and the message index records that follow it in a file.
 
     Args:
-        records: one message or more, each a whole MCAP record (`channels.encode_message`).
-        compress: see `compressor`.
+        records: one or more complete MCAP message records (`channels.encode_message`).
+        compress: a function made by `compressor`.
     """
     indexes: dict[int, list[int]] = {}
     offset = 0
@@ -129,42 +133,42 @@ def encode_chunk(records: Sequence[bytes], compress: Compress) -> bytes:
     pieces = [head, data]
     for channel_id, index in indexes.items():
         size = 8 * len(index)
-        pieces.append(_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX.value, 6 + size, channel_id, size))
+        pieces.append(_INDEX_HEADER.pack(Opcode.MESSAGE_INDEX.value, 6 + size, channel_id, size))
         pieces.append(struct.pack(f"<{len(index)}Q", *index))
     return b"".join(pieces)
 
 
-def chunks_of(read: Callable[[int, int], bytes], begin: int, end: int) -> Iterator[ChunkNote]:
-    """The chunks that stand in a file, in order. Nothing has to be kept of them while it is written.
+def read_chunk_infos(read: Callable[[int, int], bytes], begin: int, end: int) -> Iterator[ChunkInfo]:
+    """Read the chunk infos back from a file, in order, so that a writer keeps no list of its chunks.
 
     Args:
-        read: gives so many bytes of the file, or fewer at its end, from an offset on.
-        begin: where the first record stands, bytes.
-        end: where the last one ends.
+        read: `read(offset, size)` returns `size` bytes of the file, or fewer at its end.
+        begin: offset of the first record, bytes.
+        end: offset after the last record, bytes.
 
     Raises:
-        ValueError: records do not follow each other from `begin` to `end`.
+        ValueError: the bytes from `begin` to `end` are not a sequence of complete records.
     """
     at = begin
-    note: ChunkNote | None = None
+    info: ChunkInfo | None = None
     counts: list[tuple[int, int]] = []
     try:
         while at < end:
             head = read(at, _CHUNK.size)
-            opcode, length = _RECORD_HEAD.unpack_from(head)
+            opcode, length = _RECORD_HEADER.unpack_from(head)
             if opcode == Opcode.CHUNK.value:
-                if note is not None:
-                    yield note._replace(counts=tuple(counts))
+                if info is not None:
+                    yield info._replace(counts=tuple(counts))
                 _, _, first_ns, last_ns, raw_size, _, _, _, data_size = _CHUNK.unpack(head)
-                note = ChunkNote(at, first_ns, last_ns, data_size, raw_size, ())
+                info = ChunkInfo(at, first_ns, last_ns, data_size, raw_size, ())
                 counts.clear()
             elif opcode == Opcode.MESSAGE_INDEX.value:
-                _, _, channel_id, size = _INDEX_HEAD.unpack_from(head)
+                _, _, channel_id, size = _INDEX_HEADER.unpack_from(head)
                 counts.append((channel_id, size // 16))
-            at += _RECORD_HEAD.size + length
+            at += _RECORD_HEADER.size + length
     except struct.error as error:
-        raise ValueError(f"no record at {at}") from error
+        raise ValueError(f"no record at offset {at}") from error
     if at != end:
-        raise ValueError(f"a record that ends at {at}, behind {end}")
-    if note is not None:
-        yield note._replace(counts=tuple(counts))
+        raise ValueError(f"the last record ends at offset {at}, after the end {end}")
+    if info is not None:
+        yield info._replace(counts=tuple(counts))

@@ -9,7 +9,7 @@ if sys.platform != "win32":
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a renaming in `folder` survive a power cut; where a system can't, its file system does it by itself."""
+    """Make a rename in `folder` survive a power failure. On systems that can't sync folders, do nothing."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:
@@ -23,9 +23,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def lock_file(descriptor: int) -> bool:
-    """Show that a file is being written, as long as it is open; False: another process shows that.
+    """Take the advisory lock of an open file, until it is closed; False: another process holds it.
 
-    Where a system has no advisory locks, an open file can't be renamed or removed by others anyway.
+    On systems without advisory locks, other processes can't rename or remove an open file anyway.
     """
     if sys.platform == "win32":
         return True
@@ -34,6 +34,6 @@ def lock_file(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        # A file system without locks.
+        # The file system does not support locks.
         return True
     return True

@@ -1,6 +1,6 @@
-"""Making a whole file of one that is not: every whole chunk is kept, indexed anew, and what is missing is stated.
+"""Recovers a truncated or damaged file: copies its complete chunks into a new indexed file and reports the losses.
 
-The original is not touched before the new file is safe on the disk under its name.
+The original file is not changed before the new file is synced and renamed.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, RECOVERING_SUFFIX
 from hilrig_recorder.mcap_format.fsutil import lock_file
@@ -21,60 +22,62 @@ from hilrig_recorder.mcap_format.scan import (
     Damage,
     DamagedError,
     Message,
-    is_whole,
-    message_keys,
-    open_chunk,
+    is_complete,
+    read_chunk,
+    read_message_keys,
     scan,
 )
-from hilrig_recorder.mcap_format.writer import LIBRARY, RunWriter
+from hilrig_recorder.mcap_format.writer import LIBRARY, RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
 
-_UNFINISHED: Final = "the file had no end: its recorder was killed, or it was cut off; what came last may be missing"
-_DAMAGED: Final = "how it ended stood where the file is damaged"
-_HEAD_BYTES: Final = 64 * 1024
+_REASON_UNFINISHED: Final = (
+    "the file was not finished: the recorder was killed, or the file was truncated; the last messages may be missing"
+)
+_REASON_DAMAGED: Final = "the summary of the file was damaged"
+_MAX_BEGIN_BYTES: Final = 64 * 1024
 
 
 @dataclass(slots=True)
 class Recovery:
-    """What was saved, and what was not."""
+    """Result of a recovery."""
 
     source: Path
     path: Path | None = None
-    """The new file; None: there was nothing to do, for the file is whole."""
+    """The new file; None: the source is complete and intact, no file was written."""
     messages: int = 0
     chunks: int = 0
     attachments: int = 0
     metadata: int = 0
     damaged_chunks: int = 0
-    """Chunks that are there but not whole."""
+    """Chunks with a wrong checksum or content."""
     damaged_bytes: int = 0
-    """Bytes of the original that hold nothing whole: the torn end, and damage in between."""
+    """Bytes of the source without a complete record: the truncated end and damaged ranges."""
     torn_bytes: int = 0
-    """Those of them that belong to a record which the end of the file cut off."""
+    """The part of `damaged_bytes` that belongs to a record truncated by the end of the file."""
     orphans: int = 0
-    """Messages whose channel is not known any more."""
+    """Messages that were not copied because their channel is unknown."""
     reasons: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
-class Tail:
-    """The end of a recording, whole or not."""
+class SegmentTail:
+    """The last messages of a recording, finished or not."""
 
     end: str
-    """How it ended, as its summary says; empty: it has none."""
+    """The value `ended` of its summary; empty: it has no summary."""
     keys: set[tuple[int, int, int]]
-    """Channel, sequence and publish time of its last messages."""
+    """(channel id, sequence, publish time) of the last messages."""
     last: dict[int, tuple[int, int]]
-    """Sequence and publish time of the last message of each channel."""
+    """(sequence, publish time) of the last message, by channel id."""
     last_ns: int
-    """Arrival of the last message, wall clock, ns; 0: there is none."""
+    """Arrival of the last message, wall clock, ns; 0: no message."""
 
 
 def map_file(path: Path) -> memoryview:
-    """A file's bytes, without reading them all into memory.
+    """Map a file into memory.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the file can't be read.
     """
     try:
         with path.open("rb") as file:
@@ -85,11 +88,11 @@ def map_file(path: Path) -> memoryview:
         raise InputError(f"{path}: can't be read: {error.strerror}") from error
 
 
-def read_tail(path: Path, tail_ns: int) -> Tail:
-    """What the next file of a session must know of the one before; of its messages, those of the last `tail_ns`.
+def read_tail(path: Path, tail_ns: int) -> SegmentTail:
+    """Read how a file ended and the keys of its messages of the last `tail_ns`.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the file can't be read.
     """
     end = ""
     last: dict[int, tuple[int, int]] = {}
@@ -104,84 +107,84 @@ def read_tail(path: Path, tail_ns: int) -> Tail:
     for chunk in chunks:
         if chunk.last_ns >= last_ns - tail_ns:
             with contextlib.suppress(DamagedError):
-                for key in message_keys(chunk):
+                for key in read_message_keys(chunk):
                     keys.add(key)
                     last[key[0]] = key[1:]
-    return Tail(end, keys, last, last_ns)
+    return SegmentTail(end, keys, last, last_ns)
 
 
-def session_of(path: Path) -> dict[str, str]:
-    """What `hilrig.session` at a file's beginning says; empty: nothing.
+def read_session_metadata(path: Path) -> dict[str, str]:
+    """Read the metadata record `hilrig.session` at the beginning of a file; empty if it is missing.
 
     Raises:
-        InputError: it can't be read.
+        InputError: the file can't be read.
     """
-    for _, item in scan(map_file(path)[:_HEAD_BYTES]):
+    for _, item in scan(map_file(path)[:_MAX_BEGIN_BYTES]):
         if isinstance(item, Metadata) and item.name == "hilrig.session":
             return dict(item.metadata)
     return {}
 
 
-def recover(source: Path, path: Path, *, go_on: Callable[[], bool] = lambda: True) -> Recovery:
-    """Make a whole file at `path` of `source`, which stays as it is.
+def recover(source: Path, path: Path, *, should_continue: Callable[[], bool] = lambda: True) -> Recovery:
+    """Write a complete file at `path` from `source`, which is not changed.
 
     Args:
-        source: any MCAP file, also one that hilrig did not write; a whole one is left alone.
+        source: any MCAP file, also one that hilrig did not write. No file is written if it is complete and intact.
         path: the new file; it must not exist.
-        go_on: asked between chunks; when it says no, what was made so far is removed.
+        should_continue: called between chunks; if it returns False, the new file is removed.
 
     Raises:
-        InputError: `source` can't be read, holds nothing of an MCAP file, or is being written just now.
-        OperationError: the new file can't be written, or `go_on` said no.
+        InputError: `source` can't be read, is not an MCAP file, or is being written.
+        OperationError: the new file can't be written, or `should_continue` returned False.
     """
-    with _held(source):
-        return _recover(source, path, go_on)
+    with _locked(source):
+        return _recover(source, path, should_continue)
 
 
-def _recover(source: Path, path: Path, go_on: Callable[[], bool]) -> Recovery:
+def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> Recovery:
     recovery = Recovery(source)
     view = map_file(source)
-    finished = is_whole(view)
-    if finished and _is_intact(view, source, go_on):
+    finished = is_complete(view)
+    if finished and _is_intact(view, source, should_continue):
         return recovery
     if path.exists():
-        raise OperationError(f"{path}: exists; choose another name for what is recovered from {source.name}")
-    part = path.with_name(path.name + RECOVERING_SUFFIX)
+        raise OperationError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
+    temporary_path = path.with_name(path.name + RECOVERING_SUFFIX)
     try:
-        part.unlink(missing_ok=True)
-        _Copy(view, recovery, finished).write(path, part, go_on)
+        temporary_path.unlink(missing_ok=True)
+        _Copier(view, recovery, finished).write(path, temporary_path, should_continue)
     except OSError as error:
         raise OperationError(f"{path}: can't be written: {error.strerror}") from error
     recovery.path = path
     return recovery
 
 
-def _is_intact(view: memoryview, source: Path, go_on: Callable[[], bool]) -> bool:
-    """Whether everything before a good end holds too: what was damaged on a disk or a stick still ends as it did."""
+def _is_intact(view: memoryview, source: Path, should_continue: Callable[[], bool]) -> bool:
+    """Whether a finished file has no damage: a defective disk may damage chunks and leave the end valid."""
     for _, item in scan(view):
         if isinstance(item, Damage):
             return False
         if isinstance(item, Chunk):
-            _ask(go_on, source)
+            _check_interrupt(should_continue, source)
             try:
-                open_chunk(item)
+                read_chunk(item)
             except DamagedError:
                 return False
     return True
 
 
-def _ask(go_on: Callable[[], bool], source: Path) -> None:
-    if not go_on():
-        raise OperationError(f"{source}: recovering was interrupted; the file is as it was")
+def _check_interrupt(should_continue: Callable[[], bool], source: Path) -> None:
+    if not should_continue():
+        raise OperationError(f"{source}: recovery was interrupted; the file is unchanged")
 
 
 @contextlib.contextmanager
-def _held(source: Path) -> Iterator[None]:
-    """Nobody else writes or recovers a file meanwhile."""
+def _locked(source: Path) -> Iterator[None]:
+    """Lock a file against other processes that write or recover it."""
     try:
         file = source.open("r+b")
     except PermissionError:
-        # What can't be written can be read all the same, and nobody writes it.
+        # Without write permission the file can still be read, and no recorder of this user writes it.
         yield
         return
     except OSError as error:
@@ -191,54 +194,59 @@ def _held(source: Path) -> Iterator[None]:
         return
     with file:
         if not lock_file(file.fileno()):
-            raise InputError(f"{source}: a recorder is writing it just now, or it is being recovered already")
+            raise InputError(
+                f"{source}: the file is locked: a recorder is writing it, or it is already being recovered"
+            )
         yield
 
 
-class _Copy:
+class _Copier:
+    """Copies the complete records of a file into a new file."""
+
     def __init__(self, view: memoryview, recovery: Recovery, finished: bool) -> None:
         self._view = view
         self._recovery = recovery
         self._finished = finished
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
         self._declared: set[int] = set()
-        self._notes = {"lost_transport": 0, "lost_recorder": 0}
+        self._losses = {"lost_transport": 0, "lost_recorder": 0}
         self._has_summary = False
         self._last_ns = 0
 
-    def write(self, path: Path, part: Path, go_on: Callable[[], bool]) -> None:
-        header = next((item for _, item in scan(self._view[:_HEAD_BYTES]) if isinstance(item, Header)), None)
+    def write(self, path: Path, temporary_path: Path, should_continue: Callable[[], bool]) -> None:
+        header = next((item for _, item in scan(self._view[:_MAX_BEGIN_BYTES]) if isinstance(item, Header)), None)
         if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
-            raise InputError(f"{self._recovery.source}: holds nothing of an MCAP file")
-        ours = header is not None and header.library == LIBRARY
-        writer = RunWriter(
+            if self._view[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+                raise InputError(f"{self._recovery.source}: not an MCAP file (bad magic)")
+            raise InputError(f"{self._recovery.source}: MCAP file without a complete record: nothing to recover")
+        is_hilrig = header is not None and header.library == LIBRARY
+        writer = RecordingWriter(
             path,
-            part=part,
+            temporary_path=temporary_path,
             schemas=(),
             channels=(),
             profile=header.profile if header else "",
             library=header.library if header else LIBRARY,
         )
         try:
-            self._copy(writer, ours, go_on)
-            writer.finish(lambda: self._last_words(ours))
-            if writer.given_up:
-                raise OperationError(f"{path}: can't be written: no space is left for it")
+            self._copy(writer, is_hilrig, should_continue)
+            writer.finish(lambda: self._final_metadata(is_hilrig))
+            if writer.dropped_count:
+                raise OperationError(f"{path}: can't be written: no space left on the disk")
             writer.publish()
         except BaseException:
             writer.discard()
             raise
 
-    def _copy(self, writer: RunWriter, ours: bool, go_on: Callable[[], bool]) -> None:
+    def _copy(self, writer: RecordingWriter, is_hilrig: bool, should_continue: Callable[[], bool]) -> None:
         recovery = self._recovery
         for _, item in scan(self._view):
             if isinstance(item, Chunk):
-                _ask(go_on, recovery.source)
+                _check_interrupt(should_continue, recovery.source)
                 self._copy_chunk(writer, item)
             elif isinstance(item, Message):
-                # A file of chunks has no messages beside them: that is a damaged record which looks like one.
-                if ours or recovery.chunks:
+                # A file with chunks has no messages outside them: this is a damaged record that resembles a message.
+                if is_hilrig or recovery.chunks:
                     recovery.damaged_bytes += len(item.record)
                 else:
                     self._copy_message(writer, item)
@@ -257,9 +265,9 @@ class _Copy:
                     item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
                 )
 
-    def _copy_chunk(self, writer: RunWriter, chunk: Chunk) -> None:
+    def _copy_chunk(self, writer: RecordingWriter, chunk: Chunk) -> None:
         try:
-            for item in open_chunk(chunk):
+            for item in read_chunk(chunk):
                 if isinstance(item, Message):
                     self._copy_message(writer, item)
                 else:
@@ -271,7 +279,7 @@ class _Copy:
             return
         self._recovery.chunks += 1
 
-    def _copy_message(self, writer: RunWriter, message: Message) -> None:
+    def _copy_message(self, writer: RecordingWriter, message: Message) -> None:
         if message.channel_id not in self._declared:
             self._recovery.orphans += 1
             return
@@ -279,7 +287,7 @@ class _Copy:
         self._recovery.messages += 1
         self._last_ns = max(self._last_ns, message.log_time)
 
-    def _declare(self, writer: RunWriter, item: Schema | Channel) -> None:
+    def _declare(self, writer: RecordingWriter, item: Schema | Channel) -> None:
         if isinstance(item, Schema):
             if item.id not in self._schemas:
                 self._schemas[item.id] = item
@@ -290,19 +298,19 @@ class _Copy:
         self._declared.add(item.id)
         writer.add_channel(item)
 
-    def _copy_metadata(self, writer: RunWriter, item: Metadata) -> None:
+    def _copy_metadata(self, writer: RecordingWriter, item: Metadata) -> None:
         self._recovery.metadata += 1
         self._has_summary |= item.name == "hilrig.summary"
         if item.name.startswith("hilrig.loss"):
-            for name in self._notes:
-                # Metadata has no checksum: a figure may be none.
-                figure = item.metadata.get(name.removeprefix("lost_"), "")
-                self._notes[name] += int(figure) if figure.isdecimal() else 0
+            for name in self._losses:
+                # Metadata has no checksum: a damaged count may not be a number.
+                count = item.metadata.get(name.removeprefix("lost_"), "")
+                self._losses[name] += int(count) if count.isdecimal() else 0
         writer.add_metadata(item.name, item.metadata)
 
-    def _last_words(self, ours: bool) -> dict[str, dict[str, str]]:
+    def _final_metadata(self, is_hilrig: bool) -> dict[str, dict[str, str]]:
         recovery = self._recovery
-        words = {
+        records = {
             "hilrig.recovered": {
                 "from": recovery.source.name,
                 "messages": str(recovery.messages),
@@ -314,25 +322,25 @@ class _Copy:
                 "software_version": version("hilrig"),
             }
         }
-        if ours and not self._has_summary:
-            words["hilrig.summary"] = {
+        if is_hilrig and not self._has_summary:
+            records["hilrig.summary"] = {
                 "ended": "recovered",
-                "reason": _DAMAGED if self._finished else _UNFINISHED,
+                "reason": _REASON_DAMAGED if self._finished else _REASON_UNFINISHED,
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),
-                **{name: str(count) for name, count in self._notes.items()},
+                **{name: str(count) for name, count in self._losses.items()},
             }
-        return words
+        return records
 
 
 def recovered_path(source: Path) -> Path:
-    """Where what is recovered from a file goes: a `.part` gets its name, any other keeps its own beside it.
+    """The default path of a recovered file: without `.part`, or with `.recovered` before the suffix.
 
     Raises:
-        InputError: it is a folder.
+        InputError: `source` is a folder.
     """
     if source.is_dir():
-        raise InputError(f"{source}: is a folder; name the MCAP files in it")
+        raise InputError(f"{source}: is a folder; give the MCAP files in it")
     if source.name.endswith(PART_SUFFIX):
         return source.with_name(source.name.removesuffix(PART_SUFFIX))
     return source.with_name(f"{source.stem}.recovered{source.suffix or MCAP_SUFFIX}")

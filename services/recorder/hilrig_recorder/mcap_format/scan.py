@@ -1,7 +1,7 @@
-"""Reading an MCAP file that may be torn or damaged: every whole record in it, and what lies between.
+"""Reads MCAP files that may be truncated or damaged: yields each complete record, and each damaged range between them.
 
-A record whose length leads nowhere is damage; reading goes on at the next chunk that is whole, which its lengths and
-its checksum prove. Nothing is guessed: a chunk whose checksum does not hold is damage from end to end.
+After a damaged record, reading continues at the next complete chunk, which its lengths and its checksum verify. A chunk
+with a wrong checksum is skipped entirely.
 """
 
 import struct
@@ -19,16 +19,16 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from hilrig_recorder.mcap_format.summary_section import encoded
+from hilrig_recorder.mcap_format.summary_section import encode_records
 
-CHUNK_LIMIT: Final = 1 << 30
-"""A chunk that claims to be larger, bytes uncompressed, is taken for damage."""
+MAX_CHUNK_BYTES: Final = 1 << 30
+"""Maximum uncompressed size of a chunk, bytes. A chunk that states a larger size is treated as damaged."""
 
 Buffer = bytes | memoryview
 
-_HEAD: Final = struct.Struct("<BQ")
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")
-_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
+_RECORD_HEADER: Final = struct.Struct("<BQ")
+_CHUNK_HEADER: Final = struct.Struct("<QQQII")
+_MESSAGE_HEADER: Final = struct.Struct("<HIQQ")
 _OPCODES: Final = frozenset(opcode.value for opcode in Opcode)
 _READERS: Final = {
     Opcode.HEADER.value: Header.read,
@@ -41,7 +41,7 @@ _READERS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A whole chunk; times are wall clock, ns."""
+    """A complete chunk; times are wall clock, ns."""
 
     offset: int
     first_ns: int
@@ -54,7 +54,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message; `record` is the whole MCAP record."""
+    """A message; `record` is the complete MCAP record. Times are wall clock, ns."""
 
     channel_id: int
     sequence: int
@@ -64,13 +64,13 @@ class Message:
 
     @property
     def data(self) -> bytes:
-        """The message's bytes."""
-        return self.record[_HEAD.size + _MESSAGE_HEAD.size :]
+        """The payload of the message."""
+        return self.record[_RECORD_HEADER.size + _MESSAGE_HEADER.size :]
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Bytes that hold nothing whole."""
+    """A range of bytes without a complete record."""
 
     offset: int
     length: int
@@ -78,19 +78,19 @@ class Damage:
 
 
 class DamagedError(Exception):
-    """A record that does not hold what it says."""
+    """The content of a record is inconsistent."""
 
 
 Item = Chunk | Message | McapRecord | Damage
 
 
 def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
-    """Every whole record up to the end of the data section, with its offset; damage where there is any.
+    """Yield each complete record up to the end of the data section, and each damaged range.
 
-    Message indexes are passed over. Chunks are given as they are: `open_chunk` checks and opens one.
+    Message indexes are skipped. Chunks are not decompressed: use `read_chunk`.
 
     Yields:
-        (offset, record): a `Chunk`, a `Message` that stands outside chunks, a record of mcap's, or `Damage`.
+        (offset, item): a `Chunk`, a `Message` outside chunks, a record of the mcap library, or `Damage`.
     """
     view = memoryview(buffer)
     end = len(view)
@@ -99,24 +99,24 @@ def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
         offset = len(MCAP0_MAGIC)
     else:
         following = _next_chunk(view, 0)
-        yield 0, Damage(0, following, "it does not begin as an MCAP file does")
+        yield 0, Damage(0, following, "bad magic")
         offset = following
     while offset < end:
-        head = view[offset : offset + _HEAD.size]
-        if len(head) < _HEAD.size:
-            yield offset, Damage(offset, end - offset, "torn")
+        head = view[offset : offset + _RECORD_HEADER.size]
+        if len(head) < _RECORD_HEADER.size:
+            yield offset, Damage(offset, end - offset, "truncated record")
             return
-        opcode, length = _HEAD.unpack(head)
-        start, stop = offset + _HEAD.size, offset + _HEAD.size + length
+        opcode, length = _RECORD_HEADER.unpack(head)
+        start, stop = offset + _RECORD_HEADER.size, offset + _RECORD_HEADER.size + length
         try:
             if opcode not in _OPCODES and opcode < 0x80:
-                raise DamagedError("no record begins here")
+                raise DamagedError("unknown opcode")
             if stop > end:
-                raise DamagedError("torn")
+                raise DamagedError("truncated record")
             if opcode in (Opcode.DATA_END.value, Opcode.FOOTER.value):
-                # Behind the end of the data there is no chunk; where there is one, this is no end.
+                # No chunk follows the end of the data section. If one does, this record is damaged.
                 if _next_chunk(view, stop) < end:
-                    raise DamagedError("an end that is none")
+                    raise DamagedError("data end record before the last chunk")
                 return
             item = _record(opcode, offset, view[start:stop])
         except DamagedError as damage:
@@ -129,37 +129,37 @@ def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
         offset = stop
 
 
-def open_chunk(chunk: Chunk) -> Iterator[Message | Schema | Channel]:
-    """What a chunk holds.
+def read_chunk(chunk: Chunk) -> Iterator[Message | Schema | Channel]:
+    """Decompress a chunk and return an iterator over its records.
 
     Raises:
-        DamagedError: its checksum does not hold, or it can't be decompressed; nothing has been yielded then.
+        DamagedError: the checksum does not match, or decompression fails. No record was yielded.
     """
     raw = memoryview(_decompress(chunk))
-    return _contents(raw)
+    return _chunk_records(raw)
 
 
-def message_keys(chunk: Chunk) -> Iterator[tuple[int, int, int]]:
-    """Channel, sequence and publish time of a chunk's messages: much quicker than `open_chunk`.
+def read_message_keys(chunk: Chunk) -> Iterator[tuple[int, int, int]]:
+    """Yield channel id, sequence and publish time of each message of a chunk, much faster than `read_chunk`.
 
     Raises:
-        DamagedError: as `open_chunk`.
+        DamagedError: as in `read_chunk`.
     """
     raw = _decompress(chunk)
-    head, message_head, size = _HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, _HEAD.size
-    message, offset, end = int(Opcode.MESSAGE), 0, len(raw) - size - _MESSAGE_HEAD.size
+    record_header, message_header, size = _RECORD_HEADER.unpack_from, _MESSAGE_HEADER.unpack_from, _RECORD_HEADER.size
+    message, offset, end = int(Opcode.MESSAGE), 0, len(raw) - size - _MESSAGE_HEADER.size
     while offset <= end:
-        opcode, length = head(raw, offset)
+        opcode, length = record_header(raw, offset)
         if opcode == message:
-            channel_id, sequence, _, publish_time = message_head(raw, offset + size)
+            channel_id, sequence, _, publish_time = message_header(raw, offset + size)
             yield channel_id, sequence, publish_time
         offset += size + length
 
 
-def is_whole(buffer: Buffer) -> bool:
-    """Whether a file is finished: it begins and ends as it should, and its index matches its checksum."""
+def is_complete(buffer: Buffer) -> bool:
+    """Whether a file is finished: magic at both ends, a valid footer, and a summary that matches its checksum."""
     view = memoryview(buffer)
-    magic, footer_size = len(MCAP0_MAGIC), _HEAD.size + 20
+    magic, footer_size = len(MCAP0_MAGIC), _RECORD_HEADER.size + 20
     if len(view) < 2 * magic + footer_size or view[:magic] != MCAP0_MAGIC or view[-magic:] != MCAP0_MAGIC:
         return False
     footer_at = len(view) - magic - footer_size
@@ -176,7 +176,7 @@ def _record(opcode: int, offset: int, content: memoryview) -> Item | None:
         return _message(content)
     if opcode == Opcode.MESSAGE_INDEX.value:
         if len(content) < 6 or struct.unpack_from("<I", content, 2)[0] != len(content) - 6:
-            raise DamagedError("a message index whose lengths do not agree")
+            raise DamagedError("message index with inconsistent lengths")
         return None
     reader = _READERS.get(opcode)
     if reader is None:
@@ -185,31 +185,31 @@ def _record(opcode: int, offset: int, content: memoryview) -> Item | None:
     try:
         record: McapRecord = reader(ReadDataStream(BytesIO(data)))
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError, MemoryError) as error:
-        raise DamagedError(f"a {Opcode(opcode).name.lower()} that can't be read") from error
-    # Written again it must be what was read: lengths within it agree, and so does an attachment's checksum.
-    if encoded(record)[_HEAD.size :] != data:
-        raise DamagedError(f"a {Opcode(opcode).name.lower()} that does not hold what it says")
+        raise DamagedError(f"{Opcode(opcode).name.lower()} record can't be decoded") from error
+    # Encoding must reproduce the input. This verifies the inner lengths and the checksum of an attachment.
+    if encode_records(record)[_RECORD_HEADER.size :] != data:
+        raise DamagedError(f"{Opcode(opcode).name.lower()} record with inconsistent lengths or wrong checksum")
     return record
 
 
 def _chunk(offset: int, content: memoryview) -> Chunk:
     try:
-        first_ns, last_ns, size, crc, name_length = _CHUNK_HEAD.unpack_from(content)
-        name_end = _CHUNK_HEAD.size + name_length
-        compression = str(content[_CHUNK_HEAD.size : name_end], "ascii")
+        first_ns, last_ns, size, crc, name_length = _CHUNK_HEADER.unpack_from(content)
+        name_end = _CHUNK_HEADER.size + name_length
+        compression = str(content[_CHUNK_HEADER.size : name_end], "ascii")
         (data_length,) = struct.unpack_from("<Q", content, name_end)
     except (struct.error, UnicodeDecodeError) as error:
-        raise DamagedError("a chunk that can't be read") from error
-    if name_end + 8 + data_length != len(content) or size > CHUNK_LIMIT:
-        raise DamagedError("a chunk whose lengths do not agree")
+        raise DamagedError("chunk header can't be decoded") from error
+    if name_end + 8 + data_length != len(content) or size > MAX_CHUNK_BYTES:
+        raise DamagedError("chunk with inconsistent lengths")
     return Chunk(offset, first_ns, last_ns, compression, size, crc, content[name_end + 8 :])
 
 
 def _message(content: memoryview) -> Message:
-    if len(content) < _MESSAGE_HEAD.size:
-        raise DamagedError("a message that is too short")
-    record = _HEAD.pack(Opcode.MESSAGE.value, len(content)) + bytes(content)
-    channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(content)
+    if len(content) < _MESSAGE_HEADER.size:
+        raise DamagedError("message record is too short")
+    record = _RECORD_HEADER.pack(Opcode.MESSAGE.value, len(content)) + bytes(content)
+    channel_id, sequence, log_time, publish_time = _MESSAGE_HEADER.unpack_from(content)
     return Message(channel_id, sequence, log_time, publish_time, record)
 
 
@@ -218,34 +218,36 @@ def _decompress(chunk: Chunk) -> bytes:
         if chunk.compression == "zstd":
             stated = zstandard.frame_content_size(chunk.data)
             if stated not in (-1, chunk.uncompressed_size):
-                raise DamagedError("a chunk whose lengths do not agree")
+                raise DamagedError("chunk with inconsistent lengths")
             raw = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
         elif chunk.compression == "lz4":
             raw = lz4.frame.decompress(bytes(chunk.data))  # type: ignore[attr-defined]
         elif chunk.compression == "":
             raw = bytes(chunk.data)
         else:
-            raise DamagedError(f"a chunk compressed with {chunk.compression!r}, which nobody knows")
+            raise DamagedError(f"unknown compression {chunk.compression!r}")
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
-        raise DamagedError("a chunk that can't be decompressed") from error
+        raise DamagedError("decompression failed") from error
     if len(raw) != chunk.uncompressed_size or (chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc):
-        raise DamagedError("a chunk whose checksum does not hold")
+        raise DamagedError("checksum mismatch")
     return raw
 
 
-def _contents(raw: memoryview) -> Iterator[Message | Schema | Channel]:
+def _chunk_records(raw: memoryview) -> Iterator[Message | Schema | Channel]:
     offset, end = 0, len(raw)
-    while end - offset >= _HEAD.size:
-        opcode, length = _HEAD.unpack_from(raw, offset)
-        stop = offset + _HEAD.size + length
+    while end - offset >= _RECORD_HEADER.size:
+        opcode, length = _RECORD_HEADER.unpack_from(raw, offset)
+        stop = offset + _RECORD_HEADER.size + length
         if stop > end:
             return
-        if opcode == Opcode.MESSAGE.value and length >= _MESSAGE_HEAD.size:
-            channel_id, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(raw, offset + _HEAD.size)
+        if opcode == Opcode.MESSAGE.value and length >= _MESSAGE_HEADER.size:
+            channel_id, sequence, log_time, publish_time = _MESSAGE_HEADER.unpack_from(
+                raw, offset + _RECORD_HEADER.size
+            )
             yield Message(channel_id, sequence, log_time, publish_time, bytes(raw[offset:stop]))
         elif opcode in (Opcode.SCHEMA.value, Opcode.CHANNEL.value):
             try:
-                item = _record(opcode, offset, raw[offset + _HEAD.size : stop])
+                item = _record(opcode, offset, raw[offset + _RECORD_HEADER.size : stop])
             except DamagedError:
                 return
             if isinstance(item, Schema | Channel):
@@ -254,7 +256,7 @@ def _contents(raw: memoryview) -> Iterator[Message | Schema | Channel]:
 
 
 def _next_chunk(view: memoryview, offset: int) -> int:
-    """Where the next whole chunk begins, from `offset` on; the end of the buffer where there is none."""
+    """Offset of the next complete chunk at or after `offset`; the end of the buffer if no chunk follows."""
     end = len(view)
     window = 1 << 20
     while offset < end:
@@ -269,12 +271,12 @@ def _next_chunk(view: memoryview, offset: int) -> int:
 
 
 def _is_chunk(view: memoryview, offset: int) -> bool:
-    head = view[offset : offset + _HEAD.size]
-    if len(head) < _HEAD.size:
+    head = view[offset : offset + _RECORD_HEADER.size]
+    if len(head) < _RECORD_HEADER.size:
         return False
-    length = _HEAD.unpack(head)[1]
-    start = offset + _HEAD.size
-    if length < _CHUNK_HEAD.size + 8 or start + length > len(view):
+    length = _RECORD_HEADER.unpack(head)[1]
+    start = offset + _RECORD_HEADER.size
+    if length < _CHUNK_HEADER.size + 8 or start + length > len(view):
         return False
     try:
         _decompress(_chunk(offset, view[start : start + length]))

@@ -1,4 +1,4 @@
-"""The end of a recording: the index by which a reader finds everything, and the checksum that proves it. Pure."""
+"""The summary section at the end of an MCAP file: indexes, statistics and checksum. Pure."""
 
 import struct
 import zlib
@@ -20,43 +20,48 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from hilrig_recorder.mcap_format.chunk import ChunkNote
+from hilrig_recorder.mcap_format.chunk import ChunkInfo
 
 
 @dataclass(slots=True)
-class Contents:
-    """What stands in a file beside its chunks."""
+class SummarySection:
+    """Collects the entries of the summary section, except those of the chunks."""
 
     schemas: list[Schema] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
 
-    def end(self, size: int, chunks: Sequence[ChunkNote]) -> bytes:
-        """What finishes a file of `size` bytes that holds this and these chunks."""
-        data_end = encoded(DataEnd(0))
+    def encode(self, size: int, chunks: Sequence[ChunkInfo]) -> bytes:
+        """All bytes after the data section: data end, summary, footer and magic.
+
+        Args:
+            size: size of the file so far, bytes.
+            chunks: the chunks in the file.
+        """
+        data_end = encode_records(DataEnd(0))
         start = size + len(data_end)
         summary = bytearray()
         offsets = bytearray()
         groups: list[tuple[Opcode, bytes]] = [
-            (Opcode.SCHEMA, encoded(*self.schemas)),
-            (Opcode.CHANNEL, encoded(*self.channels)),
-            (Opcode.STATISTICS, encoded(self._statistics(chunks))),
+            (Opcode.SCHEMA, encode_records(*self.schemas)),
+            (Opcode.CHANNEL, encode_records(*self.channels)),
+            (Opcode.STATISTICS, encode_records(self._statistics(chunks))),
             (Opcode.CHUNK_INDEX, b"".join(chunk.index_record() for chunk in chunks)),
-            (Opcode.ATTACHMENT_INDEX, encoded(*self.attachments)),
-            (Opcode.METADATA_INDEX, encoded(*self.metadata)),
+            (Opcode.ATTACHMENT_INDEX, encode_records(*self.attachments)),
+            (Opcode.METADATA_INDEX, encode_records(*self.metadata)),
         ]
         for opcode, records in groups:
             if records:
-                offsets += encoded(SummaryOffset(opcode.value, start + len(summary), len(records)))
+                offsets += encode_records(SummaryOffset(opcode.value, start + len(summary), len(records)))
                 summary += records
         offset_start = start + len(summary)
         summary += offsets
         footer_head = struct.pack("<BQQQ", Opcode.FOOTER.value, 20, start, offset_start)
         checksum = zlib.crc32(footer_head, zlib.crc32(summary))
-        return data_end + bytes(summary) + encoded(Footer(start, offset_start, checksum)) + MCAP0_MAGIC
+        return data_end + bytes(summary) + encode_records(Footer(start, offset_start, checksum)) + MCAP0_MAGIC
 
-    def _statistics(self, chunks: Sequence[ChunkNote]) -> Statistics:
+    def _statistics(self, chunks: Sequence[ChunkInfo]) -> Statistics:
         totals: dict[int, int] = {}
         for chunk in chunks:
             for channel_id, count in chunk.counts:
@@ -74,8 +79,8 @@ class Contents:
         )
 
 
-def encoded(*records: McapRecord) -> bytes:
-    """Records as they stand in a file."""
+def encode_records(*records: McapRecord) -> bytes:
+    """Encode records in the MCAP file format."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)

@@ -1,9 +1,9 @@
-"""One recording: an MCAP file that is called `.part` while it is written and gets its name when it is whole.
+"""Writes one recording: an MCAP file with the suffix `.part` that is renamed when it is finished.
 
-Chunks of at most 64 KiB leave in one write each, so that a kill tears at most the last one. The index at the end is
-made of what stands in the file: nothing is kept of a chunk once it is written, however long a recording grows. A write
-that fails is taken back to the last whole chunk, and the file can still be finished: what did not fit is tried again
-then, and where no space is left even for the index, the newest chunks make room for it.
+Each chunk of at most 64 KiB is written by one call, so that a kill truncates at most the last chunk. The index is built
+from the file when it is finished: memory use does not grow with the recording. After a failed write the file is
+truncated to its last complete chunk and can still be finished: pending messages are written again first, and if there
+is no space for the index, the newest chunks are removed until it fits.
 """
 
 import errno
@@ -17,26 +17,36 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata,
 from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.mcap_format.channels import CHANNELS, SCHEMAS
-from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES, ChunkNote, Compress, chunks_of, compressor, cut, encode_chunk
+from hilrig_recorder.mcap_format.chunk import (
+    CHUNK_BYTES,
+    ChunkInfo,
+    Compress,
+    compressor,
+    encode_chunk,
+    read_chunk_infos,
+    split_into_chunks,
+)
 from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
-from hilrig_recorder.mcap_format.summary_section import Contents, encoded
+from hilrig_recorder.mcap_format.summary_section import SummarySection, encode_records
 
 LIBRARY: Final = "hilrig"
 
 
-class MovedError(OSError):
-    """The file is not any more where it was: somebody moved or deleted it, or its folder, while it was written."""
+class FileReplacedError(OSError):
+    """The file being written, or its folder, was moved or deleted."""
 
-    def __init__(self, part: Path) -> None:
-        super().__init__(errno.ENOENT, "it was moved or deleted while it was written", str(part))
+    def __init__(self, path: Path) -> None:
+        super().__init__(errno.ENOENT, "file was moved or deleted while it was being written", str(path))
 
 
-class RunWriter:
-    """Writes one recording; use it from one thread, and `sync` from any one other, which may `finish` it too.
+class RecordingWriter:
+    """Writes one recording.
+
+    One thread writes. One other thread may call `sync`, and finally `finish` and `publish`.
 
     Raises:
-        OSError: from every method that writes, when the disk does not take it. What was written before stays whole.
+        OSError: from every method that writes, if the write fails. Records written before stay complete.
     """
 
     def __init__(
@@ -48,192 +58,199 @@ class RunWriter:
         metadata: tuple[Metadata, ...] = (),
         profile: str = "",
         library: str = LIBRARY,
-        part: Path | None = None,
+        temporary_path: Path | None = None,
         compress: Compress | None = None,
     ) -> None:
         self.path = path
-        self.part = part_path(path) if part is None else part
-        self._file = FileIO(self.part, "x+")
+        self.temporary_path = part_path(path) if temporary_path is None else temporary_path
+        self._file = FileIO(self.temporary_path, "x+")
         lock_file(self._file.fileno())
         self.size = 0
-        """Bytes in the file, all of whole records."""
+        """Bytes in the file, all of complete records."""
         self.message_count = 0
         """Messages in the file."""
-        self.given_up = 0
-        """Messages that the disk did not take."""
+        self.dropped_count = 0
+        """Messages that could not be written."""
         self._compress = compressor() if compress is None else compress
         self._pending: list[bytes] = []
         self._pending_bytes = 0
-        self._contents = Contents()
+        self._summary = SummarySection()
         try:
-            # One write: a laboratory may begin hundreds of files at once, and a file that is there says whose it is.
-            begin = MCAP0_MAGIC + encoded(Header(profile, library), *schemas, *channels)
-            self._append(begin + encoded(*metadata))
+            # One write: many files may be opened at once, and each file that exists states its session.
+            begin = MCAP0_MAGIC + encode_records(Header(profile, library), *schemas, *channels)
+            self._append(begin + encode_records(*metadata))
         except OSError:
             self.discard()
             raise
-        self._contents.schemas += schemas
-        self._contents.channels += channels
+        self._summary.schemas += schemas
+        self._summary.channels += channels
         offset = len(begin)
         for item in metadata:
-            length = len(encoded(item))
-            self._contents.metadata.append(MetadataIndex(offset, length, item.name))
+            length = len(encode_records(item))
+            self._summary.metadata.append(MetadataIndex(offset, length, item.name))
             offset += length
 
     @property
     def attachment_count(self) -> int:
-        """Attachments in the file."""
-        return len(self._contents.attachments)
+        """Number of attachments in the file."""
+        return len(self._summary.attachments)
 
     # -- records ----------------------------------------------------------------------------------------------------
 
     def add_schema(self, schema: Schema) -> None:
-        """Declare a schema, outside the chunks so that a torn file has it."""
-        self._append(encoded(schema))
-        self._contents.schemas.append(schema)
+        """Add a schema outside the chunks, so that a truncated file contains it."""
+        self._append(encode_records(schema))
+        self._summary.schemas.append(schema)
 
     def add_channel(self, channel: Channel) -> None:
-        """Declare a channel, outside the chunks too."""
-        self._append(encoded(channel))
-        self._contents.channels.append(channel)
+        """Add a channel outside the chunks, so that a truncated file contains it."""
+        self._append(encode_records(channel))
+        self._summary.channels.append(channel)
 
     def add(self, record: bytes) -> None:
-        """Add a message that is encoded already (`channels.encode_message`), to be written when a chunk is full."""
+        """Add an encoded message (`channels.encode_message`). It is written when the chunk is full."""
         if self._pending and self._pending_bytes + len(record) > CHUNK_BYTES:
             self.close_chunk()
         self._pending.append(record)
         self._pending_bytes += len(record)
 
     def write(self, records: Iterable[bytes]) -> None:
-        """Add messages, and write them at once."""
+        """Add encoded messages and write them immediately."""
         self._pending += records
         self.close_chunk()
 
     def close_chunk(self) -> None:
-        """Write the messages that wait; what the disk does not take waits for `finish`."""
+        """Write the pending messages. After an error, unwritten messages stay pending until `finish`."""
         written = 0
         try:
-            for run in cut(self._pending):
-                self._append(encode_chunk(run, self._compress))
-                written += len(run)
+            for group in split_into_chunks(self._pending):
+                self._append(encode_chunk(group, self._compress))
+                written += len(group)
         finally:
             self.message_count += written
             del self._pending[:written]
             self._pending_bytes = 0
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a named set of values."""
-        record = encoded(Metadata(name, dict(values)))
+        """Add a metadata record."""
+        record = encode_records(Metadata(name, dict(values)))
         self._append(record)
-        self._contents.metadata.append(MetadataIndex(self.size - len(record), len(record), name))
+        self._summary.metadata.append(MetadataIndex(self.size - len(record), len(record), name))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, *, log_time: int, create_time: int = 0) -> None:
-        """Add a file to the file; times are wall clock, ns."""
-        record = encoded(Attachment(create_time, log_time, name, media_type, data))
+        """Add an attachment; times are wall clock, ns."""
+        record = encode_records(Attachment(create_time, log_time, name, media_type, data))
         self._append(record)
-        self._contents.attachments.append(
+        self._summary.attachments.append(
             AttachmentIndex(self.size - len(record), len(record), log_time, create_time, len(data), name, media_type)
         )
 
-    # -- the end ----------------------------------------------------------------------------------------------------
+    # -- finishing --------------------------------------------------------------------------------------------------
 
-    def finish(self, last_words: Callable[[], Mapping[str, Mapping[str, str]]] = dict) -> None:
-        """Write the last chunk, `last_words` (metadata by name) and the index.
+    def finish(self, final_metadata: Callable[[], Mapping[str, Mapping[str, str]]] = dict) -> None:
+        """Write the last chunk, the final metadata and the index.
 
-        Where the disk has no room for them, the newest chunks are given up until it has; `last_words` is asked again
-        each time, for it may tell `given_up`.
+        If the disk has no space for them, the newest chunks are removed until they fit.
+
+        Args:
+            final_metadata: returns metadata records by name. It is called again after each removed chunk, because it
+                may contain `dropped_count`.
 
         Raises:
-            OSError: there is not even room for the index of nothing; what stands in the file can be recovered.
+            OSError: not even an index without chunks could be written. The file can be recovered.
         """
         if self._pending:
-            # The one that the others share is of the thread that writes.
+            # The shared compressor belongs to the writing thread.
             self._compress = compressor()
             try:
                 self.close_chunk()
             except OSError:
-                self.given_up += len(self._pending)
+                self.dropped_count += len(self._pending)
                 self._pending.clear()
         chunks = self._chunks()
         while True:
             try:
-                self._end(last_words(), chunks)
+                self._write_end(final_metadata(), chunks)
                 return
             except OSError:
                 if not chunks:
                     raise
-                self._take_back(chunks.pop())
+                self._remove_chunk(chunks.pop())
 
-    def _chunks(self) -> list[ChunkNote]:
+    def _chunks(self) -> list[ChunkInfo]:
         try:
-            return list(chunks_of(self._read, len(MCAP0_MAGIC), self.size))
+            return list(read_chunk_infos(self._read, len(MCAP0_MAGIC), self.size))
         except ValueError as error:
-            raise OSError(errno.EIO, f"what was written can't be read back: {error}") from error
+            raise OSError(errno.EIO, f"written data can't be read back: {error}") from error
         finally:
             self._file.seek(self.size)
 
-    def _end(self, last_words: Mapping[str, Mapping[str, str]], chunks: Sequence[ChunkNote]) -> None:
-        size, known = self.size, len(self._contents.metadata)
+    def _write_end(self, final_metadata: Mapping[str, Mapping[str, str]], chunks: Sequence[ChunkInfo]) -> None:
+        size, known = self.size, len(self._summary.metadata)
         try:
-            for name, values in last_words.items():
+            for name, values in final_metadata.items():
                 self.add_metadata(name, values)
-            self._append(self._contents.end(self.size, chunks))
+            self._append(self._summary.encode(self.size, chunks))
         except OSError:
-            del self._contents.metadata[known:]
-            self._cut(size)
+            del self._summary.metadata[known:]
+            self._truncate(size)
             raise
 
-    def _take_back(self, chunk: ChunkNote) -> None:
-        """Give up the newest chunk, and whatever was written behind it."""
-        contents = self._contents
-        contents.metadata = [index for index in contents.metadata if index.offset < chunk.start]
-        contents.attachments = [index for index in contents.attachments if index.offset < chunk.start]
+    def _remove_chunk(self, chunk: ChunkInfo) -> None:
+        """Remove the newest chunk and all records after it."""
+        summary = self._summary
+        summary.metadata = [index for index in summary.metadata if index.offset < chunk.start]
+        summary.attachments = [index for index in summary.attachments if index.offset < chunk.start]
         self.message_count -= chunk.messages
-        self.given_up += chunk.messages
-        self._cut(chunk.start)
+        self.dropped_count += chunk.messages
+        self._truncate(chunk.start)
 
-    # -- the disk ---------------------------------------------------------------------------------------------------
+    # -- disk access ------------------------------------------------------------------------------------------------
 
     def sync(self) -> None:
-        """Make what was written survive a power cut.
+        """Make the written records survive a power failure.
 
         Raises:
-            MovedError: under its name it would not be found; what is written goes on to where it is now.
+            FileReplacedError: the temporary path no longer refers to this file. Writing continues to the open file.
         """
         os.fsync(self._file.fileno())
-        self._find()
+        self._check_path()
 
-    def _find(self) -> None:
+    def _check_path(self) -> None:
         try:
-            is_there = os.path.samestat(self.part.stat(), os.fstat(self._file.fileno()))
+            is_same = os.path.samestat(self.temporary_path.stat(), os.fstat(self._file.fileno()))
         except FileNotFoundError:
-            is_there = False
-        if not is_there:
-            raise MovedError(self.part)
+            is_same = False
+        if not is_same:
+            raise FileReplacedError(self.temporary_path)
 
     def publish(self, *, durably: bool = True) -> Path:
-        """Give the finished file its name, so that it survives a power cut; the path it has now."""
+        """Rename the finished file to its final path and return that path.
+
+        Args:
+            durably: whether file and rename must survive a power failure.
+        """
         try:
-            self._find()
+            self._check_path()
             if self.path.exists():
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
             if durably:
                 self.sync()
         finally:
             self._file.close()
-        self.part.replace(self.path)
+        self.temporary_path.replace(self.path)
         if durably:
             sync_folder(self.path.parent)
         return self.path
 
     def close(self) -> None:
-        """Let go of the file as it is, under its `.part` name."""
+        """Close the file as it is, under its temporary path."""
         self._file.close()
 
     def discard(self) -> None:
         """Remove the unfinished file."""
         self._file.close()
-        self.part.unlink(missing_ok=True)
+        self.temporary_path.unlink(missing_ok=True)
 
     def _read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
@@ -245,11 +262,11 @@ class RunWriter:
             while rest:
                 rest = rest[self._file.write(rest) or 0 :]
         except OSError:
-            self._cut(self.size)
+            self._truncate(self.size)
             raise
         self.size += len(data)
 
-    def _cut(self, size: int) -> None:
+    def _truncate(self, size: int) -> None:
         self._file.truncate(size)
         self._file.seek(size)
         self.size = size

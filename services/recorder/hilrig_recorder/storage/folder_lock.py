@@ -1,8 +1,8 @@
-"""One recorder a rig: a lock in the lab's folder, which shows whose recordings a recorder writes there.
+"""Locks in the folder of a lab, so that only one recorder writes the recordings of a rig.
 
-On one bus services tell each other for which rigs they run; this catches two recorders on one disk that do not hear
-each other. A lock is gone with the process that held it, however that ended. Of two that begin at the same moment
-both may see the other and refuse, but never neither.
+On one bus, services detect each other's rigs. The locks also detect two recorders that write to the same disk from
+separate buses. A lock ends with the process that holds it. If two recorders start simultaneously, both may refuse, but
+at least one always does.
 """
 
 import json
@@ -18,26 +18,28 @@ from typing import IO, Any, Final, Self
 from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_runtime.errors import OperationError
 
-NAMED: Final = 3
-"""Rigs that a refusal names."""
+MAX_NAMES_IN_MESSAGE: Final = 3
+"""Maximum number of rigs named in an error message."""
 _LOCKED_BYTE: Final = 1 << 20
 _ATTEMPTS: Final = 10
 _PAUSE_S: Final = 0.02
 
 
 class FolderLock:
-    """Holds some rigs' recordings in a lab's folder for this process.
+    """Locks the recordings of some rigs in the folder of a lab for this process.
 
     Raises:
-        OperationError: another recorder holds one of them, or has the same name; says which.
+        OperationError: another recorder has locked one of the rigs, or has the same instance name.
     """
 
     def __init__(self, folder: Path, instance: str, rigs: Collection[str]) -> None:
         path = folder / f".recorder-{instance}.lock"
         self._file = path.open("a+")
         try:
-            if not _lock_soon(self._file):
-                raise OperationError(f"{folder}: {_holder(path)} is called {instance!r} too; choose another --instance")
+            if not _lock_with_retries(self._file):
+                raise OperationError(
+                    f"{folder}: {_holder(path)} has the same instance name {instance!r}; choose another --instance"
+                )
             self._file.truncate(0)
             self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "rigs": sorted(rigs)}))
             self._file.flush()
@@ -52,11 +54,15 @@ class FolderLock:
     def _refuse_shared(folder: Path, other: Path, rigs: Collection[str]) -> None:
         shared = sorted(set(rigs) & set(_read(other).get("rigs", ())))
         if shared:
-            names = ", ".join(shared[:NAMED]) + (f" and {len(shared) - NAMED} more" if len(shared) > NAMED else "")
-            raise OperationError(f"{folder}: {_holder(other)} records {names} there; two would write the same files")
+            names = ", ".join(shared[:MAX_NAMES_IN_MESSAGE])
+            if len(shared) > MAX_NAMES_IN_MESSAGE:
+                names += f" and {len(shared) - MAX_NAMES_IN_MESSAGE} more"
+            raise OperationError(
+                f"{folder}: {_holder(other)} already records {names} in this folder; stop it, or assign other --rigs"
+            )
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the lock."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -68,8 +74,8 @@ class FolderLock:
         self.close()
 
 
-def _lock_soon(file: IO[str]) -> bool:
-    # Another recorder that begins may just be looking whether somebody holds it.
+def _lock_with_retries(file: IO[str]) -> bool:
+    # Another recorder that starts may hold the lock briefly while it checks it.
     for _ in range(_ATTEMPTS):
         if _lock(file):
             return True
@@ -82,7 +88,7 @@ def _lock(file: IO[str]) -> bool:
         return lock_file(file.fileno())
     import msvcrt
 
-    # Far behind what is read: on Windows a locked byte can't be.
+    # On Windows a locked byte can't be read, so a byte after the content is locked.
     file.seek(_LOCKED_BYTE)
     try:
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
@@ -101,10 +107,10 @@ def _is_free(path: Path) -> bool:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        said = json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    return said if isinstance(said, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _holder(path: Path) -> str:

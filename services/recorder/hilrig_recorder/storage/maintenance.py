@@ -1,4 +1,4 @@
-"""What a recorder does beside recording, in no hurry: recovering what was left unfinished, keeping the disk tidy."""
+"""Background maintenance: recovers files that earlier recorders did not finish, and deletes expired recordings."""
 
 import contextlib
 import logging
@@ -9,98 +9,112 @@ from typing import Final
 
 from hilrig_recorder.mcap_format.file_names import RECOVERING_SUFFIX, UNFINISHED_SUFFIX
 from hilrig_recorder.mcap_format.recover import recover, recovered_path
-from hilrig_recorder.storage.retention import finished_recordings, to_delete
+from hilrig_recorder.storage.retention import finished_recordings, select_expired
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.errors import HilrigError
 from hilrig_runtime.timing.clock import Clock
 
-KEEP_PERIOD_S: Final = 60.0
-HEAD_START_S: Final = 2.0
-PAUSES: Final = 3.0
-"""Recovering pauses so many times as long as it works."""
+RETENTION_PERIOD_S: Final = 60.0
+"""Period at which expired recordings are deleted."""
+START_DELAY_S: Final = 2.0
+"""Delay of the first recovery, so that open sessions get their next segments first."""
+PAUSE_TO_WORK_RATIO: Final = 3.0
+"""Duty cycle of recovery: pause = ratio * work time."""
 MIN_PAUSE_S: Final = 0.002
 
 logger = logging.getLogger(__name__)
 
 
-def unfinished(folder: Path) -> list[Path]:
-    """What recorders before this one left unfinished in a lab's folder."""
+def find_unfinished(folder: Path) -> list[Path]:
+    """The unfinished recordings of earlier recorders in the folder of a lab."""
     return sorted(folder.glob(f"*/*{UNFINISHED_SUFFIX}"))
 
 
-class Housekeeping:
-    """A thread that recovers `parts` and then applies the rules of keeping once a minute."""
+class MaintenanceWorker:
+    """A thread that recovers unfinished files and then deletes expired recordings once a minute.
+
+    Args:
+        folder: the folder of the lab's recordings.
+        unfinished: the files to recover.
+        config: the retention rules.
+        clock: the clock.
+        on_error: called with a text when a file can't be recovered or deleted.
+    """
 
     def __init__(
-        self, folder: Path, parts: list[Path], config: RecorderConfig, clock: Clock, on_trouble: Callable[[str], None]
+        self,
+        folder: Path,
+        unfinished: list[Path],
+        config: RecorderConfig,
+        clock: Clock,
+        on_error: Callable[[str], None],
     ) -> None:
         self._folder = folder
-        self._parts = parts
+        self._unfinished = unfinished
         self._config = config
         self._clock = clock
-        self._on_trouble = on_trouble
-        self._ended = threading.Event()
+        self._on_error = on_error
+        self._stopping = threading.Event()
         self._resumed_ns = clock.monotonic_ns()
-        self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="maintenance", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End; what is being recovered stays as it was, for the next start."""
-        self._ended.set()
+        """Stop the thread. An interrupted recovery leaves the original file for the next start."""
+        self._stopping.set()
         self._thread.join()
 
     def _run(self) -> None:
         for draft in self._folder.glob(f"*/*{RECOVERING_SUFFIX}"):
             with contextlib.suppress(OSError):
                 draft.unlink()
-        # First the sessions that go on get their next files.
-        if self._parts:
-            self._ended.wait(HEAD_START_S)
+        if self._unfinished:
+            self._stopping.wait(START_DELAY_S)
         self._resumed_ns = self._clock.monotonic_ns()
-        for part in self._parts:
+        for path in self._unfinished:
             if not self._pause():
                 return
-            self._recover(part)
-        while not self._ended.is_set():
-            self._tidy()
-            self._ended.wait(KEEP_PERIOD_S)
+            self._recover(path)
+        while not self._stopping.is_set():
+            self._delete_expired()
+            self._stopping.wait(RETENTION_PERIOD_S)
 
     def _pause(self) -> bool:
-        """Leave the processor to the recording, most of the time; whether to go on."""
+        """Leave most of the CPU time to recording; False: the thread must stop."""
         worked_s = (self._clock.monotonic_ns() - self._resumed_ns) * 1e-9
-        ended = self._ended.wait(max(MIN_PAUSE_S, PAUSES * worked_s))
+        stopping = self._stopping.wait(max(MIN_PAUSE_S, PAUSE_TO_WORK_RATIO * worked_s))
         self._resumed_ns = self._clock.monotonic_ns()
-        return not ended
+        return not stopping
 
-    def _recover(self, part: Path) -> None:
+    def _recover(self, source: Path) -> None:
         try:
-            if part.stat().st_size == 0:
-                part.unlink()
+            if source.stat().st_size == 0:
+                source.unlink()
                 return
-            path = recovered_path(part)
+            path = recovered_path(source)
             if path.exists():
                 path = path.with_name(f"{path.stem}.recovered{path.suffix}")
-            recovery = recover(part, path, go_on=self._pause)
+            recovery = recover(source, path, should_continue=self._pause)
             if recovery.path is None:
-                # It was finished, and only its name was missing.
-                part.replace(path)
+                # The file was finished, but not renamed.
+                source.replace(path)
             else:
-                part.unlink()
+                source.unlink()
             logger.info("recovered %s: %d messages", path, recovery.messages)
         except (HilrigError, OSError) as error:
-            if not self._ended.is_set():
-                self._on_trouble(str(error))
+            if not self._stopping.is_set():
+                self._on_error(str(error))
 
-    def _tidy(self) -> None:
+    def _delete_expired(self) -> None:
         days, gib = self._config.keep_days, self._config.keep_gib
         if not days and not gib:
             return
         now_s = self._clock.wall_ns() / 1e9
-        for stored in to_delete(finished_recordings(self._folder), keep_days=days, keep_gib=gib, now_s=now_s):
+        for stored in select_expired(finished_recordings(self._folder), keep_days=days, keep_gib=gib, now_s=now_s):
             try:
                 stored.path.unlink(missing_ok=True)
-                for beside in stored.path.parent.glob(f"{stored.path.name}.*"):
-                    beside.unlink(missing_ok=True)
-                logger.info("deleted %s: recorder.keep_days or recorder.keep_gib no longer keeps it", stored.path)
+                for companion in stored.path.parent.glob(f"{stored.path.name}.*"):
+                    companion.unlink(missing_ok=True)
+                logger.info("deleted %s: expired by recorder.keep_days or recorder.keep_gib", stored.path)
             except OSError as error:
-                self._on_trouble(f"{stored.path}: can't be deleted: {error.strerror}")
+                self._on_error(f"{stored.path}: can't be deleted: {error.strerror}")

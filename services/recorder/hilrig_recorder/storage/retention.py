@@ -1,4 +1,4 @@
-"""Which recordings may go, when there are rules about how long or how much is kept."""
+"""Retention policy: selects the recordings to delete by age and total size."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ DAY_S = 86_400
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class StoredRecording:
     """A finished recording on the disk."""
 
     path: Path
@@ -21,24 +21,33 @@ class Stored:
     """When it was finished, s since 1970-01-01 UTC."""
 
 
-def finished_recordings(folder: Path) -> list[Stored]:
-    """The finished recordings of a lab's folder: `<folder>/<rig>/<session>.mcap`."""
+def finished_recordings(folder: Path) -> list[StoredRecording]:
+    """The finished recordings in the folder of a lab: `<folder>/<rig>/<session>.mcap`."""
     found = []
     for path in folder.glob(f"*/*{MCAP_SUFFIX}"):
         try:
             info = path.stat()
         except OSError:
-            # Gone since it was listed.
+            # Deleted since it was listed.
             continue
-        found.append(Stored(path, path.parent.name, info.st_size, info.st_mtime))
+        found.append(StoredRecording(path, path.parent.name, info.st_size, info.st_mtime))
     return found
 
 
-def to_delete(recordings: Iterable[Stored], *, keep_days: float, keep_gib: float, now_s: float) -> list[Stored]:
-    """What the rules let go, oldest first; 0 turns a rule off. A rig's newest recording always stays."""
+def select_expired(
+    recordings: Iterable[StoredRecording], *, keep_days: float, keep_gib: float, now_s: float
+) -> list[StoredRecording]:
+    """The recordings to delete, oldest first. The newest recording of each rig is never deleted.
+
+    Args:
+        recordings: all finished recordings.
+        keep_days: maximum age, days; 0: no limit.
+        keep_gib: maximum total size, GiB; 0: no limit.
+        now_s: current time, s since 1970-01-01 UTC.
+    """
     oldest_first = sorted(recordings, key=lambda stored: (stored.finished_s, stored.path))
     newest = {stored.rig: stored for stored in oldest_first}
-    going: list[Stored] = []
+    expired: list[StoredRecording] = []
     total = sum(stored.size for stored in oldest_first)
     for stored in oldest_first:
         if newest[stored.rig] is stored:
@@ -46,6 +55,6 @@ def to_delete(recordings: Iterable[Stored], *, keep_days: float, keep_gib: float
         too_old = keep_days > 0 and now_s - stored.finished_s > keep_days * DAY_S
         too_much = keep_gib > 0 and total > keep_gib * 2**30
         if too_old or too_much:
-            going.append(stored)
+            expired.append(stored)
             total -= stored.size
-    return going
+    return expired

@@ -1,7 +1,7 @@
-"""One open file of a session: its messages, what is noted in it besides, and its last words.
+"""An open segment file of a session: writes messages, metadata and attachments, and prepares its final metadata.
 
-Trouble with the disk stays here: the file takes no more from then on, counts what it did not take, and is ended by
-whoever is told of its failure.
+A write error is handled here: the file accepts no more messages, counts the lost ones, and reports the failure to its
+owner, which finishes the file.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -9,39 +9,46 @@ from dataclasses import asdict
 from typing import Final
 
 from hilrig_recorder.ingest.recording import Recording
-from hilrig_recorder.mcap_format.writer import RunWriter
+from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigConfig
 
-LOSS_NOTES: Final = 1000
-"""Places of losses noted in a file; all are counted in its summary."""
+MAX_LOSS_RECORDS: Final = 1000
+"""Maximum number of metadata records of losses in a file; the summary counts all losses."""
 
 
-class RunFile:
-    """Implements `recording.Sink`. `on_failure` is called once, when the disk does not take something."""
+class SegmentFile:
+    """An open file of a recording; implements `ingest.recording.RecordingSink`.
+
+    Args:
+        recording: the recording.
+        writer: the writer of the file.
+        clock: the clock.
+        on_failure: called once, at the first write error.
+    """
 
     def __init__(
-        self, recording: Recording, writer: RunWriter, clock: Clock, on_failure: Callable[[OSError], None]
+        self, recording: Recording, writer: RecordingWriter, clock: Clock, on_failure: Callable[[OSError], None]
     ) -> None:
         self.recording = recording
         self.writer = writer
         self.opened_ns = clock.monotonic_ns()
         self.failure: OSError | None = None
-        """What the disk said when it did not take something; None: it took everything."""
-        self.moved = False
-        """Whether somebody moved or deleted it."""
+        """The first write error; None: all writes succeeded."""
+        self.is_replaced = False
+        """Whether the file was moved or deleted while it was open."""
         self.sources: set[tuple[str, int]] = set()
-        """Runs of services that contribute, by name and incarnation."""
+        """(source, incarnation) of the services that contribute."""
         self.configurations: set[int] = set()
-        """Incarnations of the simulation whose configuration is noted."""
+        """Incarnations of the simulation whose configuration is in the file."""
         self._clock = clock
         self._on_failure = on_failure
         self._losses = 0
 
     def write(self, records: Sequence[bytes]) -> None:
-        """See `Sink.write`."""
+        """Write encoded messages; after a write error, count them as lost."""
         if self.failure is not None:
-            self.recording.tally.lost_recorder += len(records)
+            self.recording.counters.lost_recorder += len(records)
             return
         try:
             self.writer.write(records)
@@ -49,14 +56,14 @@ class RunFile:
             self.fail(error)
 
     def fail(self, error: OSError) -> None:
-        """Take no more: the disk let it down."""
+        """Accept no more messages, because of a write error."""
         if self.failure is None:
             self.failure = error
             self._on_failure(error)
 
-    def note_loss(self, source: str, key: str, transport: int, recorder: int) -> None:
-        """Note where messages are missing."""
-        if self._losses < LOSS_NOTES:
+    def record_loss(self, source: str, key: str, transport: int, recorder: int) -> None:
+        """Add a metadata record about lost messages."""
+        if self._losses < MAX_LOSS_RECORDS:
             self._losses += 1
             values = {
                 "source": source,
@@ -65,19 +72,19 @@ class RunFile:
                 "recorder": str(recorder),
                 "log_time": str(self._clock.wall_ns()),
             }
-            self._note(numbered("hilrig.loss", self._losses), values)
+            self._add_metadata(numbered("hilrig.loss", self._losses), values)
 
-    def note_source(self, source: str, incarnation: int) -> bool:
-        """Note that a run of a service contributes; whether that is new."""
+    def record_source(self, source: str, incarnation: int) -> bool:
+        """Add a metadata record about a contributing service; False: it is already in the file."""
         if (source, incarnation) in self.sources:
             return False
         self.sources.add((source, incarnation))
         values = {"source": source, "incarnation": str(incarnation)}
-        self._note(numbered("hilrig.source", len(self.sources)), values)
+        self._add_metadata(numbered("hilrig.source", len(self.sources)), values)
         return True
 
-    def note_config(self, config: RigConfig) -> None:
-        """Note what the simulation says of itself, with its files; the same only once."""
+    def record_config(self, config: RigConfig) -> None:
+        """Add the configuration of a simulation and its files, unless it is already in the file."""
         if config.incarnation in self.configurations:
             return
         self.configurations.add(config.incarnation)
@@ -89,23 +96,27 @@ class RunFile:
             "software_version": config.software_version,
             "machine": config.machine,
         }
-        self._note(numbered("hilrig.config", len(self.configurations)), values)
-        lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were in force.\n"
+        self._add_metadata(numbered("hilrig.config", len(self.configurations)), values)
+        lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were used.\n"
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
 
-    def ending(self, end: str, reason: str) -> Callable[[], None]:
-        """What writes the last words and the index, on whatever thread; nothing is written to this file any more.
+    def finisher(self, end: str, reason: str) -> Callable[[], None]:
+        """A function that writes the final metadata and the index; any thread may call it.
 
-        `end` is one word for programs, `reason` a sentence for people. Calling it raises what `RunWriter.finish` does.
+        Nothing else may be written to this file any more. The function raises the errors of `RecordingWriter.finish`.
+
+        Args:
+            end: machine-readable cause of the end.
+            reason: a sentence that explains the end.
         """
         writer, recording = self.writer, self.recording
-        # The recording may go on in a next file, with a tally of its own.
-        tally, end_wall_ns = recording.tally, recording.end_wall_ns or self._clock.wall_ns()
+        # The recording may continue in a new segment with new counters.
+        counters, end_wall_ns = recording.counters, recording.end_wall_ns or self._clock.wall_ns()
 
-        def last_words() -> dict[str, dict[str, str]]:
-            values = {name: str(value) for name, value in asdict(tally).items()}
-            values["lost_recorder"] = str(tally.lost_recorder + writer.given_up)
+        def final_metadata() -> dict[str, dict[str, str]]:
+            values = {name: str(value) for name, value in asdict(counters).items()}
+            values["lost_recorder"] = str(counters.lost_recorder + writer.dropped_count)
             return {
                 "hilrig.summary": {
                     "ended": end,
@@ -116,9 +127,9 @@ class RunFile:
                 }
             }
 
-        return lambda: writer.finish(last_words)
+        return lambda: writer.finish(final_metadata)
 
-    def _note(self, name: str, values: Mapping[str, str]) -> None:
+    def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         try:
             self.writer.add_metadata(name, values)
         except OSError as error:
@@ -132,5 +143,5 @@ class RunFile:
 
 
 def numbered(name: str, number: int) -> str:
-    """Name of the first, second, … metadata record of a kind: names are unique in a file."""
+    """Name of the first, second, … metadata record of a kind; names are unique in a file."""
     return name if number == 1 else f"{name}.{number}"

@@ -1,7 +1,7 @@
-"""The files of one session: how they are called, and what the next must know of those before.
+"""The segment files of one session: their names, and the last messages of earlier segments.
 
-`<session>.mcap`; when a session needs another file (the recorder was restarted, the file grew too large, the disk was
-full for a while) the next is `<session>.2.mcap`, and its metadata names the one before.
+The first segment is `<session>.mcap`. When a session needs another file (after a recorder restart, a rotation or a full
+disk) it is `<session>.2.mcap`, and its metadata names the previous segment.
 """
 
 import contextlib
@@ -10,57 +10,57 @@ from pathlib import Path
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, part_path
-from hilrig_recorder.mcap_format.recover import Tail, read_tail
+from hilrig_recorder.mcap_format.recover import SegmentTail, read_tail
 from hilrig_runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
-class NextPart:
-    """Where a session goes on."""
+class NextSegment:
+    """The file in which a session continues."""
 
     path: Path
     number: int
-    """Which file of the session it is, from 1."""
+    """Number of the segment, from 1."""
     previous: Path | None
-    """The one before; None: this is the first."""
+    """The previous segment; None: this is the first."""
 
 
-def next_part(folder: Path, session: str, after: str = "") -> NextPart:
-    """The file after the last of a session, whole or unfinished, and behind the file of the name `after`.
+def next_segment(folder: Path, session: str, after: str = "") -> NextSegment:
+    """The segment after the last one of a session, finished or not, and after the file with the name `after`.
 
-    Those before may be deleted or moved away already.
+    Earlier segments may already be deleted or moved.
 
     Raises:
-        OSError: the folder can't be looked into.
+        OSError: the folder can't be listed.
     """
     try:
         names = [path.name for path in folder.iterdir()]
     except FileNotFoundError:
-        # Not there yet.
+        # The folder is created later.
         names = []
     number = max(_number(name, session) for name in (*names, after))
-    previous = folder / file_name(session, number) if number else None
-    return NextPart(folder / file_name(session, number + 1), number + 1, previous)
+    previous = folder / segment_name(session, number) if number else None
+    return NextSegment(folder / segment_name(session, number + 1), number + 1, previous)
 
 
-def tail_of_session(folder: Path, session: str, number: int, tail_ns: int) -> Tail:
-    """The last `tail_ns` of a session's files up to a number: a recorder may have been restarted often."""
-    tail = _tail(folder / file_name(session, number), tail_ns)
+def read_session_tail(folder: Path, session: str, number: int, tail_ns: int) -> SegmentTail:
+    """Read the last `tail_ns` of a session, from segment `number` backward; after restarts, segments may be short."""
+    tail = _read_tail(folder / segment_name(session, number), tail_ns)
     last_ns = tail.last_ns
     while number > 1 and (not last_ns or last_ns - tail.last_ns < tail_ns):
         number -= 1
-        before = _tail(folder / file_name(session, number), tail_ns)
+        before = _read_tail(folder / segment_name(session, number), tail_ns)
         last_ns = last_ns or before.last_ns
         reached_ns = before.last_ns or tail.last_ns
-        tail = Tail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
+        tail = SegmentTail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
     return tail
 
 
-def horizon_of(tail: Tail) -> dict[int, int]:
-    """Of each channel the publish time before which `tail` does not know what was recorded.
+def horizon_by_channel(tail: SegmentTail) -> dict[int, int]:
+    """Publish time from which `tail` contains all messages, by channel id.
 
-    A channel is recorded in order. Events have several senders, whose clocks may differ; for them, and for a channel of
-    which nothing was seen, it is the earliest of all.
+    A channel is recorded in order. Events have several publishers, whose clocks may differ. For events, and for
+    channels without messages in `tail`, the result is the earliest publish time of all channels.
     """
     earliest = min((publish_ns for _, _, publish_ns in tail.keys), default=0)
     horizon_ns = dict.fromkeys(CHANNEL_OF_TOPIC.values(), 0)
@@ -70,13 +70,13 @@ def horizon_of(tail: Tail) -> dict[int, int]:
     return {channel_id: publish_ns or earliest for channel_id, publish_ns in horizon_ns.items()}
 
 
-def file_name(session: str, number: int) -> str:
-    """Name of a session's file; `number` counts from 1."""
+def segment_name(session: str, number: int) -> str:
+    """File name of a segment; `number` counts from 1."""
     return f"{session}{MCAP_SUFFIX}" if number == 1 else f"{session}.{number}{MCAP_SUFFIX}"
 
 
 def _number(name: str, session: str) -> int:
-    """Which file of a session is called so; 0: none."""
+    """Segment number of a file name; 0: not a segment of this session."""
     stem = name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     if stem == session:
         return 1
@@ -84,9 +84,9 @@ def _number(name: str, session: str) -> int:
     return int(number) if number.isdecimal() and number != stem else 0
 
 
-def _tail(path: Path, tail_ns: int) -> Tail:
-    # It may get its name just now, from the disk's thread or because it is recovered.
+def _read_tail(path: Path, tail_ns: int) -> SegmentTail:
+    # The file may be renamed meanwhile, by the sync worker or by a recovery.
     for candidate in (path, part_path(path), path):
         with contextlib.suppress(InputError):
             return read_tail(candidate, tail_ns)
-    return Tail("", set(), {}, 0)
+    return SegmentTail("", set(), {}, 0)

@@ -1,4 +1,4 @@
-"""The shelf of recordings, `<folder>/<lab>/<rig>/<session>.mcap`: files are begun, rotated and ended here."""
+"""The store of recordings, `<folder>/<lab>/<rig>/<session>.mcap`: opens, rotates and finishes the files."""
 
 import errno
 import platform
@@ -9,33 +9,43 @@ from typing import Final
 
 from mcap.records import Metadata
 
-from hilrig_recorder.ingest.recording import SECOND_NS, Recording, Sink, Tally
+from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording, RecordingSink
 from hilrig_recorder.mcap_format.channels import SCHEMA_VERSION
 from hilrig_recorder.mcap_format.chunk import compressor
-from hilrig_recorder.mcap_format.writer import MovedError, RunWriter
-from hilrig_recorder.storage.disk_reserve import MIB, Space
-from hilrig_recorder.storage.segment_file import RunFile
-from hilrig_recorder.storage.segments import NextPart, horizon_of, next_part, tail_of_session
-from hilrig_recorder.storage.sync_worker import Disk, what_became_of
+from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
+from hilrig_recorder.storage.disk_reserve import MIB, DiskReserve
+from hilrig_recorder.storage.segment_file import SegmentFile
+from hilrig_recorder.storage.segments import NextSegment, horizon_by_channel, next_segment, read_session_tail
+from hilrig_recorder.storage.sync_worker import SyncWorker, describe_failure
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, RigConfig
 
-NAMED: Final = 3
-"""Troubles that a health report names; events and the log name each."""
-SLOW_S: Final = 5.0
-"""A disk that takes longer to make safe what was written is told of."""
-_SPEED: Final = " speed"
-"""Among the troubles, where no rig is called so."""
-_SPACE_PERIOD_NS: Final = SECOND_NS
-_NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
+MAX_ALERTS_IN_REPORT: Final = 3
+"""Maximum number of alerts named in a health report; each alert is also an event and a log line."""
+SLOW_SYNC_S: Final = 5.0
+"""An alert is raised when written data is not synced within this time."""
+_SPEED_ALERT: Final = " speed"
+"""Key of the alert about a slow disk; not a valid rig name."""
+_SPACE_ALERT: Final = ""
+"""Key of the alert about disk space; not a valid rig name."""
+_SPACE_CHECK_PERIOD_NS: Final = SECOND_NS
+_NO_SPACE_ERRORS: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
-class Files:
-    """The recordings' files; used from the recorder's thread alone. Implements `recording.Shelf`.
+class FileStore:
+    """The files of the recordings; only the recorder's thread uses it. Implements `ingest.recording.RecordingStore`.
 
-    `repeated_ns` is how old what senders repeat after a restart may be. `tell` gets what the operator should know;
-    `ask_config` the name of a rig whose configuration is wanted; `give_up` a recording whose file can't go on.
+    Args:
+        lab: name of the lab.
+        config: the recorder's configuration.
+        clock: the clock.
+        sync_worker: syncs and finishes the files.
+        instance: instance name of the recorder.
+        repeated_ns: maximum age of the messages that publishers send again after a restart of the recorder, ns.
+        emit: publishes an event for the operator.
+        request_config: requests the configuration of a rig.
+        on_failed: called with a recording whose file failed.
     """
 
     def __init__(
@@ -43,220 +53,220 @@ class Files:
         lab: str,
         config: RecorderConfig,
         clock: Clock,
-        disk: Disk,
+        sync_worker: SyncWorker,
         *,
         instance: str,
         repeated_ns: int,
-        tell: Callable[[Event], None],
-        ask_config: Callable[[str], None],
-        give_up: Callable[[Recording], None],
+        emit: Callable[[Event], None],
+        request_config: Callable[[str], None],
+        on_failed: Callable[[Recording], None],
     ) -> None:
         self.folder = config.folder / lab
         self._lab = lab
         self._config = config
         self._clock = clock
-        self._disk = disk
+        self._sync_worker = sync_worker
         self._instance = instance
         self._repeated_ns = repeated_ns
-        self._tell = tell
-        self._ask_config = ask_config
-        self._give_up = give_up
-        self._files: dict[Recording, RunFile] = {}
-        self._ending: dict[RunWriter, Recording] = {}
-        self._trouble: dict[str, str] = {}
-        self._space = Space(self.folder, instance, config.min_free_mib)
+        self._emit = emit
+        self._request_config = request_config
+        self._on_failed = on_failed
+        self._files: dict[Recording, SegmentFile] = {}
+        self._finishing: dict[RecordingWriter, Recording] = {}
+        self._alerts: dict[str, str] = {}
+        self._reserve = DiskReserve(self.folder, instance, config.min_free_mib)
         self._space_due_ns = 0
-        self._bytes_closed = 0
+        self._bytes_finished = 0
         self._compress = compressor()
 
     @property
-    def trouble(self) -> str:
-        """What the operator should know now; empty: nothing."""
-        told = list(self._trouble.values())
-        more = len(told) - NAMED
-        return "; ".join(told[:NAMED]) + (f"; and {more} more" if more > 0 else "")
+    def alert(self) -> str:
+        """The current alerts for the operator; empty: none."""
+        alerts = list(self._alerts.values())
+        more = len(alerts) - MAX_ALERTS_IN_REPORT
+        return "; ".join(alerts[:MAX_ALERTS_IN_REPORT]) + (f"; and {more} more" if more > 0 else "")
 
     @property
     def bytes_written(self) -> int:
-        """Bytes in files since the start."""
-        writers = [*self._ending, *(file.writer for file in self._files.values())]
-        return self._bytes_closed + sum(writer.size for writer in writers)
+        """Bytes written to files since the start."""
+        writers = [*self._finishing, *(file.writer for file in self._files.values())]
+        return self._bytes_finished + sum(writer.size for writer in writers)
 
-    # -- Shelf ------------------------------------------------------------------------------------------------------
+    # -- RecordingStore ---------------------------------------------------------------------------------------------
 
-    def open(self, recording: Recording) -> Sink | None:
-        """See `Shelf.open`."""
+    def open(self, recording: Recording) -> RecordingSink | None:
+        """Open the next segment of a recording; None: the session has ended, or the file can't be opened."""
         folder = self.folder / recording.rig
-        part = self._next_part(recording)
-        if part is None:
+        segment = self._next_segment(recording)
+        if segment is None:
             return None
-        if part.previous is not None:
-            tail = tail_of_session(folder, recording.session, part.number - 1, self._repeated_ns)
+        if segment.previous is not None:
+            tail = read_session_tail(folder, recording.session, segment.number - 1, self._repeated_ns)
             if tail.end == "ended":
                 return None
             recording.seen, recording.last = tail.keys, tail.last
-            recording.horizon_ns = horizon_of(tail)
-        return None if self._space.full else self._open(recording, part)
+            recording.horizon_ns = horizon_by_channel(tail)
+        return None if self._reserve.is_exhausted else self._open(recording, segment)
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
-        """See `Shelf.close`."""
+        """Finish the file of a recording in the background."""
         file = self._files.pop(recording, None)
         if file is not None:
             self._finish(file, end, reason)
 
-    def lost(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
-        """See `Shelf.lost`."""
+    def record_loss(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
+        """Record a loss in the file of a recording."""
         file = self._files.get(recording)
         if file is not None:
-            file.note_loss(source, key, transport, recorder)
+            file.record_loss(source, key, transport, recorder)
 
-    def source(self, recording: Recording, source: str, incarnation: int) -> None:
-        """See `Shelf.source`."""
+    def record_source(self, recording: Recording, source: str, incarnation: int) -> None:
+        """Record in the file that an instance of a service contributes; request the configuration if it is new."""
         file = self._files.get(recording)
-        if file is not None and file.note_source(source, incarnation):
-            self._ask_config(recording.rig)
+        if file is not None and file.record_source(source, incarnation):
+            self._request_config(recording.rig)
 
-    def refuse(self, what: str) -> None:
-        """See `Shelf.refuse`."""
-        self._tell(Event(kind=Event.RECORDING, severity=Event.WARNING, text=f"not recorded: {what}"))
+    def report_rejected(self, message: str) -> None:
+        """Emit a warning about input that is not recorded."""
+        self._emit(Event(kind=Event.RECORDING, severity=Event.WARNING, text=f"not recorded: {message}"))
 
-    # -- from the shell ---------------------------------------------------------------------------------------------
+    # -- calls of the service ---------------------------------------------------------------------------------------
 
     def configure(self, config: RigConfig) -> None:
-        """Put a rig's configuration into its open files; the same one only once."""
+        """Add the configuration of a rig to its open files, unless they contain it."""
         for file in self._files.values():
             if file.recording.rig == config.rig:
-                file.note_config(config)
+                file.record_config(config)
 
     def unconfigured(self) -> set[str]:
         """Rigs with an open file that has no configuration yet."""
         return {file.recording.rig for file in self._files.values() if not file.configurations}
 
-    def fail(self, writer: RunWriter, error: OSError) -> None:
-        """End the file of `writer`, which the disk let down, or which is not any more where it was."""
+    def fail(self, writer: RecordingWriter, error: OSError) -> None:
+        """Handle an error of syncing an open file."""
         for file in self._files.values():
             if file.writer is not writer:
                 continue
-            if isinstance(error, MovedError):
-                file.moved = True
+            if isinstance(error, FileReplacedError):
+                file.is_replaced = True
             else:
                 file.fail(error)
 
-    def ended(self, writer: RunWriter, error: OSError | None) -> None:
-        """A file has ended: it has its name, or this is why not."""
-        recording = self._ending.pop(writer)
-        self._bytes_closed += writer.size
+    def finished(self, writer: RecordingWriter, error: OSError | None) -> None:
+        """Handle the end of a file: it is renamed, or failed with an error."""
+        recording = self._finishing.pop(writer)
+        self._bytes_finished += writer.size
         if error is not None:
-            self._report(recording, what_became_of(writer, error))
+            self._report(recording, describe_failure(writer, error))
 
     def tick(self, now_ns: int) -> None:
-        """Begin next files and end those that failed; some times a second."""
+        """Rotate files and finish failed ones; called several times per second."""
         failed = any(file.failure is not None for file in self._files.values())
-        # Files that failed for want of space end before space is looked at, and set aside, again.
-        if now_ns >= self._space_due_ns and not failed and not (self._space.full and self._ending):
-            self._space_due_ns = now_ns + _SPACE_PERIOD_NS
-            self._look_at_space()
-        self._look_at_speed()
+        # Files that failed for lack of space are finished before the space is checked and reserved again.
+        if now_ns >= self._space_due_ns and not failed and not (self._reserve.is_exhausted and self._finishing):
+            self._space_due_ns = now_ns + _SPACE_CHECK_PERIOD_NS
+            self._check_space()
+        self._check_speed()
         for file in list(self._files.values()):
             if file.failure is not None:
-                self._end_failed(file, file.failure)
-            elif self._space.full:
-                self._end_failed(file, OSError(errno.ENOSPC, "the disk is nearly full"))
-            elif file.moved or self._is_due(file, now_ns):
+                self._finish_failed(file, file.failure)
+            elif self._reserve.is_exhausted:
+                self._finish_failed(file, OSError(errno.ENOSPC, "the disk is nearly full"))
+            elif file.is_replaced or self._is_due(file, now_ns):
                 self._rotate(file)
 
     def release(self) -> None:
-        """Give back what was set aside: the recorder ends."""
-        self._space.release()
+        """Release the reserved disk space, because the recorder stops."""
+        self._reserve.release()
 
     # -- files ------------------------------------------------------------------------------------------------------
 
-    def _next_part(self, recording: Recording, after: str = "") -> NextPart | None:
+    def _next_segment(self, recording: Recording, after: str = "") -> NextSegment | None:
         folder = self.folder / recording.rig
         try:
-            return next_part(folder, recording.session, after)
+            return next_segment(folder, recording.session, after)
         except OSError as error:
-            self._report(recording, f"{folder}: can't be recorded: {self._space.why(error)}")
+            self._report(recording, f"{folder}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
 
-    def _open(self, recording: Recording, part: NextPart) -> RunFile | None:
-        about = Metadata("hilrig.session", self._session_values(recording, part))
+    def _open(self, recording: Recording, segment: NextSegment) -> SegmentFile | None:
+        session = Metadata("hilrig.session", self._session_metadata(recording, segment))
         try:
-            part.path.parent.mkdir(parents=True, exist_ok=True)
-            writer = RunWriter(part.path, metadata=(about,), compress=self._compress)
+            segment.path.parent.mkdir(parents=True, exist_ok=True)
+            writer = RecordingWriter(segment.path, metadata=(session,), compress=self._compress)
         except OSError as error:
-            self._report(recording, f"{part.path}: can't be recorded: {self._space.why(error)}")
+            self._report(recording, f"{segment.path}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
-        file = self._files[recording] = RunFile(recording, writer, self._clock, self._on_failure)
-        self._disk.follow(writer)
-        self._ask_config(recording.rig)
-        self._trouble.pop(recording.rig, None)
+        file = self._files[recording] = SegmentFile(recording, writer, self._clock, self._on_failure)
+        self._sync_worker.follow(writer)
+        self._request_config(recording.rig)
+        self._alerts.pop(recording.rig, None)
         return file
 
-    def _session_values(self, recording: Recording, part: NextPart) -> dict[str, str]:
+    def _session_metadata(self, recording: Recording, segment: NextSegment) -> dict[str, str]:
         start = datetime.fromtimestamp(recording.start_wall_ns // SECOND_NS, UTC)
         return {
             "session": recording.session,
             "rig": recording.rig,
             "lab": self._lab,
             "controller": recording.controller,
-            "keeper": recording.keeper,
+            "keeper": recording.owner,
             "start": start.strftime("%Y-%m-%dT%H:%M:%SZ"),
             "start_wall_ns": str(recording.start_wall_ns),
             "software_version": version("hilrig"),
             "schema_version": SCHEMA_VERSION,
             "machine": machine(),
             "recorder": f"recorder/{self._instance}",
-            "part": str(part.number),
-            "previous": part.previous.name if part.previous is not None else "",
+            "part": str(segment.number),
+            "previous": segment.previous.name if segment.previous is not None else "",
         }
 
-    def _is_due(self, file: RunFile, now_ns: int) -> bool:
+    def _is_due(self, file: SegmentFile, now_ns: int) -> bool:
         config = self._config
         too_large = config.rotate_mib and file.writer.size >= config.rotate_mib * MIB
         too_long = config.rotate_min and now_ns - file.opened_ns >= config.rotate_min * 60 * SECOND_NS
         return bool(too_large or too_long) and file.recording.end_wall_ns is None
 
-    def _rotate(self, file: RunFile) -> None:
+    def _rotate(self, file: SegmentFile) -> None:
         recording = file.recording
         before = file.writer.path.name
-        part = self._next_part(recording, before)
-        following = None if part is None else self._open(recording, part)
+        segment = self._next_segment(recording, before)
+        following = None if segment is None else self._open(recording, segment)
         if following is None:
-            # The old file goes on; the trouble was told.
+            # The error was reported. Recording continues in the old file.
             file.opened_ns = self._clock.monotonic_ns()
-            file.moved = False
+            file.is_replaced = False
             return
         recording.sink = following
-        self._finish(file, "continued", f"the session goes on in {following.writer.path.name}")
-        recording.tally = Tally()
+        self._finish(file, "continued", f"the session continues in {following.writer.path.name}")
+        recording.counters = LossCounters()
         for source, incarnation in file.sources:
-            following.note_source(source, incarnation)
+            following.record_source(source, incarnation)
 
-    def _finish(self, file: RunFile, end: str, reason: str) -> None:
-        self._ending[file.writer] = file.recording
-        self._disk.end(file.writer, file.ending(end, reason))
+    def _finish(self, file: SegmentFile, end: str, reason: str) -> None:
+        self._finishing[file.writer] = file.recording
+        self._sync_worker.finish(file.writer, file.finisher(end, reason))
 
-    # -- trouble ----------------------------------------------------------------------------------------------------
+    # -- errors -----------------------------------------------------------------------------------------------------
 
     def _on_failure(self, error: OSError) -> None:
-        if error.errno in _NO_SPACE:
-            # Every file on this disk ends now, while the space set aside is enough for all of them.
-            self._space.run_out()
+        if error.errno in _NO_SPACE_ERRORS:
+            # Every file on this disk is finished now, while the reserved space suffices for all of them.
+            self._reserve.mark_exhausted()
 
-    def _end_failed(self, file: RunFile, error: OSError) -> None:
+    def _finish_failed(self, file: SegmentFile, error: OSError) -> None:
         recording = file.recording
         del self._files[recording]
-        end = "disk full" if error.errno in _NO_SPACE else "write failed"
+        end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
         reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
         self._finish(file, end, reason)
         self._report(recording, reason)
-        self._give_up(recording)
+        self._on_failed(recording)
 
     def _report(self, recording: Recording, text: str) -> None:
-        if self._trouble.get(recording.rig) != text:
-            self._trouble[recording.rig] = text
-            self._tell(
+        if self._alerts.get(recording.rig) != text:
+            self._alerts[recording.rig] = text
+            self._emit(
                 Event(
                     kind=Event.RECORDING,
                     rig=recording.rig,
@@ -266,23 +276,23 @@ class Files:
                 )
             )
 
-    def _look_at_speed(self) -> None:
-        if self._disk.behind_s < SLOW_S:
-            self._trouble.pop(_SPEED, None)
-        elif _SPEED not in self._trouble:
-            text = f"{self.folder}: the disk is slow: what comes is safe from a power cut after {SLOW_S:g} s and more"
-            self._trouble[_SPEED] = text
-            self._tell(Event(kind=Event.RECORDING, severity=Event.WARNING, text=text))
+    def _check_speed(self) -> None:
+        if self._sync_worker.sync_delay_s < SLOW_SYNC_S:
+            self._alerts.pop(_SPEED_ALERT, None)
+        elif _SPEED_ALERT not in self._alerts:
+            text = f"{self.folder}: slow disk: a power failure may lose the last {SLOW_SYNC_S:g} s or more"
+            self._alerts[_SPEED_ALERT] = text
+            self._emit(Event(kind=Event.RECORDING, severity=Event.WARNING, text=text))
 
-    def _look_at_space(self) -> None:
-        text = self._space.look()
+    def _check_space(self) -> None:
+        text = self._reserve.refresh()
         if text:
-            self._trouble[""] = text
-            self._tell(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
-        elif not self._space.full:
-            self._trouble.pop("", None)
+            self._alerts[_SPACE_ALERT] = text
+            self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
+        elif not self._reserve.is_exhausted:
+            self._alerts.pop(_SPACE_ALERT, None)
 
 
 def machine() -> str:
-    """This machine, for people: system, processor, Python."""
+    """Human-readable description of this machine: system, processor, Python."""
     return f"{platform.system()} {platform.release()} {platform.machine()}, Python {platform.python_version()}"

@@ -1,6 +1,6 @@
-"""What the disk is slow at, on a thread of its own: syncing what was written, ending files and giving them their name.
+"""The sync worker: a thread that syncs open files, and finishes and renames closed ones.
 
-The recorder's thread only appends: neither a disk that takes its time nor the index of a long recording holds it up.
+The recorder's thread only appends, so neither a slow disk nor the index of a long recording delays it.
 """
 
 import logging
@@ -10,145 +10,150 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from hilrig_recorder.mcap_format.writer import MovedError, RunWriter
+from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
 from hilrig_runtime.timing.clock import Clock
 
-LOOK_PERIOD_NS: Final = 100_000_000
-"""So soon what was written is synced; a file is written to about once a second."""
-ENDING_S: Final = 0.9
-"""When all ends: the longest that files are given to get their index and name, without syncing."""
+SYNC_PERIOD_NS: Final = 100_000_000
+"""Period of syncing; each file is written about once a second."""
+FINISH_WITHOUT_SYNC_S: Final = 0.9
+"""Maximum time at shutdown for finishing and renaming files without syncing them."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class _Open:
-    writer: RunWriter
+class _OpenFile:
+    writer: RecordingWriter
     synced: int = 0
-    """Bytes that are safe."""
+    """Synced bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """A file that is followed from now on, or one that ends."""
+    """A file to sync from now on, or a file to finish."""
 
-    writer: RunWriter
+    writer: RecordingWriter
     finish: Callable[[], None] | None = None
 
 
-class Disk:
-    """Syncs, ends and publishes. What came of it is handed back on this thread: `on_trouble` hears of a file that could
-    not be synced, `on_ended` of each that has ended, with what was wrong, and keeps its `.part` name then."""
+class SyncWorker:
+    """Syncs, finishes and renames files. The callbacks run on the worker's thread.
+
+    Args:
+        clock: the clock.
+        on_sync_error: called with a writer and the error when a file could not be synced.
+        on_finished: called for each finished file; with an error if it keeps its `.part` name.
+    """
 
     def __init__(
         self,
         clock: Clock,
-        on_trouble: Callable[[RunWriter, OSError], None],
-        on_ended: Callable[[RunWriter, OSError | None], None],
+        on_sync_error: Callable[[RecordingWriter, OSError], None],
+        on_finished: Callable[[RecordingWriter, OSError | None], None],
     ) -> None:
         self._clock = clock
-        self._on_trouble = on_trouble
-        self._on_ended = on_ended
+        self._on_sync_error = on_sync_error
+        self._on_finished = on_finished
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
-        self._open: dict[int, _Open] = {}
+        self._open: dict[int, _OpenFile] = {}
         self._closing = threading.Event()
-        self._hurry = threading.Event()
-        self._ended = False
-        self._round_from_ns: int | None = None
-        """When all open files began to be synced, monotonic clock; None: they are."""
+        self._skip_sync = threading.Event()
+        self._stopped = False
+        self._round_start_ns: int | None = None
+        """When the current sync of all open files started, monotonic clock; None: no sync is running."""
         self._round_ns = 0
-        """How long that took the last time."""
-        self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
+        """Duration of the last sync of all open files."""
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
         self._thread.start()
 
-    def follow(self, writer: RunWriter) -> None:
-        """Sync what is written to this file, from now on."""
+    def follow(self, writer: RecordingWriter) -> None:
+        """Sync this file periodically from now on."""
         self._jobs.put(_Job(writer))
 
-    def end(self, writer: RunWriter, finish: Callable[[], None]) -> None:
-        """Call `finish`, which writes what a file ends with, sync it, close it and give it its name.
+    def finish(self, writer: RecordingWriter, finish: Callable[[], None]) -> None:
+        """Call `finish`, which writes the end of the file, then sync, close and rename the file.
 
-        Nobody else may use the writer from now on.
+        The caller must not use the writer any more.
         """
         self._jobs.put(_Job(writer, finish))
 
     @property
-    def behind_s(self) -> float:
-        """How long it takes until what was written is safe, s."""
-        begun_ns = self._round_from_ns
-        going_on_ns = 0 if begun_ns is None else self._clock.monotonic_ns() - begun_ns
-        return max(self._round_ns, going_on_ns) * 1e-9
+    def sync_delay_s(self) -> float:
+        """Time until written data is synced, s."""
+        start_ns = self._round_start_ns
+        running_ns = 0 if start_ns is None else self._clock.monotonic_ns() - start_ns
+        return max(self._round_ns, running_ns) * 1e-9
 
     def close(self, timeout_s: float) -> bool:
-        """End what is waiting; after `timeout_s` without syncing, so that every file gets its name.
+        """Finish the queued files; after `timeout_s` without syncing, so that every file is renamed.
 
         Returns:
-            Whether all is done.
+            Whether all files are finished.
         """
         self._closing.set()
         self._jobs.put(None)
         self._thread.join(timeout_s)
-        self._hurry.set()
-        self._thread.join(ENDING_S)
+        self._skip_sync.set()
+        self._thread.join(FINISH_WITHOUT_SYNC_S)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        due_ns = self._clock.monotonic_ns() + LOOK_PERIOD_NS
-        while not self._ended:
+        due_ns = self._clock.monotonic_ns() + SYNC_PERIOD_NS
+        while not self._stopped:
             wait_ns = due_ns - self._clock.monotonic_ns()
             if wait_ns > 0:
-                self._next_job(wait_ns * 1e-9)
+                self._run_job(wait_ns * 1e-9)
                 continue
-            self._round_from_ns = self._clock.monotonic_ns()
+            self._round_start_ns = self._clock.monotonic_ns()
             for item in list(self._open.values()):
                 if self._sync(item):
-                    # In turns: many files that end, and many that are open, do not wait for all of the others.
-                    self._next_job(0)
+                    # Jobs run between syncs, so that a file to finish does not wait for the sync of all open files.
+                    self._run_job(0)
             now_ns = self._clock.monotonic_ns()
-            self._round_ns, self._round_from_ns = now_ns - self._round_from_ns, None
-            due_ns = now_ns + LOOK_PERIOD_NS
+            self._round_ns, self._round_start_ns = now_ns - self._round_start_ns, None
+            due_ns = now_ns + SYNC_PERIOD_NS
 
-    def _next_job(self, timeout_s: float) -> None:
+    def _run_job(self, timeout_s: float) -> None:
         try:
             job = self._jobs.get(timeout=timeout_s) if timeout_s > 0 else self._jobs.get_nowait()
         except Empty:
             return
         if job is None:
-            self._ended = True
+            self._stopped = True
         elif job.finish is None:
-            self._open[id(job.writer)] = _Open(job.writer)
+            self._open[id(job.writer)] = _OpenFile(job.writer)
         else:
             self._open.pop(id(job.writer), None)
-            self._end(job.writer, job.finish)
+            self._finish(job.writer, job.finish)
 
-    def _sync(self, item: _Open) -> bool:
-        """Sync a file that was written to; whether it was."""
-        # A job between may have closed it; and at the end every file is about to be.
+    def _sync(self, item: _OpenFile) -> bool:
+        """Sync a file with new data; False: nothing to sync."""
+        # A job may have closed the file meanwhile. At shutdown every file is finished soon.
         if self._closing.is_set() or id(item.writer) not in self._open or item.writer.size == item.synced:
             return False
         size = item.writer.size
         try:
             item.writer.sync()
         except OSError as error:
-            self._on_trouble(item.writer, error)
+            self._on_sync_error(item.writer, error)
         item.synced = size
         return True
 
-    def _end(self, writer: RunWriter, finish: Callable[[], None]) -> None:
+    def _finish(self, writer: RecordingWriter, finish: Callable[[], None]) -> None:
         try:
             finish()
-            writer.publish(durably=not self._hurry.is_set())
+            writer.publish(durably=not self._skip_sync.is_set())
         except OSError as error:
             writer.close()
-            logger.error("%s", what_became_of(writer, error))
-            self._on_ended(writer, error)
+            logger.error("%s", describe_failure(writer, error))
+            self._on_finished(writer, error)
         else:
             logger.info("recorded %s", writer.path)
-            self._on_ended(writer, None)
+            self._on_finished(writer, None)
 
 
-def what_became_of(writer: RunWriter, error: OSError) -> str:
-    """Of a file that could not get its name, for people."""
-    if isinstance(error, MovedError):
+def describe_failure(writer: RecordingWriter, error: OSError) -> str:
+    """A human-readable text for a file that could not be finished."""
+    if isinstance(error, FileReplacedError):
         return f"{writer.path}: {error.strerror}"
-    return f"{writer.part}: can't be finished, and waits to be recovered: {error.strerror}"
+    return f"{writer.temporary_path}: can't be finished: {error.strerror}; it will be recovered at the next start"

@@ -1,7 +1,7 @@
-"""The paper's experiment (44) by its three methods: figures 4, 5 and 6, and the numbers that tell them apart.
+"""Reproduces experiment (44) of the paper with its three integration methods: figures 4, 5 and 6, and their numbers.
 
-Two torque pulses move joints 1 and 2 of an arm at rest. At the paper's step of 20 ms Euler's method is beyond its limit
-of stability and blows up, Runge–Kutta–Fehlberg is within it, and Dormand–Prince with a variable step is the reference.
+Two torque pulses move joints 1 and 2 of an arm at rest. At the paper's step of 20 ms, Euler's method exceeds its
+stability limit and diverges, Runge–Kutta–Fehlberg is stable, and Dormand–Prince with a variable step is the reference.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,17 @@ Floats = NDArray[np.float64]
 
 DURATION_S: Final = 10.0
 PAPER_STEP_MS: Final = 20.0
-# Of m2 and m3 only the sum counts in the plane, and the paper has 1 kg and 0: the quill takes half of it here, for an
-# arm without a quill has no joint 3 to simulate. Its weight is carried, so that it rests.
+# In the plane only the sum of m2 and m3 matters. The paper has 1 kg and 0 kg; here the quill has half of the sum,
+# because joint 3 can't be simulated without mass. A constant force on joint 3 compensates its weight.
 ARM: Final = ArmParameters(masses=(1.0, 0.5, 0.5), friction=(2.0, 2.0, 5.0, 0.05))
-BREAKS_S: Final = (2.0, 3.0, 5.0, 6.0)
-EXPECTED_END: Final = (0.05000, 0.19998)
-"""θ(10 s), rad: the friction's b·Δθ is the torque's ∫τ dt, but for what still coasts."""
+TORQUE_SWITCH_TIMES_S: Final = (2.0, 3.0, 5.0, 6.0)
+EXPECTED_END_RAD: Final = (0.05000, 0.19998)
+"""θ(10 s), rad: b·Δθ = ∫τ dt, except for the remaining motion."""
 EXPECTED_LIMITS_MS: Final = {"euler": 15.4, "rk4": 21.5, "rkf45, order 4": 23.3, "rkf45": 28.4}
-DIVERGED: Final = 1.0
-"""A joint faster than so many rad/s has diverged: it is twenty times what the torques could drive against friction.
-The growth ends there, for sines are bounded: what remains is a violent oscillation at the rate of the steps."""
+DIVERGENCE_SPEED_RAD_S: Final = 1.0
+"""A faster joint has diverged: this is twenty times the speed that the torques can reach against friction.
+
+The growth is bounded, because the sines in the model are: a diverged solution oscillates at the step rate."""
 
 
 def torque(time_s: float) -> tuple[float, float]:
@@ -41,7 +42,7 @@ def torque(time_s: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Experiment (44) by one method."""
+    """Solution of experiment (44) by one method."""
 
     name: str
     title: str
@@ -54,19 +55,19 @@ class Solution:
 
     @property
     def diverged_s(self) -> float | None:
-        """When it left all that the arm can do, s; None: it did not."""
-        beyond = ~(np.abs(self.velocity) < DIVERGED).all(axis=0)
+        """Time at which the solution diverged, s; None: it did not."""
+        beyond = ~(np.abs(self.velocity) < DIVERGENCE_SPEED_RAD_S).all(axis=0)
         return float(self.time_s[np.argmax(beyond)]) if beyond.any() else None
 
     @property
     def end(self) -> tuple[float, float] | None:
-        """θ1, θ2 at the end, rad; None: it diverged."""
+        """θ1, θ2 at the end, rad; None: the solution diverged."""
         return None if self.diverged_s is not None else (float(self.position[0, -1]), float(self.position[1, -1]))
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """What the experiment gives by each method."""
+class ExperimentResult:
+    """Solutions of experiment (44) by all methods."""
 
     step_ms: float
     mode: float
@@ -79,14 +80,14 @@ class Figures:
 
     @property
     def deviation(self) -> float | None:
-        """Of Runge–Kutta–Fehlberg from the reference at the end, rad; None: it diverged."""
+        """Deviation of Runge–Kutta–Fehlberg from the reference at the end, rad; None: it diverged."""
         end, reference = self.fehlberg.end, self.reference.end
         return (
             None if end is None or reference is None else max(abs(e - r) for e, r in zip(end, reference, strict=True))
         )
 
     def checks(self) -> list[tuple[str, str, str, bool]]:
-        """What was expected at the paper's step, what came out, and whether it agrees."""
+        """Rows (quantity, expected value at the paper's step, computed value, agreement)."""
         end, deviation = self.reference.end, self.deviation
         diverged_s = self.euler.diverged_s
         rows = [
@@ -94,16 +95,18 @@ class Figures:
                 "θ(10 s), reference",
                 "0.05000, 0.19998 rad",
                 "diverged" if end is None else f"{end[0]:.5f}, {end[1]:.5f} rad",
-                end is not None and all(abs(e - x) < 1e-5 for e, x in zip(end, EXPECTED_END, strict=True)),
+                end is not None and all(abs(e - x) < 1e-5 for e, x in zip(end, EXPECTED_END_RAD, strict=True)),
             ),
             (
                 f"Euler at {self.step_ms:g} ms",
                 "diverges",
-                "stays" if diverged_s is None else f"diverges (beyond {DIVERGED:g} rad/s at {diverged_s:.2f} s)",
+                "stable"
+                if diverged_s is None
+                else f"diverges (above {DIVERGENCE_SPEED_RAD_S:g} rad/s at {diverged_s:.2f} s)",
                 diverged_s is not None,
             ),
             (
-                f"RKF at {self.step_ms:g} ms, off the reference",
+                f"RKF at {self.step_ms:g} ms, deviation from the reference",
                 "at most 2e-6 rad",
                 "diverged" if deviation is None else f"{deviation:.1e} rad",
                 deviation is not None and deviation <= 2.05e-6,
@@ -118,7 +121,7 @@ class Figures:
         return rows
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """JSON-compatible values."""
         return {
             "step_ms": self.step_ms,
             "fastest_mode_per_s": self.mode,
@@ -141,20 +144,23 @@ class Figures:
         }
 
 
-def compute(step_ms: float = PAPER_STEP_MS) -> Figures:
-    """Do the experiment by all methods, the fixed ones with a step of `step_ms`.
+def compute(step_ms: float = PAPER_STEP_MS) -> ExperimentResult:
+    """Solve the experiment by all methods; the fixed-step methods use a step of `step_ms`.
 
     Raises:
-        InputError: no whole number of steps makes up each second.
+        InputError: a second is not a multiple of the step.
     """
     per_second = 1000.0 / step_ms if step_ms > 0 else 0.0
     if per_second < 1 or abs(per_second - round(per_second)) > 1e-9:
-        raise InputError(f"a step of {step_ms:g} ms does not divide a second, at which the torques switch")
+        raise InputError(
+            f"invalid step {step_ms:g} ms: a second must be a multiple of the step, "
+            "because the torques switch at whole seconds"
+        )
     mode = fastest_mode(ARM, theta2=0.0)
     limits = {table.name: table.negative_real_limit() / mode * 1e3 for table in (EULER, RK4, RKF45)}
     limits["rkf45, order 4"] = RKF45.negative_real_limit(RKF45.embedded) / mode * 1e3
     count = round(DURATION_S * per_second)
-    return Figures(
+    return ExperimentResult(
         step_ms=step_ms,
         mode=mode,
         euler=_fixed(EULER, "Euler", step_ms, count),
@@ -170,7 +176,7 @@ def _fixed(table: Tableau, title: str, step_ms: float, count: int) -> Solution:
     effort[2] = -ARM.masses[2] * GRAVITY
     positions, velocities = np.zeros((2, count + 1)), np.zeros((2, count + 1))
     time_s = np.asarray(np.arange(count + 1) * (step_ms / 1e3), dtype=np.float64)
-    # A method that diverges runs out of numbers.
+    # A diverging method may overflow.
     with np.errstate(all="ignore"):
         for k in range(count):
             effort[:2, 0] = torque(time_s[k] + 1e-9)
@@ -194,12 +200,12 @@ def _reference() -> Solution:
         return np.concatenate([y[2:], rates[:2, 0]])
 
     time_s = np.asarray(np.linspace(0.0, DURATION_S, 1001), dtype=np.float64)
-    y = reference_solution(derivative, np.zeros(4), time_s, breaks=BREAKS_S)
+    y = reference_solution(derivative, np.zeros(4), time_s, breaks=TORQUE_SWITCH_TIMES_S)
     return Solution("dop853", "Dormand–Prince, variable step", time_s, y[:2], y[2:])
 
 
-def draw(figures: Figures, folder: Path) -> list[Path]:
-    """Draw figures 4, 5 and 6 into `folder`, which is made where it is not there; gives the files.
+def draw(result: ExperimentResult, folder: Path) -> list[Path]:
+    """Draw figures 4, 5 and 6 into `folder`, which is created if needed; returns the files.
 
     Raises:
         OperationError: the folder can't be written.
@@ -207,19 +213,19 @@ def draw(figures: Figures, folder: Path) -> list[Path]:
     from matplotlib.figure import Figure
 
     written = []
-    for number, solution in ((4, figures.euler), (5, figures.reference), (6, figures.fehlberg)):
+    for number, solution in ((4, result.euler), (5, result.reference), (6, result.fehlberg)):
         figure = Figure(figsize=(8, 5), layout="constrained", dpi=120)
         angles, speeds = figure.subplots(2, 1, sharex=True)
-        for axes, values, unit, reach in (
+        for axes, values, quantity, upper in (
             (angles, solution.position, "position, rad", 0.25),
             (speeds, solution.velocity, "velocity, rad/s", 0.08),
         ):
             for joint, color in ((0, "#4c78a8"), (1, "#f58518")):
                 width = 1.6 if solution.diverged_s is None else 0.5
                 axes.plot(solution.time_s, values[joint], color=color, label=f"joint {joint + 1}", linewidth=width)
-            axes.set_ylabel(unit)
+            axes.set_ylabel(quantity)
             if solution.diverged_s is None:
-                axes.set_ylim(-0.25 * reach, reach)
+                axes.set_ylim(-0.25 * upper, upper)
             axes.grid(alpha=0.3)
         angles.legend(loc="upper left")
         angles.set_xlim(0, DURATION_S)

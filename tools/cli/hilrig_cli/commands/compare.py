@@ -39,8 +39,8 @@ def compare(
     Exit code 1: one of several could not be compared; it is said which, and why.
     """
     from hilrig_replay.analysis.compare import compare as compare_runs
-    from hilrig_replay.analysis.compare import save_comparison_plot
     from hilrig_replay.io.run import open_run
+    from hilrig_replay.plots.comparison_plot import save_comparison_plot
     from hilrig_replay.rerun_view.view import save_rrd
     from hilrig_runtime.errors import InputError
 

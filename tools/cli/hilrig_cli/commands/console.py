@@ -42,8 +42,8 @@ def console(
     import secrets
     import threading
 
-    from hilrig_console.auth import Guard, own_names
-    from hilrig_console.serving import Address, ConsoleServer, TlsFiles, ask_health
+    from hilrig_console.auth import AccessPolicy, normalize_host_names
+    from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
@@ -52,17 +52,17 @@ def console(
     if (certificate is None) != (key is None):
         raise InputError("--certificate and --key belong together: give both")
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
-    address = Address.of(listen)
+    address = ListenAddress.parse(listen)
     if check:
-        ask_health(address, tls)
+        check_health(address, tls)
         return
     lab = load_lab(config)
     password = _password(password_file) if password_file is not None else ""
-    invented = not password and not address.is_private
+    invented = not password and not address.is_loopback
     if invented:
         password = secrets.token_urlsafe(12)
-    names = own_names([platform.node(), address.host, *(name or [])])
-    server = ConsoleServer(lab, address, Guard(password, names), tls)
+    names = normalize_host_names([platform.node(), address.host, *(name or [])])
+    server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
     yield_to_others()
     stopping = threading.Event()
     stop_on_signals(stopping)
@@ -71,13 +71,13 @@ def console(
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if invented:
             print(f"password: {password} (any user name)", flush=True)
-        if tls is None and not address.is_private:
+        if tls is None and not address.is_loopback:
             print("hilrig: without --certificate and --key the password can be overheard", file=sys.stderr, flush=True)
         wait_for(stopping)
 
 
 def _password(file: Path) -> str:
-    from hilrig_console.auth import SHORTEST_PASSWORD
+    from hilrig_console.auth import MIN_PASSWORD_CHARS
     from hilrig_runtime.errors import InputError
 
     try:
@@ -85,6 +85,6 @@ def _password(file: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no text"
         raise InputError(f"--password-file: {file} can't be read: {reason}") from error
-    if len(password) < SHORTEST_PASSWORD:
-        raise InputError(f"--password-file: {file}: its first line must have at least {SHORTEST_PASSWORD} characters")
+    if len(password) < MIN_PASSWORD_CHARS:
+        raise InputError(f"--password-file: {file}: its first line must have at least {MIN_PASSWORD_CHARS} characters")
     return password

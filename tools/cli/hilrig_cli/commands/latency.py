@@ -29,7 +29,7 @@ def latency(
 ) -> None:
     """Measure the loop latency of recordings: six stages, percentiles, jitter, and why it is what it is.
 
-    Exit code 1: the recording (or one of them) is not fit for latency claims; the reasons are printed.
+    Exit code 1: the recording (or one of them) is not valid for latency measurements; the reasons are printed.
     """
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.paths import display_names, find_recordings
@@ -38,7 +38,8 @@ def latency(
 
     paths = find_recordings(runs)
     if plot is not None:
-        from hilrig_replay.plots.latency_plot import check_plot_path, save_plot
+        from hilrig_replay.plots.latency_plot import save_plot
+        from hilrig_replay.plots.output import check_plot_path
 
         if len(paths) > 1:
             raise InputError(f"--plot draws one run, and {len(paths)} were given")
@@ -106,9 +107,9 @@ def print_report(report: "LatencyReport") -> None:
     for finding in report.findings:
         console.print(Text(f"• {finding.text}"))
     if report.fit:
-        console.print(Text("fit for latency claims", style="green"))
+        console.print(Text("valid for latency measurements", style="green"))
     else:
-        console.print(Text("not fit for latency claims: " + "; ".join(report.reasons), style="yellow"))
+        console.print(Text("not valid for latency measurements: " + "; ".join(report.reasons), style="yellow"))
 
 
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:

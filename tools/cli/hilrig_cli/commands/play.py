@@ -24,7 +24,7 @@ def play(
     """Put a recording back on the bus with its own timing, so that whatever follows a running rig follows it."""
     import threading
 
-    from hilrig_replay.export.player import Player, play_on, rig_config
+    from hilrig_replay.export.player import Player, publish_recording, rig_config
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
@@ -42,7 +42,9 @@ def play(
     stop_on_signals(stopping)
     with _bus(lab, name) as bus:
         bus.serve(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
-        played = play_on(bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name)
+        played = publish_recording(
+            bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name
+        )
     print(f"played {played} messages of {opened.session} as {name} in lab {lab.name}", file=sys.stderr)
 
 

@@ -40,21 +40,21 @@ def report(
     from hilrig_replay.grading.task_loading import load_task
     from hilrig_replay.io.paths import find_recordings
     from hilrig_replay.io.recording_file import refuse_recording
-    from hilrig_replay.report.report import report as make_report
+    from hilrig_replay.report.report import build_report
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.parent}")
+        raise InputError(f"{out}: folder {out.parent} does not exist")
     refuse_recording(out)
     graded_by = None if task is None else load_task(task)
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        doing = progress.add_task("reading and drawing", total=1.0)
-        found = make_report(
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        doing = bar.add_task("reading and drawing", total=1.0)
+        found = build_report(
             find_recordings(runs),
             verified=verify,
             task=graded_by,
-            tick=lambda share: progress.update(doing, completed=share),
+            on_progress=lambda share: bar.update(doing, completed=share),
             workers=None,
         )
     try:
@@ -62,12 +62,14 @@ def report(
     except OSError as error:
         raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
     if as_json:
-        print(json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out, "alike": found.alike}))
+        print(
+            json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out, "alike": found.same_torques})
+        )
     else:
         print(out)
         for reason in found.left_out:
             print(f"left out: {reason}", file=sys.stderr)
-        for pair in found.alike:
-            print(f"alike: {pair}", file=sys.stderr)
+        for pair in found.same_torques:
+            print(f"same torques: {pair}", file=sys.stderr)
     if found.left_out:
         raise typer.Exit(1)

@@ -73,7 +73,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     if live and not chosen.live:
         raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
     # Before these, which take a moment: what is wrong with a study is said at once.
-    from hilrig_study.plots import Dot, plane_figure, save_pictures, traces
+    from hilrig_study.plots import Marker, plane_figure, save_plots, traces
     from hilrig_study.rerun_plots import save_study_rrd
     from hilrig_study.results import save_results
     from hilrig_study.sweep import sweep
@@ -89,18 +89,31 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         swept = sweep(chosen, file.parent, lambda share: progress.update(task, completed=share))
     measured: list[dict[str, Any]] = []
     if live:
-        from hilrig_cli.study_live import run_live_points
+        import threading
+        from collections.abc import Callable, Iterator
+        from contextlib import contextmanager
 
-        measured = run_live_points(
-            chosen, file.parent, out, lambda line: console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
-        )
+        from hilrig_cli.local.demo import free_ports
+        from hilrig_cli.local.local_lab import running_lab
+        from hilrig_runtime.config.lab import LabConfig
+        from hilrig_study.live.live_points import run_live_points
+
+        def report(line: str) -> None:
+            console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
+
+        @contextmanager
+        def start_lab(lab: LabConfig, config: Path) -> Iterator[Callable[[], object]]:
+            with running_lab(lab, config, report, threading.Event()) as supervisor:
+                yield supervisor.poll
+
+        measured = run_live_points(chosen, file.parent, out, start_lab, free_ports, report)
     with console.status("drawing"):
         pictures = []
         for number in range(len(chosen.controllers)):
             name = chosen.controllers[number].name
-            dots = [Dot(p["x"], p["y"], p["as_predicted"]) for p in measured if p["controller"] == name]
-            figure = plane_figure(chosen, swept, number, shown, dots)
-            pictures += save_pictures(figure, out / f"plane-{number + 1}")
+            markers = [Marker(p["x"], p["y"], p["as_predicted"]) for p in measured if p["controller"] == name]
+            figure = plane_figure(chosen, swept, number, shown, markers)
+            pictures += save_plots(figure, out / f"plane-{number + 1}")
         save_study_rrd(chosen, swept, shown, out / "study.rrd")
         more = {"pictures": [str(path) for path in pictures], "live": measured}
         return save_results(chosen, swept, out, more)
@@ -151,12 +164,12 @@ def _ms(seconds: float | None) -> str:
 
 def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Console") -> None:
     from hilrig_replay.io.run import open_run
-    from hilrig_study.live.from_recording import judge_gains
+    from hilrig_study.live.from_recording import evaluate_gains
     from hilrig_study.study_config import load_study
 
     study = None if file is None else load_study(file)
     with console.status("judging gains"):
-        judged = judge_gains(open_run(path), study).as_dict()
+        judged = evaluate_gains(open_run(path), study).as_dict()
     if as_json:
         print(json.dumps(judged))
     else:

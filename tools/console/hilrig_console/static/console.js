@@ -1,52 +1,52 @@
 "use strict";
-// The lab as its console sends it: `lab` once a second, `poses` five times, `event` as they happen. Whatever a lab says
-// is set as text, never as HTML.
+// Live view of a lab from server-sent events: `lab` once per second, `poses` five times per second, and each `event`.
+// All values are inserted as text, never as HTML.
 
 const SVG = "http://www.w3.org/2000/svg";
-const EVENTS_KEPT = 200;
-const QUIET_MS = 4000;
-const CARDS_AT_MOST = 60;
-const GLIDE_MS = 200;
-const HOLDS = 2, MAGNET = 1;
+const MAX_EVENTS = 200;
+const TIMEOUT_MS = 4000;
+const MAX_CARDS = 60;
+const ANIMATION_MS = 200;
+const HOLDS_PART = 2, MAGNET_ON = 1;
 const LEVELS = {"in use": "good", "free": "", "no command": "warn", "watchdog tripped": "bad", "no edge": "bad", "no simulation": "bad"};
 const SEVERITIES = {info: "", warning: "warn", error: "bad"};
-const stillness = matchMedia("(prefers-reduced-motion: reduce)");
+const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
-const at = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 const fixed = (value, digits) => value === null || value === undefined ? "–" : value.toFixed(digits);
 const count = (number, thing) => `${number} ${thing}${number === 1 ? "" : "s"}`;
 const pathOf = (path) => path.split("/").map(encodeURIComponent).join("/");
 
-function made(name, attributes = {}, ...children) {
+function html(name, attributes = {}, ...children) {
   const element = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   element.append(...children);
   return element;
 }
 
-function drawn(name, attributes = {}) {
+function svg(name, attributes = {}) {
   const element = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   return element;
 }
 
-function say(element, text) {
+function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-function mark(element, level) {
+function setLevel(element, level) {
   if (element.dataset.level !== level) element.dataset.level = level;
 }
 
-// ---- a rig's arm, from above: x to the right, y up, millimetres
+// ---- top view of an arm: x to the right, y up, millimeters
 
 class Arm {
   constructor(rig) {
-    this.svg = drawn("svg", {class: "arm stale", role: "img", "aria-label": `The arm of ${rig}`});
-    this.title = drawn("title");
-    this.title.textContent = `The arm of ${rig} from above; at the right, how high its tool is`;
+    this.svg = svg("svg", {class: "arm stale", role: "img", "aria-label": `Arm of ${rig}`});
+    this.title = svg("title");
+    this.title.textContent = `Arm of ${rig}, top view; tool height on the right`;
     this.scene = null;
-    this.shown = this.wanted = null;
+    this.shown = this.target = null;
     this.seen = false;
   }
 
@@ -54,31 +54,31 @@ class Arm {
     this.scene = scene;
     const span = scene.span * 1.07, wide = span * 2.22;
     this.svg.setAttribute("viewBox", `${-span} ${-span} ${wide} ${span * 2}`);
-    const world = drawn("g", {transform: "scale(1 -1)"});
-    world.append(drawn("path", {class: "reach", d: scene.reach}));
+    const world = svg("g", {transform: "scale(1 -1)"});
+    world.append(svg("path", {class: "reach", d: scene.reach}));
     for (const tray of scene.trays) {
       const [x, y, yaw] = tray.at, [w, h] = tray.size;
-      world.append(drawn("rect", {class: "tray", fill: tray.colour, x: -w / 2, y: -h / 2, width: w, height: h,
+      world.append(svg("rect", {class: "tray", fill: tray.color, x: -w / 2, y: -h / 2, width: w, height: h,
         transform: `translate(${x} ${y}) rotate(${yaw})`}));
-      for (const [px, py] of tray.places) world.append(drawn("circle", {class: "place", cx: px, cy: py, r: 22}));
+      for (const [px, py] of tray.places) world.append(svg("circle", {class: "place", cx: px, cy: py, r: 22}));
     }
     this.parts = scene.parts.map((part) => {
       const [w, h] = part.size;
-      const shape = part.round ? drawn("circle", {r: w / 2}) : drawn("rect", {x: -w / 2, y: -h / 2, width: w, height: h});
+      const shape = part.round ? svg("circle", {r: w / 2}) : svg("rect", {x: -w / 2, y: -h / 2, width: w, height: h});
       shape.setAttribute("class", "part");
-      shape.setAttribute("fill", part.colour);
+      shape.setAttribute("fill", part.color);
       world.append(shape);
       return shape;
     });
     this.place(scene.parts.map((part) => part.at));
-    this.one = drawn("line", {class: "one", x1: 0, y1: 0});
-    this.two = drawn("line", {class: "two"});
-    this.elbow = drawn("circle", {class: "elbow", r: 16});
-    this.tool = drawn("circle", {class: "tool", r: 24});
-    world.append(this.one, this.two, drawn("circle", {class: "base", r: 34}), this.elbow, this.tool);
+    this.one = svg("line", {class: "one", x1: 0, y1: 0});
+    this.two = svg("line", {class: "two"});
+    this.elbow = svg("circle", {class: "elbow", r: 16});
+    this.tool = svg("circle", {class: "tool", r: 24});
+    world.append(this.one, this.two, svg("circle", {class: "base", r: 34}), this.elbow, this.tool);
     const rail = span * 1.12;
-    world.append(drawn("line", {class: "rail", x1: rail, x2: rail, y1: -span * 0.8, y2: span * 0.8}));
-    this.height = drawn("circle", {class: "height", cx: rail, r: 22});
+    world.append(svg("line", {class: "rail", x1: rail, x2: rail, y1: -span * 0.8, y2: span * 0.8}));
+    this.height = svg("circle", {class: "height", cx: rail, r: 22});
     world.append(this.height);
     this.svg.replaceChildren(this.title, world);
     this.shown = null;
@@ -90,24 +90,24 @@ class Arm {
     });
   }
 
-  take(scene, pose, parts) {
+  update(scene, pose, parts) {
     if (scene !== this.scene) this.build(scene);
     if (parts.length) this.place(parts);
-    this.tool.setAttribute("class", `tool${pose[5] & HOLDS ? " holds" : pose[5] & MAGNET ? " on" : ""}`);
+    this.tool.setAttribute("class", `tool${pose[5] & HOLDS_PART ? " holds" : pose[5] & MAGNET_ON ? " on" : ""}`);
     this.from = this.shown || pose;
-    this.wanted = pose;
+    this.target = pose;
     this.since = performance.now();
     this.svg.classList.remove("stale");
   }
 
-  lost() {
+  markStale() {
     this.svg.classList.add("stale");
   }
 
-  // Between two poses the arm glides; true: it has not arrived.
-  glide(now) {
-    const share = stillness.matches ? 1 : Math.min(1, (now - this.since) / GLIDE_MS);
-    const [ex, ey, x, y, z] = this.shown = this.wanted.slice(0, 5).map((to, i) => this.from[i] + (to - this.from[i]) * share);
+  // Interpolates between two poses; returns true until the target is reached.
+  animate(now) {
+    const share = reducedMotion.matches ? 1 : Math.min(1, (now - this.since) / ANIMATION_MS);
+    const [ex, ey, x, y, z] = this.shown = this.target.slice(0, 5).map((to, i) => this.from[i] + (to - this.from[i]) * share);
     for (const [key, value] of [["x2", ex], ["y2", ey]]) this.one.setAttribute(key, value);
     for (const [key, value] of [["x1", ex], ["y1", ey], ["x2", x], ["y2", y]]) this.two.setAttribute(key, value);
     this.elbow.setAttribute("cx", ex);
@@ -120,77 +120,77 @@ class Arm {
   }
 }
 
-// ---- a rig, as a card and as a row
+// ---- a rig as a card and as a table row
 
 const FIGURES = [
   ["loop", "loop p50 / p99", "big wide"], ["late", "tick p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
-  ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "recorded as", "wide"],
+  ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
 class Rig {
   constructor(name) {
     this.name = name;
     this.arm = new Arm(name);
-    this.pill = made("span", {class: "pill"});
+    this.pill = html("span", {class: "pill"});
     this.figures = {};
-    const figures = made("dl", {class: "figures"});
+    const figures = html("dl", {class: "figures"});
     for (const [key, title, kind] of FIGURES) {
-      const value = this.figures[key] = made("dd", kind.includes("big") ? {class: "big"} : {});
-      figures.append(made("div", {class: kind.replace("big ", "")}, made("dt", {}, title), value));
+      const value = this.figures[key] = html("dd", kind.includes("big") ? {class: "big"} : {});
+      figures.append(html("div", {class: kind.replace("big ", "")}, html("dt", {}, title), value));
     }
-    this.card = made("li", {}, made("div", {class: "head"}, made("h3", {title: name}, name), this.pill), this.arm.svg, figures);
+    this.card = html("li", {}, html("div", {class: "head"}, html("h3", {title: name}, name), this.pill), this.arm.svg, figures);
     this.card.rig = this;
-    this.rowPill = made("span", {class: "pill"});
-    this.cells = ["", "", "n", "n", "n", "n", "", ""].map((kind) => made("td", kind ? {class: kind} : {}));
-    this.row = made("tr", {}, made("th", {scope: "row"}, name), made("td", {}, this.rowPill), ...this.cells);
+    this.rowPill = html("span", {class: "pill"});
+    this.cells = ["", "", "n", "n", "n", "n", "", ""].map((kind) => html("td", kind ? {class: kind} : {}));
+    this.row = html("tr", {}, html("th", {scope: "row"}, name), html("td", {}, this.rowPill), ...this.cells);
   }
 
   update(rig, runs) {
     this.held = Boolean(rig.controller);
     this.level = runs ? LEVELS[rig.state] ?? "warn" : "";
     this.text = `${rig.rig} ${rig.state} ${rig.controller} ${rig.address} ${rig.session}`.toLowerCase();
-    const recorded = rig.recording ? rig.session || "by hand" : "–";
+    const recorded = rig.recording ? rig.session || "manual recording" : "–";
     const p50 = fixed(rig.loop_p50_ms, 1), p99 = fixed(rig.loop_p99_ms, 1), late = fixed(rig.simulated ? rig.lateness_p99_ms : null, 2);
     for (const pill of [this.pill, this.rowPill]) {
-      say(pill, rig.state);
-      mark(pill, this.level);
+      setText(pill, rig.state);
+      setLevel(pill, this.level);
     }
-    mark(this.card, this.level);
-    say(this.figures.loop, rig.loop_samples ? `${p50} / ${p99} ms` : "–");
-    say(this.figures.controller, rig.controller || "nobody");
-    say(this.figures.address, rig.address || "–");
-    say(this.figures.late, rig.simulated ? `${late} ms` : late);
-    say(this.figures.overruns, rig.simulated ? String(rig.overruns) : "–");
+    setLevel(this.card, this.level);
+    setText(this.figures.loop, rig.loop_samples ? `${p50} / ${p99} ms` : "–");
+    setText(this.figures.controller, rig.controller || "none");
+    setText(this.figures.address, rig.address || "–");
+    setText(this.figures.late, rig.simulated ? `${late} ms` : late);
+    setText(this.figures.overruns, rig.simulated ? String(rig.overruns) : "–");
     const watchdog = rig.served ? rig.watchdog_tripped ? "tripped" : "armed" : "–";
-    say(this.figures.watchdog, watchdog);
-    say(this.figures.recorded, recorded);
+    setText(this.figures.watchdog, watchdog);
+    setText(this.figures.recorded, recorded);
     this.figures.recorded.classList.toggle("rec", rig.recording);
     this.figures.recorded.title = recorded;
-    const cells = [rig.address || "–", rig.controller || "nobody", p50, p99, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
-    cells.forEach((text, number) => say(this.cells[number], text));
+    const cells = [rig.address || "–", rig.controller || "none", p50, p99, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
+    cells.forEach((text, number) => setText(this.cells[number], text));
     this.cells[7].classList.toggle("rec", rig.recording);
   }
 
-  matches(words, which) {
-    return words.every((word) => this.text.includes(word))
+  matches(terms, which) {
+    return terms.every((term) => this.text.includes(term))
       && (which === "all" || (which === "held" ? this.held : this.level === "bad"));
   }
 }
 
-// ---- what is shown
+// ---- page content
 
 const rigs = new Map();
-let poses = {}, scenes = [], scenesWanted = -1, runsShown = -1, heardMs = 0, gliding = false, chosenView = "";
-const place = new URLSearchParams(location.hash.slice(1));
+let poses = {}, scenes = [], scenesVersion = -1, runsVersion = -1, receivedMs = 0, animating = false, selectedView = "";
+const urlState = new URLSearchParams(location.hash.slice(1));
 const visible = new IntersectionObserver((entries) => {
   for (const entry of entries) entry.target.rig.arm.seen = entry.isIntersecting;
   showPoses(poses);
 });
 
 function showLab(lab) {
-  heardMs = Date.now();
+  receivedMs = Date.now();
   document.title = `hilrig · ${lab.lab}`;
-  say(at("lab"), lab.lab);
+  setText(byId("lab"), lab.lab);
   const names = new Set(lab.rigs.map((rig) => rig.rig));
   for (const [name, rig] of rigs) {
     if (names.has(name)) continue;
@@ -199,9 +199,9 @@ function showLab(lab) {
     rig.row.remove();
     rigs.delete(name);
   }
-  // Where nothing runs, no single rig is to blame.
+  // Without services, the rigs are not marked as faulty.
   const runs = lab.services.some((service) => !service.silent);
-  const cards = at("cards"), rows = at("rows").querySelector("tbody");
+  const cards = byId("cards"), rows = byId("rows").querySelector("tbody");
   for (const known of lab.rigs) {
     let rig = rigs.get(known.rig);
     if (!rig) {
@@ -213,93 +213,93 @@ function showLab(lab) {
     rig.update(known, runs);
   }
   const alarms = [...rigs.values()].filter((rig) => rig.level === "bad").length;
-  const sums = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
+  const totals = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
     [lab.rigs.filter((rig) => rig.recording).length, "recorded"]];
-  if (alarms) sums.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
-  at("sums").replaceChildren(...sums.map(([number, what]) =>
-    made("li", what.startsWith("alarm") ? {class: "alarm"} : {}, made("b", {}, String(number)), ` ${what}`)));
-  const troubles = lab.troubles.map((text) => ["warn", text]);
-  if (lab.link) troubles.unshift(["bad", lab.link]);
+  if (alarms) totals.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
+  byId("summary").replaceChildren(...totals.map(([number, label]) =>
+    html("li", label.startsWith("alarm") ? {class: "alarm"} : {}, html("b", {}, String(number)), ` ${label}`)));
+  const alerts = lab.troubles.map((text) => ["warn", text]);
+  if (lab.link) alerts.unshift(["bad", lab.link]);
   else if (!runs) {
-    troubles.unshift(["bad", `Nothing is heard of the lab “${lab.lab}”: is it running (hilrig up), with this lab.toml?`]);
+    alerts.unshift(["bad", `No services of the lab “${lab.lab}” found: start it with “hilrig up” and the same lab.toml.`]);
   }
-  const list = at("troubles"), before = [...list.children].map((item) => item.textContent).join("\n");
-  if (before !== troubles.map(([, text]) => text).join("\n")) {
-    list.replaceChildren(...troubles.map(([level, text]) => made("li", {"data-level": level}, text)));
+  const list = byId("alerts"), before = [...list.children].map((item) => item.textContent).join("\n");
+  if (before !== alerts.map(([, text]) => text).join("\n")) {
+    list.replaceChildren(...alerts.map(([level, text]) => html("li", {"data-level": level}, text)));
   }
   showServices(lab.services);
   arrange();
-  if (lab.scenes !== scenesWanted) fetchScenes(lab.scenes);
-  if (lab.runs !== runsShown) fetchRuns(lab.runs);
+  if (lab.scenes !== scenesVersion) fetchScenes(lab.scenes);
+  if (lab.runs !== runsVersion) fetchRuns(lab.runs);
 }
 
 function showServices(services) {
-  const table = at("services");
-  at("services-none").hidden = services.length > 0;
+  const table = byId("services");
+  byId("services-none").hidden = services.length > 0;
   table.parentElement.hidden = services.length === 0;
   table.tBodies[0].replaceChildren(...services.map((service) => {
     const cells = [service.host, service.rigs, service.cpu_percent.toFixed(0), service.memory_mib.toFixed(0),
       service.lateness_p99_ms.toFixed(2), service.overruns, service.lost_transport + service.lost_recorder,
       service.clock_peer ? `${service.clock_offset_ms < 0 ? "−" : "+"}${Math.abs(service.clock_offset_ms).toFixed(1)} ± ${service.clock_uncertainty_ms.toFixed(1)}` : "–"];
-    const row = made("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
-      made("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
-    row.append(...cells.map((cell, number) => made("td", number ? {class: "n"} : {}, String(cell))));
+    const row = html("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
+      html("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
+    row.append(...cells.map((cell, number) => html("td", number ? {class: "n"} : {}, String(cell))));
     return row;
   }));
 }
 
 function arrange() {
-  const words = at("words").value.toLowerCase().split(/\s+/).filter(Boolean), which = at("which").value;
+  const terms = byId("rig-search").value.toLowerCase().split(/\s+/).filter(Boolean), which = byId("which").value;
   let shown = 0;
   for (const rig of rigs.values()) {
-    const hidden = !rig.matches(words, which);
+    const hidden = !rig.matches(terms, which);
     shown += hidden ? 0 : 1;
     if (rig.card.hidden !== hidden) rig.card.hidden = rig.row.hidden = hidden;
   }
-  const none = at("rigs-none");
+  const none = byId("rigs-none");
   none.hidden = shown > 0;
-  say(none, rigs.size ? "No rig is like that." : "No rig is known.");
-  const asTable = (chosenView || (rigs.size > CARDS_AT_MOST ? "table" : "cards")) === "table";
-  at("cards").hidden = asTable;
-  at("rows").hidden = !asTable || shown === 0;
-  at("as-cards").setAttribute("aria-pressed", String(!asTable));
-  at("as-table").setAttribute("aria-pressed", String(asTable));
+  setText(none, rigs.size ? "No rig matches." : "No rigs.");
+  const asTable = (selectedView || (rigs.size > MAX_CARDS ? "table" : "cards")) === "table";
+  byId("cards").hidden = asTable;
+  byId("rows").hidden = !asTable || shown === 0;
+  byId("as-cards").setAttribute("aria-pressed", String(!asTable));
+  byId("as-table").setAttribute("aria-pressed", String(asTable));
 }
 
-// They are sent when they change; what was not to be drawn then is drawn when it is.
-function showPoses(newest) {
-  poses = newest;
+// Poses are sent when they change; a card that is scrolled into view gets the latest ones.
+function showPoses(latest) {
+  poses = latest;
   for (const rig of rigs.values()) {
     const pose = poses[rig.name], scene = pose && scenes[pose[0]];
-    if (!scene) rig.arm.lost();
-    else if (rig.arm.seen || !rig.arm.scene) rig.arm.take(scene, pose[1], pose[2]);
+    if (!scene) rig.arm.markStale();
+    else if (rig.arm.seen || !rig.arm.scene) rig.arm.update(scene, pose[1], pose[2]);
   }
-  if (!gliding) {
-    gliding = true;
-    requestAnimationFrame(glide);
+  if (!animating) {
+    animating = true;
+    requestAnimationFrame(animate);
   }
 }
 
-function glide(now) {
-  gliding = false;
+function animate(now) {
+  animating = false;
   for (const rig of rigs.values()) {
     const arm = rig.arm;
-    if (arm.wanted && (arm.seen || !arm.shown) && arm.shown !== arm.wanted) {
-      if (arm.glide(now)) gliding = true;
-      else arm.shown = arm.wanted;
+    if (arm.target && (arm.seen || !arm.shown) && arm.shown !== arm.target) {
+      if (arm.animate(now)) animating = true;
+      else arm.shown = arm.target;
     }
   }
-  if (gliding) requestAnimationFrame(glide);
+  if (animating) requestAnimationFrame(animate);
 }
 
 function showEvent(event) {
-  const list = at("events"), when = new Date(event.wall_ms);
-  const item = made("li", {"data-level": SEVERITIES[event.severity] ?? "warn"},
-    made("time", {datetime: when.toISOString(), title: when.toLocaleString()}, when.toLocaleTimeString()),
-    made("span", {}, made("b", {}, event.rig || event.source), ` ${event.text}`));
+  const list = byId("events"), when = new Date(event.wall_ms);
+  const item = html("li", {"data-level": SEVERITIES[event.severity] ?? "warn"},
+    html("time", {datetime: when.toISOString(), title: when.toLocaleString()}, when.toLocaleTimeString()),
+    html("span", {}, html("b", {}, event.rig || event.source), ` ${event.text}`));
   list.prepend(item);
-  while (list.children.length > EVENTS_KEPT) list.lastElementChild.remove();
-  at("events-none").hidden = true;
+  while (list.children.length > MAX_EVENTS) list.lastElementChild.remove();
+  byId("events-none").hidden = true;
 }
 
 function lengthOf(seconds) {
@@ -318,97 +318,97 @@ function sizeOf(bytes) {
 }
 
 function showRuns(list) {
-  const table = at("runs");
+  const table = byId("runs");
   table.parentElement.hidden = list.runs.length === 0;
-  const more = list.found > list.runs.length ? `, the newest ${list.runs.length} shown` : "";
-  say(at("runs-count"), list.trouble || (list.found === list.total ? `${list.total}${more}` : `${list.found} of ${list.total}${more}`));
+  const more = list.found > list.runs.length ? `, latest ${list.runs.length} shown` : "";
+  setText(byId("runs-count"), list.error || (list.found === list.total ? `${list.total}${more}` : `${list.found} of ${list.total}${more}`));
   table.tBodies[0].replaceChildren(...list.runs.map((run) => {
     const begun = run.start_ms ? new Date(run.start_ms).toLocaleString() : run.name;
-    const row = made("tr", run.trouble ? {"data-level": "bad"} : {}, made("th", {scope: "row", title: run.path}, begun),
-      made("td", {}, run.rig));
-    const links = made("td");
+    const row = html("tr", run.trouble ? {"data-level": "bad"} : {}, html("th", {scope: "row", title: run.path}, begun),
+      html("td", {}, run.rig));
+    const links = html("td");
     if (!run.open && !run.trouble) {
-      links.append(made("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
+      links.append(html("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
         "aria-label": `Report of ${run.name}`}, "Report"));
     }
-    if (!run.open) links.append(made("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
+    if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
     if (run.trouble) {
-      row.append(made("td", {class: "long", colspan: "8"}, run.trouble), links);
+      row.append(html("td", {class: "long", colspan: "8"}, run.trouble), links);
       return row;
     }
     const lost = run.lost_transport + run.lost_recorder + run.lost_file;
-    const fit = made("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
+    const fit = html("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
     const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1)];
-    row.append(made("td", {}, run.controller || "nobody"), ...figures.map((text) => made("td", {class: "n"}, text)),
-      made("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, made("td", {title: run.reason}, run.open ? "being written" : run.ended), links);
+    row.append(html("td", {}, run.controller || "none"), ...figures.map((text) => html("td", {class: "n"}, text)),
+      html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, run.open ? "recording" : run.ended), links);
     return row;
   }));
 }
 
-// ---- what is fetched
+// ---- requests
 
 async function fetchScenes(wanted) {
-  scenesWanted = wanted;
+  scenesVersion = wanted;
   try {
     scenes = await (await fetch("scenes")).json();
     showPoses(poses);
   } catch {
-    scenesWanted = -1;
+    scenesVersion = -1;
   }
 }
 
 async function fetchRuns(version) {
-  runsShown = version;
-  const words = at("run-words").value;
+  runsVersion = version;
+  const query = byId("run-search").value;
   try {
-    const list = await (await fetch(`runs?words=${encodeURIComponent(words)}`)).json();
-    if (words === at("run-words").value) showRuns(list);
+    const list = await (await fetch(`runs?query=${encodeURIComponent(query)}`)).json();
+    if (query === byId("run-search").value) showRuns(list);
   } catch {
-    runsShown = -1;
+    runsVersion = -1;
   }
 }
 
 function listen() {
   const source = new EventSource("live");
-  const told = (name, show) => source.addEventListener(name, (message) => show(JSON.parse(message.data)));
+  const on = (name, show) => source.addEventListener(name, (message) => show(JSON.parse(message.data)));
   source.onopen = () => {
-    // It may be another run of the console: its numbers mean something else.
-    scenesWanted = runsShown = -1;
+    // The console may have been restarted; its version numbers are different.
+    scenesVersion = runsVersion = -1;
   };
   source.onerror = () => {
-    heardMs = 0;
-    look();
+    receivedMs = 0;
+    updateLink();
     if (source.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
   };
-  told("lab", showLab);
-  told("poses", showPoses);
-  told("event", showEvent);
+  on("lab", showLab);
+  on("poses", showPoses);
+  on("event", showEvent);
 }
 
-function look() {
-  const link = at("link"), live = Date.now() - heardMs < QUIET_MS;
-  mark(link, live ? "good" : "bad");
-  say(link, live ? "live" : "no connection to the console");
-  document.body.classList.toggle("cut", !live);
-  if (!live) for (const rig of rigs.values()) rig.arm.lost();
+function updateLink() {
+  const link = byId("link"), live = Date.now() - receivedMs < TIMEOUT_MS;
+  setLevel(link, live ? "good" : "bad");
+  setText(link, live ? "live" : "no connection to the console");
+  document.body.classList.toggle("disconnected", !live);
+  if (!live) for (const rig of rigs.values()) rig.arm.markStale();
 }
 
-function remember() {
-  for (const [key, value] of [["rigs", at("words").value], ["which", at("which").value === "all" ? "" : at("which").value], ["view", chosenView]]) {
-    if (value) place.set(key, value);
-    else place.delete(key);
+function saveView() {
+  for (const [key, value] of [["rigs", byId("rig-search").value], ["which", byId("which").value === "all" ? "" : byId("which").value], ["view", selectedView]]) {
+    if (value) urlState.set(key, value);
+    else urlState.delete(key);
   }
-  history.replaceState(null, "", place.size ? `#${place}` : location.pathname);
+  history.replaceState(null, "", urlState.size ? `#${urlState}` : location.pathname);
   arrange();
 }
 
-at("words").value = place.get("rigs") || "";
-if (["held", "alarm"].includes(place.get("which"))) at("which").value = place.get("which");
-chosenView = ["cards", "table"].includes(place.get("view")) ? place.get("view") : "";
-at("words").addEventListener("input", remember);
-at("which").addEventListener("change", remember);
-for (const view of ["cards", "table"]) at(`as-${view}`).addEventListener("click", () => { chosenView = view; remember(); });
-let pause = 0;
-at("run-words").addEventListener("input", () => { clearTimeout(pause); pause = setTimeout(() => fetchRuns(runsShown), 200); });
-setInterval(look, 1000);
+byId("rig-search").value = urlState.get("rigs") || "";
+if (["held", "alarm"].includes(urlState.get("which"))) byId("which").value = urlState.get("which");
+selectedView = ["cards", "table"].includes(urlState.get("view")) ? urlState.get("view") : "";
+byId("rig-search").addEventListener("input", saveView);
+byId("which").addEventListener("change", saveView);
+for (const view of ["cards", "table"]) byId(`as-${view}`).addEventListener("click", () => { selectedView = view; saveView(); });
+let searchTimer = 0;
+byId("run-search").addEventListener("input", () => { clearTimeout(searchTimer); searchTimer = setTimeout(() => fetchRuns(runsVersion), 200); });
+setInterval(updateLink, 1000);
 listen();

@@ -7,7 +7,6 @@ can't be aligned is skipped.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -184,20 +183,6 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
 
 def _at(trajectory: Trajectory, values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.interp(at, trajectory.time_s, column) for column in values.T], axis=1)
-
-
-def save_comparison_plot(comparison: Comparison, path: Path) -> None:
-    """Draw aligned runs into a file, `.png`, `.svg` or `.pdf`.
-
-    Raises:
-        InputError: the ending names no format, or there is no such folder.
-        OperationError: it can't be written.
-    """
-    from hilrig_replay.plots.latency_plot import check_plot_path, save_figure
-    from hilrig_replay.plots.motion_plot import comparison_figure
-
-    check_plot_path(path)
-    save_figure(comparison_figure(comparison.summaries), path)
 
 
 def _four(values: NDArray[np.float64]) -> JointValues:

@@ -68,7 +68,7 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
 
     Args:
         run: the recording.
-        on_block: called with each block (states, commands, parts and events), so that one pass serves other evaluations.
+        on_block: called with each block (states, commands, parts, events), so that one pass serves several evaluations.
 
     Raises:
         InputError: the file is damaged.

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from hilrig_replay.analysis.distribution import percentiles
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.similarity import TorqueSketch
+from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.grade import Grade, Grader
 from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
-from hilrig_replay.rerun_view.scene import parameters_of
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, RigParameters

@@ -1,1 +1,1 @@
-"""Recordings exported for other tools, and played back on the bus."""
+"""Export of recordings to other formats, and playback on the bus."""

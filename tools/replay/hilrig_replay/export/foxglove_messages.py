@@ -1,7 +1,7 @@
-"""The well-known message types of Foxglove that an export uses: those that its 3D panel and rerun's loader draw.
+"""Foxglove's message types for the export: those that its 3D panel and rerun's MCAP loader support.
 
-Described here field by field, with the names and numbers that Foxglove documents
-(https://docs.foxglove.dev/docs/sdk/schemas), so that an export needs no further package.
+The fields are defined here with Foxglove's documented names and numbers
+(https://docs.foxglove.dev/docs/sdk/schemas), so that the export needs no further package.
 """
 
 from typing import Any, Final
@@ -19,7 +19,7 @@ _SCALARS: Final = {
 _TIMESTAMP: Final = ".google.protobuf.Timestamp"
 _DURATION: Final = ".google.protobuf.Duration"
 
-# Message: its fields as (name, number, type); a type in brackets repeats, one with a dot is that message.
+# Message name: fields as (name, number, type). A type in brackets is repeated; a type with a dot is a message type.
 _MESSAGES: Final[dict[str, tuple[tuple[str, int, str], ...]]] = {
     "Vector3": (("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")),
     "Quaternion": (("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double"), ("w", 4, "double")),
@@ -86,7 +86,7 @@ _ENUMS: Final = {
 }
 
 
-def _described() -> descriptor_pb2.FileDescriptorProto:
+def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:
     file = descriptor_pb2.FileDescriptorProto(
         name="foxglove/hilrig_export.proto",
         package="foxglove",
@@ -100,8 +100,8 @@ def _described() -> descriptor_pb2.FileDescriptorProto:
             enum = message.enum_type.add(name=enum_name)
             for number, value in enumerate(values):
                 enum.value.add(name=value, number=number)
-        for field_name, number, said in fields:
-            repeated, kind = said.startswith("["), said.strip("[]")
+        for field_name, number, type_text in fields:
+            repeated, kind = type_text.startswith("["), type_text.strip("[]")
             label = _FIELD.LABEL_REPEATED if repeated else _FIELD.LABEL_OPTIONAL
             field = message.field.add(name=field_name, number=number, label=label)
             if kind == "enum":
@@ -114,11 +114,11 @@ def _described() -> descriptor_pb2.FileDescriptorProto:
 
 
 def _classes() -> dict[str, type[Any]]:
-    # A pool of their own: a program that has Foxglove's package too must not see these twice.
+    # A separate pool: in a program that also uses Foxglove's package, the default pool would have two definitions.
     pool = descriptor_pool.DescriptorPool()
     for known in (timestamp_pb2, duration_pb2):
         pool.AddSerializedFile(known.DESCRIPTOR.serialized_pb)
-    pool.Add(_described())
+    pool.Add(_file_descriptor())
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}")) for name in _MESSAGES}
 
 

@@ -1,8 +1,8 @@
-"""One colour a thing, the same in the viewer, in plots and in reports."""
+"""Colors and names of stages, joints and events, common to the viewer, plots and reports."""
 
 from typing import Final
 
-INK: Final = "#333333"
+TEXT_COLOR: Final = "#333333"
 STAGE_NAMES: Final = {
     "register_wait": "register wait",
     "controller": "controller",
@@ -24,12 +24,12 @@ JOINT_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
 PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")
 EFFORT_SYMBOLS: Final = ("τ1", "τ2", "τ3", "τ4")
 RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#72b7b2", "#eeca3b")
-"""Of runs that are compared, and of controllers."""
+"""Colors of compared runs, and of controllers."""
 SEVERITY_COLORS: Final = {"INFO": "#9aa5b1", "WARNING": "#f2b134", "ERROR": "#e45756"}
 EVENT_COLORS: Final = {"PART_PICKED": "#6fd08c", "PART_DROPPED": "#eeca3b", "LIMIT_HIT": "#b279a2"}
-"""Of events that are marked in plots; all others have the colour of their severity."""
+"""Colors of event kinds in plots; all other kinds have the color of their severity."""
 
 
 def rgb(color: str) -> tuple[int, int, int]:
-    """Red, green, blue of `#rrggbb`, each 0 to 255."""
+    """Red, green and blue of a color `#rrggbb`, each 0 to 255."""
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

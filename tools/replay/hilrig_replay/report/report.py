@@ -1,4 +1,4 @@
-"""A run, or a class of runs, as one HTML file that needs nothing else: no network, no script, no other file."""
+"""Report of one run or a group of runs as a self-contained HTML file: no network access, scripts or other files."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +11,7 @@ from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
+from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
@@ -18,17 +19,16 @@ from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, STAGE_NAMES
-from hilrig_replay.report.html_figures import picture
-from hilrig_replay.rerun_view.scene import parameters_of
+from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.process.process_pool import all_cores
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
-_GRAVE: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
-"""Kinds of events that a teacher looks for."""
-_WORTH_PROCESSES: Final = 4
-"""Fewer runs are done sooner than processes are started for them."""
+ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
+"""Event kinds that count as alarms in the overview."""
+_MIN_RUNS_FOR_PROCESSES: Final = 4
+"""Fewer runs take less time than the start of worker processes."""
 
 STYLE: Final = """
 :root { color-scheme: light; font: 15px/1.5 system-ui, sans-serif; color: #24292f; background: #f5f6f8; }
@@ -46,8 +46,8 @@ th:first-child, td:first-child, td.text { text-align: left; }
 td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600;
   white-space: normal; vertical-align: bottom; }
 img { max-width: 100%; height: auto; display: block; }
-.picture { display: flex; align-items: flex-start; } .picture img { min-width: 0; }
-@media (max-width: 44rem) { .picture { display: block; }
+.figure { display: flex; align-items: flex-start; } .figure img { min-width: 0; }
+@media (max-width: 44rem) { .figure { display: block; }
   table { font-size: .75rem; } th, td { padding: .25rem .15rem; }
   section, details { padding: .8rem .6rem; }
   td:first-child { white-space: normal; }
@@ -57,7 +57,7 @@ img { max-width: 100%; height: auto; display: block; }
     border-bottom: 1px solid #dfe3e8; }
   .ranking td { text-align: left; border: 0; white-space: normal; font-size: .85rem; }
   .ranking td:first-child { grid-column: 1 / -1; font-weight: 600; overflow-wrap: anywhere; }
-  .ranking td + td::before { content: attr(data-what); display: block; color: #5d6771; font-size: .7rem; } }
+  .ranking td + td::before { content: attr(data-label); display: block; color: #5d6771; font-size: .7rem; } }
 @media (max-width: 30rem) { table { font-size: .68rem; } th, td { padding: .25rem .1rem; } }
 li { margin: .25rem 0; overflow-wrap: anywhere; }
 .good { color: #1a7f37; } .bad { color: #b35900; }
@@ -69,42 +69,42 @@ summary { cursor: pointer; font-weight: 600; } summary span { font-weight: 400; 
 @dataclass(frozen=True, slots=True)
 class _Page:
     summary: RunSummary
-    pictures: tuple[str, ...]
+    figures: tuple[str, ...]
     verified: Verification | None
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One page, and what stands in it."""
+    """A report page and its content."""
 
     html: str
     runs: tuple[dict[str, Any], ...]
-    """Each run as plain values for JSON, the best first."""
+    """JSON-compatible values of each run, in ranking order."""
     left_out: tuple[str, ...]
-    """Why a recording is not in it, one sentence each."""
-    alike: tuple[str, ...]
-    """Which runs were driven by the same torques, one sentence a pair."""
+    """Reason why a recording is not in the report, one sentence per recording."""
+    same_torques: tuple[str, ...]
+    """Pairs of runs with the same torques, one sentence per pair."""
 
 
-def report(
+def build_report(
     paths: Sequence[Path],
     *,
     verified: bool = False,
     task: TaskConfig | None = None,
-    tick: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
     workers: int | None = 1,
 ) -> Report:
-    """The report of one run, or of several with an overview that ranks them; those that can't be read are named in it.
+    """Build the report of one run, or of several with a ranking; unreadable recordings are listed in the report.
 
     Args:
         paths: recordings.
-        verified: re-simulate each run too, and say whether it came out the same.
-        task: what the runs are graded by; None: each by what its own lab said.
-        tick: hears the share of the runs that are done.
-        workers: processes; None: one a core, where there are enough runs to be worth it.
+        verified: re-simulate each run and report whether the result is identical.
+        task: grading task for all runs; None: the task in each recording's lab.toml.
+        on_progress: called with the completed share of the runs, 0 to 1.
+        workers: number of processes; None: one per core if there are enough runs.
 
     Raises:
-        InputError: there is one only, or none that can be read: it is damaged, or not understood.
+        InputError: the only recording, or every recording, is damaged or has an unsupported content.
     """
     pages: list[_Page] = []
     left_out: list[str] = []
@@ -115,25 +115,25 @@ def report(
             raise one
         else:
             left_out.append(str(one))
-        if tick is not None:
-            tick(done / len(paths))
+        if on_progress is not None:
+            on_progress(done / len(paths))
     if not pages:
-        raise InputError("no run can be reported:\n" + "\n".join(left_out))
+        raise InputError("no readable recording:\n" + "\n".join(left_out))
     pages.sort(key=_rank)
     verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
-    plain = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
-    pairs = _alike(pages)
-    return Report(_html(pages, left_out, pairs), plain, tuple(left_out), pairs)
+    values = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
+    pairs = _same_torques(pages)
+    return Report(_html(pages, left_out, pairs), values, tuple(left_out), pairs)
 
 
-def _alike(pages: Sequence[_Page]) -> tuple[str, ...]:
+def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
     runs = [page.summary for page in pages]
     return tuple(
         f"{runs[one].name} and {runs[other].name}: "
         + (
             "the same recording"
             if runs[one].session == runs[other].session
-            else f"{int(100 * share)} % of the torques that the controllers wrote are the same to the last count"
+            else f"{int(100 * share)} % of the torques written by the controllers are identical"
         )
         for one, other, share in find_similar([run.torques for run in runs])
     )
@@ -143,16 +143,16 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
-        body = f'<h1>{escape(title)}</h1><p class="quiet">{escape(_who(summary))}</p>{_run(pages[0])}'
+        body = f'<h1>{escape(title)}</h1><p class="quiet">{escape(_origin(summary))}</p>{_run(pages[0])}'
     else:
         title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
             f"<details><summary>{number}. {escape(page.summary.name)} "
-            f'<span class="quiet">· {escape(_whose(page.summary))}</span></summary>{_run(page)}</details>'
+            f'<span class="quiet">· {escape(_session_and_origin(page.summary))}</span></summary>{_run(page)}</details>'
             for number, page in enumerate(pages, start=1)
         )
-        told = _named("Left out", left_out) + _named("The same torques", pairs)
-        body = f"<h1>{title}</h1>{_overview(pages)}{told}{details}"
+        notes = _list_section("Skipped recordings", left_out) + _list_section("Runs with the same torques", pairs)
+        body = f"<h1>{title}</h1>{_overview(pages)}{notes}{details}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -163,17 +163,17 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
 def _pages(
     paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
 ) -> Iterator[_Page | InputError]:
-    """Each run's page, or why there is none, in the order of `paths`."""
+    """Page of each run, or the reason why it is missing, in the order of `paths`."""
     names = display_names(paths)
     tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
-    if workers == 1 or len(paths) < _WORTH_PROCESSES:
-        yield from map(_page_or_reason, *tasks)
+    if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
+        yield from map(_page_or_error, *tasks)
     else:
         with all_cores(len(paths), workers) as executor:
-            yield from executor.map(_page_or_reason, *tasks)
+            yield from executor.map(_page_or_error, *tasks)
 
 
-def _page_or_reason(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | InputError:
+def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | InputError:
     try:
         return _page(open_run(path), name, verified, task)
     except InputError as error:
@@ -184,14 +184,21 @@ def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page
     summary = summarize(run, task)
     parameters = parameters_of(run.parameters_json)
     targets = task or recorded_task(run)
-    pictures = [
-        picture(motion_figure(summary.trajectory, parameters, targets), "positions, efforts and the tool's way")
+    figures = [
+        html_figure(
+            motion_figure(summary.trajectory, parameters, targets), "joint positions, joint efforts and tool path"
+        )
     ]
     if summary.latency.loop_ms is not None:
-        pictures.append(picture(latency_figure(summary.latency, run), "loop latency: histogram, stages, tail, course"))
-    # A class has many runs: the samples of each are let go once they are drawn.
+        figures.append(
+            html_figure(
+                latency_figure(summary.latency, run),
+                "loop latency: histogram, stages, tail distribution, course over time",
+            )
+        )
+    # Frees the samples once they are drawn: a group may have many runs.
     summary = replace(summary, name=name, latency=summary.latency.without_table())
-    return _Page(summary, tuple(pictures), verify(run.path) if verified else None)
+    return _Page(summary, tuple(figures), verify(run.path) if verified else None)
 
 
 def _run(page: _Page) -> str:
@@ -199,46 +206,43 @@ def _run(page: _Page) -> str:
     return (
         f"<section>{_facts(page)}</section>"
         f"{_task(summary)}"
-        f"<section><h2>Motion</h2>{page.pictures[0]}{_efforts(summary)}</section>"
-        f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.pictures[1:])}</section>"
+        f"<section><h2>Motion</h2>{page.figures[0]}{_efforts(summary)}</section>"
+        f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.figures[1:])}</section>"
         f"<section><h2>Events</h2>{_events(summary)}</section>"
     )
 
 
-def _who(summary: RunSummary) -> str:
-    # A session that a controller began has its address.
-    who = f"controlled by {summary.controller}" if summary.controller else "recorded by hand"
-    return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {who} · {summary.start}"
+def _origin(summary: RunSummary) -> str:
+    # A session that was started by a controller has the controller's address.
+    started_by = f"controlled by {summary.controller}" if summary.controller else "recorded manually"
+    return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {started_by} · {summary.start}"
 
 
-def _whose(summary: RunSummary) -> str:
-    # A file that was renamed says in its text what it was recorded as.
-    renamed = "" if summary.name == summary.session else f"{summary.session} · "
-    return renamed + _who(summary)
+def _session_and_origin(summary: RunSummary) -> str:
+    # For a renamed file, also the session under which it was recorded.
+    session = "" if summary.name == summary.session else f"{summary.session} · "
+    return session + _origin(summary)
 
 
 def _facts(page: _Page) -> str:
     summary = page.summary
-    facts = [(f"{summary.duration_s:.1f} s", f"length; {summary.ended or 'how it ended is not said'}")]
+    facts = [(f"{summary.duration_s:.1f} s", f"duration; end: {summary.ended or 'unknown'}")]
     if summary.grade is not None:
-        facts.append((f"{summary.grade.percent} %", f"of the task: {summary.grade.headline()}"))
+        facts.append((f"{summary.grade.percent} %", f"task: {summary.grade.headline()}"))
     if summary.placement is not None:
-        placement = summary.placement
-        error = placement.largest_error_mm
-        within = "none placed" if error is None else f"within {error:.1f} mm"
-        facts.append((f"{placement.placed} of {len(placement.parts)}", f"parts in their places, {within}"))
+        error = summary.placement.largest_error_mm
+        within = "none placed" if error is None else f"largest error {error:.1f} mm"
+        facts.append((f"{summary.placement.placed} of {len(summary.placement.parts)}", f"parts placed; {within}"))
     loop = summary.latency.loop_ms
     if loop is None:
         facts.append(("–", f"loop latency: {summary.latency.reasons[-1]}"))
     else:
         facts.append((f"{loop.p50:.1f} ms", f"loop latency p50; p99 {loop.p99:.1f} ms"))
-    facts.append(
-        (f"{summary.motion.tool_path_m:.2f} m", f"way of the tool, at most {summary.motion.top_speed:.2f} m/s")
-    )
-    facts.append((f"{summary.motion.work_j:.1f} J", "work of the drives"))
+    facts.append((f"{summary.motion.tool_path_m:.2f} m", f"tool path; top speed {summary.motion.top_speed:.2f} m/s"))
+    facts.append((f"{summary.motion.work_j:.1f} J", "drive work"))
     if page.verified is not None:
-        facts.append(("verified" if page.verified.same else "diverges", page.verified.sentence()))
-    cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(what)}</span></div>" for value, what in facts)
+        facts.append(("verified" if page.verified.same else "not reproduced", page.verified.sentence()))
+    cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(text)}</span></div>" for value, text in facts)
     return f'<div class="facts">{cells}</div>'
 
 
@@ -248,10 +252,10 @@ def _task(summary: RunSummary) -> str:
         return ""
     rows = "".join(
         f'<tr><td>{escape(goal)}</td><td class="{"good" if reached else "bad"}">{"yes" if reached else "no"}</td>'
-        f'<td class="text">{escape(said)}</td></tr>'
-        for goal, reached, said in grade.lines()
+        f'<td class="text">{escape(text)}</td></tr>'
+        for goal, reached, text in grade.lines()
     )
-    head = "<thead><tr><th>goal</th><th>reached</th><th></th></tr></thead>"
+    head = "<thead><tr><th>goal</th><th>reached</th><th>result</th></tr></thead>"
     title = f"Task: {escape(grade.title)}" if grade.title else "Task"
     verdict = f'<p class="{"good" if grade.passed else "bad"}">{escape(grade.headline())}.</p>'
     return (
@@ -263,72 +267,75 @@ def _task(summary: RunSummary) -> str:
 def _efforts(summary: RunSummary) -> str:
     motion = summary.motion
     rows = [
-        ["largest, N·m (τ3: N)", *(f"{value:.2f}" for value in motion.peak_effort)],
-        ["at the register's limit", *(f"{share:.1%}" for share in motion.saturated_share)],
+        ["peak, N·m (τ3: N)", *(f"{value:.2f}" for value in motion.peak_effort)],
+        ["share of time at register limit", *(f"{share:.1%}" for share in motion.saturated_share)],
     ]
     return _table(["effort", *EFFORT_SYMBOLS], rows)
 
 
 def _latency(summary: RunSummary) -> str:
     latency = summary.latency
-    rows = [] if latency.loop_ms is None else [["loop", *_figures(latency.loop_ms)]]
-    rows += [[STAGE_NAMES[stage], *_figures(statistics)] for stage, statistics in latency.stages_ms.items()]
-    rows.append(["tick lateness", *_figures(latency.jitter_ms.tick_lateness)])
-    fitness = (
-        '<p class="good">Fit for latency claims.</p>'
+    rows = [] if latency.loop_ms is None else [["loop", *_statistics_cells(latency.loop_ms)]]
+    rows += [[STAGE_NAMES[stage], *_statistics_cells(statistics)] for stage, statistics in latency.stages_ms.items()]
+    rows.append(["tick lateness", *_statistics_cells(latency.jitter_ms.tick_lateness)])
+    verdict = (
+        '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
-        else f'<p class="bad">Not fit for latency claims: {escape("; ".join(latency.reasons))}.</p>'
+        else f'<p class="bad">Not valid for latency measurements: {escape("; ".join(latency.reasons))}.</p>'
     )
-    found = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
+    findings = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
     table = _table(["ms", *(column.replace("p999", "p99.9") for column in _COLUMNS)], rows)
-    return f"{table}{fitness}{f'<ul>{found}</ul>' if found else ''}"
+    return f"{table}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
 
 
 def _events(summary: RunSummary) -> str:
     if not summary.events:
-        return "<p>Nothing happened.</p>"
+        return "<p>No events.</p>"
     rows = [[kind.replace("_", " ").lower(), str(count)] for kind, count in summary.events.items()]
-    return _table(["event", "times"], rows)
+    return _table(["event", "count"], rows)
 
 
 def _overview(pages: Sequence[_Page]) -> str:
     graded = any(page.summary.grade is not None for page in pages)
-    header = ["run", *(("goals", "done, s", "error, mm") if graded else ("parts placed", "placing error, mm"))]
-    header += ["loop p50 / p99, ms", "way, m", "work, J", "saturated", "alarms", "fit"]
+    header = ["run", *(("goals", "time, s", "error, mm") if graded else ("parts placed", "placement error, mm"))]
+    header += ["loop p50 / p99, ms", "path, m", "work, J", "saturation", "alarms", "valid latency"]
     rows = []
     for number, page in enumerate(pages, start=1):
         summary, loop = page.summary, page.summary.latency.loop_ms
         rows.append(
             [
                 f"{number}. {summary.name}",
-                *(_graded(summary) if graded else _placed(summary)),
+                *(_grade_cells(summary) if graded else _placement_cells(summary)),
                 "–" if loop is None else f"{loop.p50:.1f} / {loop.p99:.1f}",
                 f"{summary.motion.tool_path_m:.2f}",
                 f"{summary.motion.work_j:.1f}",
                 f"{max(summary.motion.saturated_share):.1%}",
-                str(sum(summary.events.get(kind, 0) for kind in _GRAVE)),
+                str(sum(summary.events.get(kind, 0) for kind in ALARM_KINDS)),
                 "yes" if summary.latency.fit else "no",
             ]
         )
-    by = "share of the goals, then by time, then by error" if graded else "parts placed, then by placing error"
-    note = f'<p class="quiet">Ranked by {by}, then by the way of the tool.</p>'
-    distributions = picture(distribution_figure([page.summary for page in pages]), "how the runs are distributed")
-    return f"<section>{_ranking(header, rows)}{note}{distributions}</section>"
+    by = "goals reached, then by completion time, then by error" if graded else "parts placed, then by placement error"
+    note = f'<p class="quiet">Ranked by {by}, then by tool path length.</p>'
+    figure = html_figure(
+        distribution_figure([page.summary for page in pages]),
+        "ranked runs: goals or parts, time or error, drive work, loop latency",
+    )
+    return f"<section>{_ranking(header, rows)}{note}{figure}</section>"
 
 
-def _named(title: str, sentences: Iterable[str]) -> str:
+def _list_section(title: str, sentences: Iterable[str]) -> str:
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     return f'<section><h2>{title}</h2><ul class="bad">{items}</ul></section>' if items else ""
 
 
-def _graded(summary: RunSummary) -> list[str]:
+def _grade_cells(summary: RunSummary) -> list[str]:
     grade = summary.grade
     if grade is None:
         return ["–"] * 3
     return [f"{grade.percent} %", _or_dash(grade.done_s, 1), _or_dash(grade.error_mm)]
 
 
-def _placed(summary: RunSummary) -> list[str]:
+def _placement_cells(summary: RunSummary) -> list[str]:
     task = summary.placement
     return ["–"] * 2 if task is None else [f"{task.placed} of {len(task.parts)}", _or_dash(task.largest_error_mm)]
 
@@ -339,18 +346,18 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 def _rank(page: _Page) -> tuple[float, ...]:
     task, grade = page.summary.placement, page.summary.grade
-    # A tool that nobody moved went the shortest way: among equals such a run comes last.
-    way = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
+    # Without a controller the tool path is the shortest, so that such a run comes last among equals.
+    path_m = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:
-        return (0.0, *grade.rank, way)
-    # Beside graded runs, those without a task come last.
+        return (0.0, *grade.rank, path_m)
+    # Runs without a task come after graded runs.
     if task is None:
-        return (1.0, 0.0, 0.0, 0.0, way)
+        return (1.0, 0.0, 0.0, 0.0, path_m)
     error = task.largest_error_mm
-    return (1.0, -task.placed, 0.0, float("inf") if error is None else error, way)
+    return (1.0, -task.placed, 0.0, float("inf") if error is None else error, path_m)
 
 
-def _figures(statistics: Statistics) -> list[str]:
+def _statistics_cells(statistics: Statistics) -> list[str]:
     return [f"{getattr(statistics, column):.3f}" for column in _COLUMNS]
 
 
@@ -361,13 +368,13 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _ranking(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose rows are cards on a narrow page: each cell knows what it is."""
+    """Table whose rows become cards on a narrow page; each cell has its column's name for that."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join(
         "<tr>"
         + "".join(
-            f'<td data-what="{escape(what, quote=True)}">{escape(cell)}</td>'
-            for what, cell in zip(header, row, strict=True)
+            f'<td data-label="{escape(column, quote=True)}">{escape(cell)}</td>'
+            for column, cell in zip(header, row, strict=True)
         )
         + "</tr>"
         for row in rows

@@ -1,1 +1,1 @@
-"""Recordings and running rigs in the rerun viewer."""
+"""Visualization of recordings and running rigs in the rerun viewer."""

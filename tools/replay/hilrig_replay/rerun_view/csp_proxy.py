@@ -1,7 +1,7 @@
-"""The viewer's page for a browser, fenced in: it may ask this machine for the run, and nobody else for anything.
+"""Reverse proxy of rerun's web viewer; adds a Content-Security-Policy that restricts the page to this host.
 
-As rerun serves it, the page sends usage statistics, asks for the newest release and loads a font from elsewhere. Here
-each answer passes through a server that adds a Content-Security-Policy, which the browser keeps.
+As served by rerun, the page sends usage statistics, checks for a newer release and loads a font from other hosts. The
+policy that this proxy adds to each response makes the browser block these requests.
 """
 
 import threading
@@ -14,11 +14,11 @@ from typing import Final
 
 LOOPBACK: Final = "127.0.0.1"
 _TIMEOUT_S: Final = 30.0
-_KEPT: Final = ("Content-Type", "Content-Encoding")
+_FORWARDED_HEADERS: Final = ("Content-Type", "Content-Encoding")
 
 
 def policy(grpc_port: int) -> str:
-    """What the page may do: its own files, its own script, and data from `grpc_port` of this machine."""
+    """Content-Security-Policy of the page: only its own files and scripts, and data from `grpc_port` of this host."""
     own = "'self' data: blob:"
     script = f"script-src {own} 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'"
     return (
@@ -28,28 +28,28 @@ def policy(grpc_port: int) -> str:
 
 
 @contextmanager
-def fenced(viewer_port: int, grpc_port: int, port: int) -> Iterator[None]:
-    """Serve what the viewer serves at `viewer_port` at `port` too, fenced, on this machine alone.
+def serve_with_csp(viewer_port: int, grpc_port: int, port: int) -> Iterator[None]:
+    """Serve the pages of `viewer_port` on `port` with the Content-Security-Policy, on the loopback interface only.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
     """
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             try:
                 with urllib.request.urlopen(f"http://{LOOPBACK}:{viewer_port}{self.path}", timeout=_TIMEOUT_S) as page:
-                    self._answer(page.status, dict(page.headers), page.read())
+                    self._respond(page.status, dict(page.headers), page.read())
             except urllib.error.HTTPError as error:
-                self._answer(error.code, dict(error.headers), error.read())
+                self._respond(error.code, dict(error.headers), error.read())
             except OSError:
-                # The viewer is ending: the page finds out by itself.
-                self._answer(502, {}, b"")
+                # The viewer is shutting down.
+                self._respond(502, {}, b"")
 
-        def _answer(self, status: int, headers: dict[str, str], body: bytes) -> None:
+        def _respond(self, status: int, headers: dict[str, str], body: bytes) -> None:
             self.send_response(status)
             for name, value in headers.items():
-                if name.title() in _KEPT:
+                if name.title() in _FORWARDED_HEADERS:
                     self.send_header(name, value)
             self.send_header("Content-Security-Policy", policy(grpc_port))
             self.send_header("Content-Length", str(len(body)))
@@ -61,7 +61,7 @@ def fenced(viewer_port: int, grpc_port: int, port: int) -> Iterator[None]:
 
     with ThreadingHTTPServer((LOOPBACK, port), Handler) as server:
         server.daemon_threads = True
-        thread = threading.Thread(target=server.serve_forever, name="viewer's page", daemon=True)
+        thread = threading.Thread(target=server.serve_forever, name="web viewer proxy", daemon=True)
         thread.start()
         try:
             yield

@@ -1,4 +1,4 @@
-"""How the viewer is laid out when a rig is opened: the arm large on the left, its curves on the right, events below."""
+"""Layout of the viewer: the arm on the left, plots on the right, events and states below the arm."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -12,16 +12,16 @@ WALL: Final = "wall"
 STEP: Final = "step"
 
 TRAIL_S: Final = 4.0
-"""How much of the tool's way is drawn behind it, s."""
+"""Length of the tool's trail, s."""
 LIVE_WINDOW_S: Final = 20.0
-"""What the curves of a running rig show, s."""
-_EYE: Final = (0.80, -0.72, 0.50)
-_LOOK_AT: Final = (0.14, 0.02, 0.02)
+"""Time range of the plots of a running rig, s."""
+_CAMERA_POSITION: Final = (0.80, -0.72, 0.50)
+_CAMERA_TARGET: Final = (0.14, 0.02, 0.02)
 _BACKGROUND: Final = (24, 28, 33)
 
 
 def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint:
-    """The blueprint for rigs under entity paths `roots`; the arms stand in one scene, their curves in one plot each."""
+    """Blueprint for the rigs under the entity paths `roots`: one scene with all arms, and common plots."""
     trail = [
         rrb.VisibleTimeRange(
             timeline,
@@ -37,7 +37,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         background=rrb.Background(color=_BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=_EYE, look_target=_LOOK_AT, eye_up=(0.0, 0.0, 1.0)
+            kind=rrb.Eye3DKind.Orbital, position=_CAMERA_POSITION, look_target=_CAMERA_TARGET, eye_up=(0.0, 0.0, 1.0)
         ),
         overrides={_path(root, "scene/trail"): [rrb.VisibleTimeRanges(trail)] for root in roots},
     )
@@ -68,26 +68,26 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
             ),
         ),
         rrb.StateTimelineView(
-            name="What was on",
+            name="States",
             origin="/",
-            contents=[f"+ {_path(root, 'lanes')}/**" for root in roots],
+            contents=[f"+ {_path(root, 'states')}/**" for root in roots],
         ),
     )
-    curves = rrb.Vertical(
-        # Of several runs each has its colour: one plot that says so is enough.
-        plot("Positions: θ in °, d3 in mm", "position", legend=len(roots) == 1),
-        # Marks stand where there is no legend: each kind of event would take a line of it.
-        plot("Velocities: θ in °/s, d3 in mm/s; events as marks", "velocity", "marks", legend=False),
-        plot("Efforts: τ1 τ2 τ4 in N·m, τ3 in N (thin: commanded)", "effort", legend=False),
-        plot("Loop latency, made of its stages, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
+    plots = rrb.Vertical(
+        # With several runs, color identifies the run: a legend in one plot is enough.
+        plot("Joint positions (θ in °, d3 in mm)", "position", legend=len(roots) == 1),
+        # Event markers are only in plots without a legend, where each kind would take a line.
+        plot("Joint velocities (θ in °/s, d3 in mm/s) and events", "velocity", "markers", legend=False),
+        plot("Joint efforts (τ1, τ2, τ4 in N·m; τ3 in N; thin: commanded)", "effort", legend=False),
+        plot("Loop latency by stage, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
         rrb.Tabs(
-            plot("Tick lateness, ms; events as marks", "lateness", "marks", legend=False),
+            plot("Tick lateness, ms, and events", "lateness", "markers", legend=False),
             plot("Modbus requests per second", "modbus"),
         ),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), curves, column_shares=[1.45, 1.0]),
+        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), plots, column_shares=[1.45, 1.0]),
         rrb.TimePanel(
             timeline=SIM_TIME,
             state="collapsed",
@@ -102,7 +102,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
 
 
 def arm_path(root: str) -> str:
-    """Entity path of a rig's URDF: rerun's loader takes a path of a single part only."""
+    """Entity path of a rig's URDF; rerun's URDF loader accepts a path of one element only."""
     return f"{root}_arm" if root else "arm"
 
 

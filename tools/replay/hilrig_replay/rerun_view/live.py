@@ -1,7 +1,7 @@
-"""A running rig, followed on the bus into the same view that a recording has.
+"""Live view of a running rig: subscribes to its topics and writes the messages into the same view as a recording.
 
-The bus's callback only stores; `Follower.step` decodes and draws what has come since the last time, in one batch a
-topic. What waits is bounded: when drawing falls behind, the oldest messages are dropped, and the arm jumps.
+The bus callback only queues messages; `Follower.step` decodes and draws the queued messages in one batch per topic.
+The queue is bounded: when drawing falls behind, the oldest messages are dropped, and the drawn arm jumps.
 """
 
 import threading
@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from hilrig_replay.io.columns import StringTable
 from hilrig_replay.io.records import Decoder
 from hilrig_replay.io.timebase import Timebase
-from hilrig_replay.rerun_view.rig_view import Drawn, RigView
+from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
 from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import OperationError
@@ -23,20 +23,19 @@ from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, TRAFFIC, parse_rig_key
 
 VIEWER_PERIOD_S: Final = 0.04
-"""How often what has come in is drawn into a viewer, s."""
+"""Period at which received messages are drawn into a viewer, s."""
 FILE_PERIOD_S: Final = 0.5
-"""The same into a file, whose index, kept in memory until its end, grows with each piece."""
+"""Period for a file, s; longer, because rerun keeps the file's index in memory, one entry per write."""
 START_TIMEOUT_S: Final = 5.0
-"""A rig that does not answer within this time is not there, s."""
-SILENCE_NS: Final = 2_000_000_000
-"""A rig from which nothing comes for so long is said to be silent, ns."""
-_ASK_S: Final = 0.5
-_WAITING: Final = 20_000
-"""Messages that may wait to be drawn, count."""
+"""Timeout for the simulation's first reply, s."""
+SILENCE_TIMEOUT_NS: Final = 2_000_000_000
+"""Time without states after which the rig is reported as silent, ns."""
+_QUERY_TIMEOUT_S: Final = 0.5
+_MAX_PENDING_MESSAGES: Final = 20_000
 
 
 class Follower:
-    """Draws one rig of a lab for as long as it is stepped."""
+    """Draws one running rig of a lab; `step` draws the messages received since the previous call."""
 
     def __init__(
         self,
@@ -45,7 +44,7 @@ class Follower:
         rig: str,
         stream: rr.RecordingStream,
         clock: Clock,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         task: TaskConfig | None = None,
     ) -> None:
         self._bus = bus
@@ -53,102 +52,102 @@ class Follower:
         self._rig = rig
         self._stream = stream
         self._clock = clock
-        self._say = say
+        self._log = log
         self._task = task
-        self._waiting: deque[tuple[str, bytes, int]] = deque(maxlen=_WAITING)
+        self._pending: deque[tuple[str, bytes, int]] = deque(maxlen=_MAX_PENDING_MESSAGES)
         self._names, self._timebase = StringTable(), Timebase()
         self._decoder = Decoder(self._names, self._timebase)
-        self._view: RigView | None = None
+        self._view: RerunRigWriter | None = None
         self._incarnation = 0
-        self._heard_ns = clock.monotonic_ns()
+        self._last_state_ns = clock.monotonic_ns()
         self._silent = False
         self._handles = [
             bus.subscribe(topic.key(lab, rig), self._on_message) for topic in (STATE, COMMAND, EVENT, TRAFFIC)
         ]
 
     def _on_message(self, key: str, payload: bytes) -> None:
-        self._waiting.append((parse_rig_key(key).topic.name, payload, self._clock.wall_ns()))
+        self._pending.append((parse_rig_key(key).topic.name, payload, self._clock.wall_ns()))
 
     def find(self, stopping: threading.Event, timeout_s: float = START_TIMEOUT_S) -> bool:
-        """Ask the rig what it looks like, until it answers or `stopping` is set; whether it did.
+        """Query the rig's geometry until it replies or `stopping` is set; returns whether it replied.
 
         Raises:
-            OperationError: nothing runs there.
+            OperationError: no reply within the timeout.
         """
         deadline_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         while not stopping.is_set():
-            drawn = self._ask()
-            if drawn is not None:
-                self._view = RigView(self._stream, drawn, self._timebase, self._names)
+            geometry = self._query_geometry()
+            if geometry is not None:
+                self._view = RerunRigWriter(self._stream, geometry, self._timebase, self._names)
                 return True
             if self._clock.monotonic_ns() >= deadline_ns:
                 raise OperationError(
-                    f"no simulation of rig {self._rig!r} answers for lab {self._lab!r}: "
-                    "is it running (hilrig up), with this lab.toml?"
+                    f"no reply from a simulation of rig {self._rig!r} in lab {self._lab!r}: "
+                    "is it running (hilrig up) with this lab.toml?"
                 )
             stopping.wait(0.05)
         return False
 
     def step(self) -> int:
-        """Draw what has come since the last time; how many messages that was."""
+        """Draw the messages received since the previous call; returns their count."""
         now_ns = self._clock.monotonic_ns()
-        count = len(self._waiting)
+        count = len(self._pending)
         for _ in range(count):
-            topic, payload, arrived_ns = self._waiting.popleft()
+            topic, payload, arrived_ns = self._pending.popleft()
             try:
                 self._decoder.add(topic, payload, 0, arrived_ns)
             except DecodeError:
-                self._say(f"a message of {self._rig}/{topic} can't be decoded: another version of hilrig sends it")
+                self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
         records = self._decoder.drain()
-        # The edge goes on repeating its command when the simulation is gone: states are the sign of life.
+        # Only states count: the edge keeps repeating its command after the simulation has stopped.
         if len(records.states):
-            self._heard_ns = now_ns
+            self._last_state_ns = now_ns
             if self._silent:
                 self._silent = False
-                self._say(f"{self._rig} is back")
-        elif not self._silent and now_ns - self._heard_ns > SILENCE_NS:
+                self._log(f"{self._rig}: receiving states again")
+        elif not self._silent and now_ns - self._last_state_ns > SILENCE_TIMEOUT_NS:
             self._silent = True
-            self._say(f"nothing comes from {self._rig}: waiting for it")
+            self._log(f"{self._rig}: no states received for {SILENCE_TIMEOUT_NS // 1_000_000_000} s; waiting")
         if self._view is None or not self._timebase.start_wall_ns:
-            # Commands and events before the first state have no place in time yet.
+            # Before the first state, commands and events can't be placed on the time axis.
             return count
         if len(records.states):
-            self._look_again(int(records.states["incarnation"][-1]))
+            self._refresh_geometry(int(records.states["incarnation"][-1]))
         self._view.add(records)
         return count
 
-    def _look_again(self, incarnation: int) -> None:
-        """After a restart of the simulation its rig may be another one."""
+    def _refresh_geometry(self, incarnation: int) -> None:
+        """Query the geometry again after a restart of the simulation, whose configuration may have changed."""
         if incarnation == self._incarnation:
             return
         first, self._incarnation = not self._incarnation, incarnation
-        drawn = None if first else self._ask()
-        if drawn is not None and self._view is not None:
-            self._view.draw(drawn)
+        geometry = None if first else self._query_geometry()
+        if geometry is not None and self._view is not None:
+            self._view.update_geometry(geometry)
 
-    def _ask(self) -> Drawn | None:
-        for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_ASK_S):
+    def _query_geometry(self) -> RigGeometry | None:
+        for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
             if answer.payload and not answer.error:
                 config = CONFIG.decode(answer.payload)
-                return Drawn.of(config.urdf, config.parameters_json, config.step_ns, self._task)
+                return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)
         return None
 
     def close(self) -> None:
-        """Listen no longer; a second call does nothing."""
+        """Unsubscribe; a second call does nothing."""
         while self._handles:
             self._handles.pop().close()
 
 
-def follow(follower: Follower, over: Callable[[], bool], stopping: threading.Event, period_s: float) -> None:
-    """Draw every `period_s` until `over()` says so or `stopping` is set.
+def follow(follower: Follower, is_closed: Callable[[], bool], stopping: threading.Event, period_s: float) -> None:
+    """Draw every `period_s` until `is_closed()` or `stopping` is set.
 
     Raises:
-        OperationError: nothing runs there.
+        OperationError: the simulation does not reply.
     """
     try:
         if not follower.find(stopping):
             return
-        while not over() and not stopping.wait(period_s):
+        while not is_closed() and not stopping.wait(period_s):
             follower.step()
         follower.step()
     finally:

@@ -1,8 +1,8 @@
-"""A rig in the rerun viewer: the arm in three dimensions, its curves, its latency, its events.
+"""Writes a rig as rerun entities: the arm in three dimensions, time series, loop latency, and events.
 
-`RigView` writes one rig into a rerun recording, block by block and column by column, and does not care whether the
-blocks come out of a file (`replay`) or off the bus (`live`). Everything of a rig is under one entity path, so that
-several runs stand beside each other in one viewer.
+`RerunRigWriter` writes one rig into a rerun recording, block by block, as columns. The blocks are read from a file
+(`view`) or received from the bus (`live`). All entities of a rig have a common root path, so that one viewer can show
+several runs.
 """
 
 import re
@@ -20,6 +20,7 @@ from rerun.urdf import UrdfTree
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_replay.analysis.samples import STAGES, CommandMatcher, join_commands
+from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.timebase import Timebase
@@ -36,55 +37,54 @@ from hilrig_replay.plots.palette import (
     rgb,
 )
 from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL, arm_path
-from hilrig_replay.rerun_view.scene import ArmPicture, parameters_of, reach_outline, read_arm, tips
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.model import JOINT_SCALE, PartParameters, RigParameters
 from hilrig_sim.arm.urdf import urdf
 
 _SAFE: Final = "safe zero"
-_NOBODY: Final = "nobody"
+_NO_CONTROLLER: Final = "no controller"
 _TRAIL_COLOR: Final = "#f2b134"
 _BASELINE_COLOR: Final = "#5b6570"
-_REACH_COLOR: Final = "#3f6f8f"
+_WORKSPACE_COLOR: Final = "#3f6f8f"
 _TASK_COLOR: Final = "#6fd08c"
-_SMALLEST_TARGET: Final = 0.004
-"""A pose's target is drawn as large as its tolerance, but no smaller than this, m."""
-_YAW_ARROW: Final = 0.04
-_PART_COLOR: Final = "#c8ccd0"
-_PART_SIZE: Final = (0.03, 0.03, 0.03)
-_OTHER_EVENT: Final = "#9aa5b1"
-_UNSAFE: Final = re.compile(r"[^\w.-]")
-"""What does not belong into an entity path."""
-_KIND_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
+_MIN_TARGET_RADIUS_M: Final = 0.004
+"""A pose target is drawn with its tolerance as radius, but at least with this one, m."""
+_YAW_ARROW_LENGTH_M: Final = 0.04
+_UNKNOWN_PART_COLOR: Final = "#c8ccd0"
+_UNKNOWN_PART_SIZE_M: Final = (0.03, 0.03, 0.03)
+_OTHER_EVENT_COLOR: Final = "#9aa5b1"
+_NOT_IN_PATH: Final = re.compile(r"[^\w.-]")
+"""Characters that an entity path must not contain."""
+_REQUEST_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
-    """What of a rig does not change while it runs."""
+class RigGeometry:
+    """Static description of a rig: arm, parameters, step and task."""
 
-    arm: ArmPicture
+    arm: ArmGeometry
     parameters: RigParameters
     step_ns: int
     task: TaskConfig | None = None
 
     @classmethod
-    def of(cls, urdf_text: str, parameters_json: str, step_ns: int, task: TaskConfig | None = None) -> "Drawn":
-        """What a recording or a running simulation says of its rig; what it does not say is as by default.
+    def of(cls, urdf_text: str, parameters_json: str, step_ns: int, task: TaskConfig | None = None) -> "RigGeometry":
+        """Build from the texts of a recording or a running simulation; empty texts give the defaults.
 
         Raises:
-            InputError: it says something that is not understood.
+            InputError: a text is invalid.
         """
         parameters = parameters_of(parameters_json)
-        return cls(read_arm(urdf_text or urdf(parameters)), parameters, step_ns, task)
+        return cls(parse_arm(urdf_text or urdf(parameters)), parameters, step_ns, task)
 
 
-class RigView:
-    """Writes one rig; `root` is the entity path that all of it goes under, empty for the only one."""
+class RerunRigWriter:
+    """Writes one rig; `root` is the root of its entity paths, empty if it is the only rig."""
 
     def __init__(
         self,
         stream: rr.RecordingStream,
-        drawn: Drawn,
+        geometry: RigGeometry,
         timebase: Timebase,
         names: StringTable,
         *,
@@ -92,59 +92,60 @@ class RigView:
         color: str | None = None,
     ) -> None:
         self._stream = stream
-        self._drawn = drawn
+        self._geometry = geometry
         self._timebase = timebase
         self._names = names
         self._root = root
         self._color = color
         self._matcher = CommandMatcher()
-        self._lanes: dict[str, str] = {}
-        self._holder = ""
-        self._holders = {_SAFE: "#e45756", _NOBODY: "#3a424c"}
+        self._current_states: dict[str, str] = {}
+        self._torque_source = ""
+        self._source_colors = {_SAFE: "#e45756", _NO_CONTROLLER: "#3a424c"}
         self._rates = RequestRates(names)
-        self._clients: set[str] = set()
+        self._known_clients: set[str] = set()
         self._last_tip: NDArray[np.float64] | None = None
-        self._placed: set[str] = set()
-        self._marked: set[str] = set()
+        self._known_parts: set[str] = set()
+        self._known_event_kinds: set[str] = set()
         self._write_scene()
         self._write_legends()
 
-    def draw(self, drawn: Drawn) -> None:
-        """Draw the rig anew where it has become another one."""
-        before, self._drawn = self._drawn, drawn
-        if (drawn.arm.urdf, drawn.parameters, drawn.task) != (before.arm.urdf, before.parameters, before.task):
+    def update_geometry(self, geometry: RigGeometry) -> None:
+        """Draw the rig again if its geometry has changed."""
+        before, self._geometry = self._geometry, geometry
+        changed = (geometry.arm.urdf, geometry.parameters, geometry.task)
+        if changed != (before.arm.urdf, before.parameters, before.task):
             self._write_scene()
 
-    # -- what does not change ---------------------------------------------------------------------------------------
+    # -- static entities --------------------------------------------------------------------------------------------
 
     def _write_scene(self) -> None:
         self._static("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        scene = self._drawn.parameters.scene
-        self._write_arm(self._drawn.arm)
+        scene = self._geometry.parameters.scene
+        self._write_arm(self._geometry.arm)
         for part in scene.parts:
             self._place_part(part)
-        outline = reach_outline(self._drawn.parameters.arm, scene.table_height + 0.002)
+        outline = workspace_outline(self._geometry.parameters.arm, scene.table_height + 0.002)
         trail = rgb(self._color or _TRAIL_COLOR)
         self._static("scene/trail", rr.LineStrips3D.from_fields(colors=[trail], radii=[0.002]))
-        self._static("scene/reach", rr.LineStrips3D(outline, colors=[rgb(_REACH_COLOR)], radii=[0.0012]))
-        if self._drawn.task is not None:
-            self._write_task(self._drawn.task)
+        self._static("scene/workspace", rr.LineStrips3D(outline, colors=[rgb(_WORKSPACE_COLOR)], radii=[0.0012]))
+        if self._geometry.task is not None:
+            self._write_task(self._geometry.task)
 
     def _write_task(self, task: TaskConfig) -> None:
         for pose in task.poses:
             at = [length / 1000 for length in pose.position_mm]
             path, color = f"scene/task/{pose.name}", rgb(_TASK_COLOR)
-            radius = max(pose.tolerance_mm / 1000, _SMALLEST_TARGET)
+            radius = max(pose.tolerance_mm / 1000, _MIN_TARGET_RADIUS_M)
             self._static(path, rr.Points3D([at], radii=[radius], colors=[color], labels=[pose.name]))
             if pose.yaw_deg is not None:
                 yaw = np.radians(pose.yaw_deg)
-                arrow = [_YAW_ARROW * np.cos(yaw), _YAW_ARROW * np.sin(yaw), 0.0]
+                arrow = [_YAW_ARROW_LENGTH_M * np.cos(yaw), _YAW_ARROW_LENGTH_M * np.sin(yaw), 0.0]
                 self._static(f"{path}/yaw", rr.Arrows3D(origins=[at], vectors=[arrow], radii=[0.001], colors=[color]))
         if task.path is not None:
             points = np.array(task.path.points_mm) / 1000
             self._static("scene/task/path", rr.LineStrips3D([points], radii=[0.0015], colors=[rgb(_TASK_COLOR)]))
 
-    def _write_arm(self, arm: ArmPicture) -> None:
+    def _write_arm(self, arm: ArmGeometry) -> None:
         path = arm_path(self._root)
         frames = f"{path}_"
         with tempfile.TemporaryDirectory() as folder:
@@ -157,24 +158,24 @@ class RigView:
                 static_transform_entity_path=f"{path}/fixed",
             )
         tree.log_urdf_to_recording(self._stream)
-        # The URDF has named frames, all else the tree of paths: this hangs the arm's root into the scene.
+        # The URDF uses named frames, all other entities use the path tree: this attaches the arm's root to the scene.
         self._static(
             "scene/arm_root",
             rr.Transform3D(parent_frame=f"tf#/{self._path('scene')}", child_frame=frames + arm.root),
         )
         self._frames = frames
-        for link, number, shape in arm.solids:
+        for link, number, shape in arm.primitives:
             paths = tree.get_visual_geometry_paths(link)
             if number < len(paths):
-                # As it comes, a primitive is drawn transparent with its edges.
-                solid: Any = {"box": rr.Boxes3D, "cylinder": rr.Cylinders3D, "sphere": rr.Ellipsoids3D}[shape]
-                # Of several arms in one scene each has its run's colour; what stands still is the same for all.
-                own = None if self._color is None or link == arm.root else [rgb(self._color)]
-                self._stream.log(paths[number], solid.from_fields(fill_mode="solid", colors=own), static=True)
+                # By default rerun draws primitives as transparent shapes with edges.
+                archetype: Any = {"box": rr.Boxes3D, "cylinder": rr.Cylinders3D, "sphere": rr.Ellipsoids3D}[shape]
+                # With several arms in one scene, movable links have the color of their run.
+                colors = None if self._color is None or link == arm.root else [rgb(self._color)]
+                self._stream.log(paths[number], archetype.from_fields(fill_mode="solid", colors=colors), static=True)
 
     def _place_part(self, part: PartParameters) -> None:
         path = f"scene/parts/{part.name}"
-        self._placed.add(part.name)
+        self._known_parts.add(part.name)
         color = rgb(part.colour)
         if part.shape == "cylinder":
             shape: Any = rr.Cylinders3D(
@@ -194,29 +195,29 @@ class RigView:
         ends = ["state sampled", *(f"+ {STAGE_NAMES[stage]}" for stage in STAGES[:-1]), "+ transport = loop"]
         self._legend("stages", ends, [_BASELINE_COLOR, *(STAGE_COLORS[stage] for stage in STAGES)])
         self._legend("loop", ["loop latency"], ["#e0e4e8"])
-        self._lane_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
-        self._lane_legend("part", {part.name: part.colour for part in self._drawn.parameters.scene.parts})
+        self._state_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
+        self._state_legend("part", {part.name: part.colour for part in self._geometry.parameters.scene.parts})
         self._legend("lateness", ["tick lateness"], ["#e45756"])
 
     def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
         shades = [rgb(color) for color in colors] if self._color is None else [rgb(self._color)] * len(names)
-        whose = f"{self._root} " if self._root else ""
-        lines = rr.SeriesLines(names=[whose + name for name in names], colors=shades, widths=[width] * len(names))
+        prefix = f"{self._root} " if self._root else ""
+        lines = rr.SeriesLines(names=[prefix + name for name in names], colors=shades, widths=[width] * len(names))
         self._static(path, lines)
 
-    def _lane_legend(self, lane: str, colors: Mapping[str, str]) -> None:
+    def _state_legend(self, name: str, colors: Mapping[str, str]) -> None:
         shades = [rgb(color) for color in colors.values()]
-        self._static(f"lanes/{lane}", rr.StateConfiguration(values=list(colors), colors=shades))
+        self._static(f"states/{name}", rr.StateConfiguration(values=list(colors), colors=shades))
 
-    # -- what changes -----------------------------------------------------------------------------------------------
+    # -- time-dependent entities ------------------------------------------------------------------------------------
 
     def add(self, records: Records) -> None:
-        """Write the next piece; its states must be known to the timebase."""
+        """Write the next block; the timebase must already include its states."""
         if len(records.commands):
             self._add_commands(records.commands)
         if len(records.states):
             self._add_states(records.states)
-            self._lane("torque", records.states, self._torque_source(records.states, records.commands))
+            self._add_state("torque", records.states, self._torque_sources(records.states, records.commands))
         if len(records.parts):
             self._add_parts(records.parts)
         samples = self._matcher.add(records.states, records.commands)
@@ -228,7 +229,7 @@ class RigView:
             self._add_events(records.events)
 
     def end(self) -> None:
-        """Write what waited for more: nothing comes any more."""
+        """Write buffered data; no more blocks follow."""
         self._add_rates(self._rates.end())
 
     def _add_states(self, states: Rows) -> None:
@@ -237,14 +238,14 @@ class RigView:
         self._scalars("position", times, q * JOINT_SCALE)
         self._scalars("velocity", times, states["velocity"] * JOINT_SCALE)
         self._scalars("effort/applied", times, states["effort"])
-        self._scalars("lateness", times, tick_lateness_ns(states, self._drawn.step_ns)[:, None] / 1e6)
+        self._scalars("lateness", times, tick_lateness_ns(states, self._geometry.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)
-        self._lane("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
-        self._lane("part", states, self._names.texts(states["held_part"]))
-        self._lane("stops", states, _stops(states["limit_flags"]))
+        self._add_state("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
+        self._add_state("part", states, self._names.texts(states["held_part"]))
+        self._add_state("limits", states, _limits(states["limit_flags"]))
 
     def _add_pose(self, times: list[rr.TimeColumn], q: NDArray[np.float64]) -> None:
-        for joint, values in zip(self._drawn.arm.joints, q.T, strict=True):
+        for joint, values in zip(self._geometry.arm.joints, q.T, strict=True):
             translations, rotations = joint.transforms(values)
             columns = rr.Transform3D.columns(
                 translation=translations,
@@ -253,9 +254,9 @@ class RigView:
                 child_frame=[self._frames + joint.child] * len(values),
             )
             self._send(f"scene/joints/{joint.name}", times, columns)
-        points = tips(self._drawn.parameters.arm, q)
+        points = tool_positions(self._geometry.parameters.arm, q)
         before = points[:1] if self._last_tip is None else self._last_tip
-        # As one array: strips given one by one take rerun thirty times as long.
+        # One array: with a list of strips rerun takes thirty times as long.
         segments: Any = np.stack((np.concatenate((before, points[:-1])), points), axis=1)
         self._last_tip = points[-1:]
         self._send("scene/trail", times, rr.LineStrips3D.columns(strips=segments))
@@ -264,8 +265,10 @@ class RigView:
         for code in np.unique(parts["part"]):
             name = self._names[int(code)]
             rows = parts[parts["part"] == code]
-            if name not in self._placed:
-                unknown = PartParameters(name, "box", _PART_SIZE, 0.1, True, _PART_COLOR, (0.0, 0.0, 0.0), 0.0)
+            if name not in self._known_parts:
+                unknown = PartParameters(
+                    name, "box", _UNKNOWN_PART_SIZE_M, 0.1, True, _UNKNOWN_PART_COLOR, (0.0, 0.0, 0.0), 0.0
+                )
                 self._place_part(unknown)
             half = rows["yaw"] / 2
             zero = np.zeros(len(rows))
@@ -290,10 +293,10 @@ class RigView:
 
     def _add_rates(self, rates: Iterable[Rate]) -> None:
         for client, kind, begins_ns, counts in rates:
-            path = f"modbus/{_UNSAFE.sub('_', client)}/{kind}"
-            if path not in self._clients:
-                self._clients.add(path)
-                line = rr.SeriesLines(names=[f"{client} {kind}"], colors=[rgb(_KIND_COLORS[kind])], widths=[1.5])
+            path = f"modbus/{_NOT_IN_PATH.sub('_', client)}/{kind}"
+            if path not in self._known_clients:
+                self._known_clients.add(path)
+                line = rr.SeriesLines(names=[f"{client} {kind}"], colors=[rgb(_REQUEST_COLORS[kind])], widths=[1.5])
                 self._static(path, line)
             at = np.zeros(len(counts), np.dtype([("wall_ns", "<i8")]))
             at["wall_ns"] = begins_ns
@@ -305,65 +308,65 @@ class RigView:
             for kind, text in zip(events["kind"], events["text"], strict=True)
         ]
         levels = ["WARN" if severity == "WARNING" else severity for severity in events["severity"]]
-        colors = [rgb(SEVERITY_COLORS.get(severity, _OTHER_EVENT)) for severity in events["severity"]]
+        colors = [rgb(SEVERITY_COLORS.get(severity, _OTHER_EVENT_COLOR)) for severity in events["severity"]]
         self._send("events", self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
         for kind in np.unique(events["kind"]):
-            mine = events[events["kind"] == kind]
-            if kind not in self._marked:
-                self._marked.add(kind)
-                color = rgb(EVENT_COLORS.get(kind, SEVERITY_COLORS.get(mine["severity"][0], _OTHER_EVENT)))
-                marks = rr.SeriesPoints(
+            rows = events[events["kind"] == kind]
+            if kind not in self._known_event_kinds:
+                self._known_event_kinds.add(kind)
+                color = rgb(EVENT_COLORS.get(kind, SEVERITY_COLORS.get(rows["severity"][0], _OTHER_EVENT_COLOR)))
+                markers = rr.SeriesPoints(
                     names=[kind.replace("_", " ").lower()], colors=[color], markers=["diamond"], marker_sizes=[6.0]
                 )
-                self._static(f"marks/{kind.lower()}", marks)
-            # On the axis: what an event says stands in the log below.
-            self._scalars(f"marks/{kind.lower()}", self._times(mine), np.zeros((len(mine), 1)))
+                self._static(f"markers/{kind.lower()}", markers)
+            # At zero: the texts are in the event log.
+            self._scalars(f"markers/{kind.lower()}", self._times(rows), np.zeros((len(rows), 1)))
 
-    def _torque_source(self, states: Rows, commands: Rows) -> NDArray[np.object_]:
-        """Whose torque acts, for each state: the address of who wrote the command in force."""
-        # The command of a state may be in the block before: what was known last holds until a newer one is found.
-        source = np.full(len(states), self._holder, dtype=object)
+    def _torque_sources(self, states: Rows, commands: Rows) -> NDArray[np.object_]:
+        """Source of the applied torque for each state: the address of the controller that wrote the active command."""
+        # The command of a state may be in an earlier block: the last known source holds until a newer one is found.
+        source = np.full(len(states), self._torque_source, dtype=object)
         rows, found = join_commands(states, commands)
         if found.any():
             at = np.maximum.accumulate(np.where(found, np.arange(len(states)), -1))
             known = self._names.texts(commands["controller"][rows])
             known[commands["safe"][rows]] = _SAFE
             source[at >= 0] = known[at[at >= 0]]
-            self._holder = str(source[-1])
-        source[states["command_seq"] == 0] = _NOBODY
+            self._torque_source = str(source[-1])
+        source[states["command_seq"] == 0] = _NO_CONTROLLER
         source[states["safe"]] = _SAFE
-        self._tell_apart(source)
+        self._assign_colors(source)
         return source
 
-    def _tell_apart(self, holders: NDArray[np.object_]) -> None:
-        """Give each holder a colour; those beyond the first `MOST` are one, as their requests are."""
-        new = sorted(set(holders) - {""} - self._holders.keys())
-        room = max(MAX_CLIENTS - len(self._holders), 0)
+    def _assign_colors(self, sources: NDArray[np.object_]) -> None:
+        """Assign a color to each source; those beyond the first `MOST` are merged, as in the request rates."""
+        new = sorted(set(sources) - {""} - self._source_colors.keys())
+        room = max(MAX_CLIENTS - len(self._source_colors), 0)
         if new[room:]:
-            holders[[holder in new[room:] for holder in holders]] = OTHER_CLIENTS
-            new = new[:room] if OTHER_CLIENTS in self._holders else [*new[:room], OTHER_CLIENTS]
+            sources[[source in new[room:] for source in sources]] = OTHER_CLIENTS
+            new = new[:room] if OTHER_CLIENTS in self._source_colors else [*new[:room], OTHER_CLIENTS]
         if new:
-            for holder in new:
-                self._holders[holder] = RUN_COLORS[len(self._holders) % len(RUN_COLORS)]
-            self._lane_legend("torque", self._holders)
+            for source in new:
+                self._source_colors[source] = RUN_COLORS[len(self._source_colors) % len(RUN_COLORS)]
+            self._state_legend("torque", self._source_colors)
 
-    # -- the recording ----------------------------------------------------------------------------------------------
+    # -- helpers ----------------------------------------------------------------------------------------------------
 
-    def _lane(self, name: str, rows: Rows, values: NDArray[np.object_]) -> None:
-        """A lane of states over time: only its changes are written."""
+    def _add_state(self, name: str, rows: Rows, values: NDArray[np.object_]) -> None:
+        """Add to a state timeline; only changes are written."""
         changed = np.ones(len(values), np.bool_)
-        changed[0] = values[0] != self._lanes.get(name)
+        changed[0] = values[0] != self._current_states.get(name)
         changed[1:] = values[1:] != values[:-1]
-        self._lanes[name] = values[-1]
+        self._current_states[name] = values[-1]
         if changed.any():
             states = [str(value) for value in values[changed]]
-            self._send(f"lanes/{name}", self._times(rows[changed]), rr.StateChange.columns(state=states))
+            self._send(f"states/{name}", self._times(rows[changed]), rr.StateChange.columns(state=states))
 
     def _times(self, rows: Rows) -> list[rr.TimeColumn]:
         return [
             rr.TimeColumn(SIM_TIME, duration=self._timebase.time_ns(rows).astype("timedelta64[ns]")),
             rr.TimeColumn(WALL, timestamp=rows["wall_ns"].astype("datetime64[ns]")),
-            rr.TimeColumn(STEP, sequence=self._timebase.steps(rows, self._drawn.step_ns)),
+            rr.TimeColumn(STEP, sequence=self._timebase.steps(rows, self._geometry.step_ns)),
         ]
 
     def _scalars(self, path: str, times: list[rr.TimeColumn], values: NDArray[np.floating]) -> None:
@@ -372,8 +375,8 @@ class RigView:
     def _send(self, path: str, times: list[rr.TimeColumn], columns: Any) -> None:
         rr.send_columns(self._path(path), times, columns, recording=self._stream)
 
-    def _static(self, path: str, what: Any) -> None:
-        self._stream.log(self._path(path), what, static=True)
+    def _static(self, path: str, archetype: Any) -> None:
+        self._stream.log(self._path(path), archetype, static=True)
 
     def _path(self, path: str) -> str:
         return f"{self._root}/{path}" if self._root else path
@@ -383,14 +386,14 @@ def _about_z(angle: float) -> Any:
     return rr.Quaternion(xyzw=[0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))])
 
 
-def _stops(flags: NDArray[np.uint16]) -> NDArray[np.object_]:
+def _limits(flags: NDArray[np.uint16]) -> NDArray[np.object_]:
     unique, inverse = np.unique(flags, return_inverse=True)
-    return np.array([_stop_names(int(value)) for value in unique], dtype=object)[inverse]
+    return np.array([_limit_names(int(value)) for value in unique], dtype=object)[inverse]
 
 
-def _stop_names(flags: int) -> str:
+def _limit_names(flags: int) -> str:
     found = [f"{symbol} lower" for joint, symbol in enumerate(JOINT_SYMBOLS) if flags >> joint & 1]
     found += [f"{symbol} upper" for joint, symbol in enumerate(JOINT_SYMBOLS) if flags >> (joint + 4) & 1]
     if flags >> 8 & 1:
-        found.append("tool on something")
+        found.append("tool contact")
     return ", ".join(found)

@@ -1,4 +1,4 @@
-"""Rerun recordings as places to write to: a file, or a viewer."""
+"""Rerun sinks: recording streams into a file or a viewer."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ APPLICATION = "hilrig"
 
 
 def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """A recording that is written to a file.
+    """Open a recording stream into a file.
 
     Raises:
-        InputError: its folder is not there, or the path names a recording.
+        InputError: the folder does not exist, or the path is a recording.
         OperationError: the file can't be written.
     """
     if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}")
+        raise InputError(f"{path}: folder {path.parent} does not exist")
     refuse_recording(path)
     try:
-        # Asked of the system first: its answer is one clear word.
+        # Opened here first, because the operating system's error is clearer than rerun's.
         path.open("wb").close()
     except OSError as error:
         raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
@@ -34,7 +34,7 @@ def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStre
 
 
 def to_viewer(grpc_port: int, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """A recording that is sent to a viewer on this machine."""
+    """Open a recording stream to a viewer on this host."""
     stream = rr.RecordingStream(APPLICATION, recording_id=name)
     stream.connect_grpc(f"rerun+http://{LOOPBACK}:{grpc_port}/proxy", default_blueprint=blueprint)
     stream.send_recording_name(name)

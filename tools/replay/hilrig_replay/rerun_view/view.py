@@ -1,4 +1,4 @@
-"""Runs into the rerun viewer: a file, a window, or a browser on this machine."""
+"""Writes runs as rerun recordings: into a file, or to a viewer on this host."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,48 +10,48 @@ from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
-from hilrig_replay.rerun_view.rig_view import Drawn, RigView
+from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
 from hilrig_replay.rerun_view.sinks import to_file, to_viewer
 from hilrig_runtime.errors import InputError, OperationError
 
 
-def drawn(run: Run) -> Drawn:
-    """What a recording says of its rig's looks.
+def geometry_of(run: Run) -> RigGeometry:
+    """Geometry of a recorded rig.
 
     Raises:
-        InputError: it says something that is not understood.
+        InputError: the recording's URDF or parameters are invalid.
     """
     try:
-        return Drawn.of(run.urdf, run.parameters_json, run.step_ns, recorded_task(run))
+        return RigGeometry.of(run.urdf, run.parameters_json, run.step_ns, recorded_task(run))
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
 
 
 def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
-    """Write runs as one rerun recording with its layout; several stand in one scene, side by side in the plots.
+    """Write runs as one rerun recording with its layout; several runs share one scene and the plots.
 
     Raises:
         InputError: a run can't be read.
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    _write(to_file(path, _name(chosen), _layout(chosen)), chosen, flush_blocks=True)
+    _write(to_file(path, _name(chosen), _layout(chosen)), chosen, file=path)
 
 
-def send_runs(runs: Sequence[Run], grpc_port: int, over: Callable[[], bool]) -> None:
-    """Send runs to a viewer on this machine as `save_rrd` writes them; ends early when it is `over`.
+def send_runs(runs: Sequence[Run], grpc_port: int, is_closed: Callable[[], bool]) -> None:
+    """Send runs to a viewer on this host, with the content that `save_rrd` writes; stops early when `is_closed()`.
 
     A viewer that serves a file keeps a core busy for as long as it runs (https://github.com/rerun-io/rerun/pull/10944);
-    one that is sent the same waits.
+    a viewer that receives the same data over gRPC is idle afterwards.
 
     Raises:
         InputError: a run can't be read.
     """
-    _write(to_viewer(grpc_port, _name(runs), _layout(runs)), runs, over)
+    _write(to_viewer(grpc_port, _name(runs), _layout(runs)), runs, is_closed)
 
 
 def root_names(runs: Sequence[Run]) -> list[str]:
-    """Entity path of each run: none for a single one, else its session."""
+    """Root entity path of each run: empty for a single run, otherwise its session."""
     if len(runs) == 1:
         return [""]
     names = [run.session for run in runs]
@@ -69,26 +69,26 @@ def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
 def _write(
     stream: rr.RecordingStream,
     runs: Sequence[Run],
-    over: Callable[[], bool] = lambda: False,
+    is_closed: Callable[[], bool] = lambda: False,
     *,
-    flush_blocks: bool = False,
+    file: Path | None = None,
 ) -> None:
-    """Write runs block by block.
+    """Write runs block by block to a viewer, or to a file.
 
-    rerun encodes and writes on threads of its own, and holds the arrays of all blocks that are not written yet. With
-    `flush_blocks`, each block is written before the next one is read, so the memory does not depend on the length of
-    the run or on the scheduling of those threads. A viewer is not flushed, because it may close at any time.
+    rerun encodes and writes on its own threads and holds every block that is not written yet. A file is flushed after
+    each block, so the memory depends neither on the length of the run nor on the scheduling of these threads. A viewer
+    is not flushed, because it may close at any time.
     """
     with stream:
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
-            view = RigView(stream, drawn(run), run.timebase, run.names, root=root, color=color)
+            view = RerunRigWriter(stream, geometry_of(run), run.timebase, run.names, root=root, color=color)
             for block in run.blocks():
-                if over():
+                if is_closed():
                     return
                 view.add(block)
-                if flush_blocks:
-                    stream.flush()
+                if file is not None:
+                    _flush(stream, file)
             view.end()
     stream.disconnect()
 

@@ -1,4 +1,4 @@
-"""The rerun viewer as a process of its own: on this machine only, with a limit on its memory, and telling nobody."""
+"""Runs the rerun viewer as a child process: loopback only, with a memory limit, without usage statistics."""
 
 import os
 import socket
@@ -13,22 +13,22 @@ from typing import Final
 
 import rerun_cli
 
-from hilrig_replay.rerun_view.csp_proxy import LOOPBACK, fenced
+from hilrig_replay.rerun_view.csp_proxy import LOOPBACK, serve_with_csp
 from hilrig_runtime.errors import OperationError
 
 MEMORY_LIMIT: Final = "1GB"
-"""When the viewer holds more than this it drops what is oldest."""
+"""Memory limit of the viewer, above which it drops the oldest data."""
 START_TIMEOUT_S: Final = 30.0
 _POLL_S: Final = 0.05
 
 
 def environment() -> dict[str, str]:
-    """The environment of a viewer: its usage statistics stay off, as they are on build machines, and its log quiet."""
+    """Environment variables of the viewer: `CI` disables usage statistics, and only errors are logged."""
     return {"RUST_LOG": "error", **os.environ, "CI": "true"}
 
 
 def executable() -> Path:
-    """The viewer's own program: the Python module of that name would stand between us and it, and not pass signals on.
+    """Path of the viewer's executable; the Python wrapper of the same name would not forward signals.
 
     Raises:
         OperationError: it is not installed.
@@ -42,11 +42,11 @@ def executable() -> Path:
 
 
 def open_viewer(grpc_port: int, web_port: int | None = None) -> "subprocess.Popen[bytes]":
-    """Start the viewer, which waits for data: a window, or with `web_port` a server for a browser on this machine.
+    """Start the viewer: a window, or with `web_port` a server for a browser on this host.
 
     Args:
-        grpc_port: where it listens for data.
-        web_port: where it serves the browser.
+        grpc_port: port on which the viewer receives data.
+        web_port: port of the web page.
 
     Raises:
         OperationError: it can't be started.
@@ -64,18 +64,18 @@ def open_viewer(grpc_port: int, web_port: int | None = None) -> "subprocess.Pope
 
 @contextmanager
 def running_viewer(grpc_port: int, web_port: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
-    """`open_viewer`, ready to take data, and ended on leaving; a browser gets its page from behind a fence.
+    """Run the viewer, ready to receive data, and terminate it on exit; the web page is served through `csp_proxy`.
 
     Raises:
-        OperationError: it does not start; the display may be missing.
+        OperationError: the viewer does not start; the display may be missing.
     """
     page_port = None if web_port is None else free_port()
     process = open_viewer(grpc_port, page_port)
     try:
-        wait_until_served(process, [grpc_port, *([] if page_port is None else [page_port])])
-        with ExitStack() as fence:
+        wait_until_ready(process, [grpc_port, *([] if page_port is None else [page_port])])
+        with ExitStack() as proxy:
             if page_port is not None and web_port is not None:
-                fence.enter_context(fenced(page_port, grpc_port, web_port))
+                proxy.enter_context(serve_with_csp(page_port, grpc_port, web_port))
             yield process
     finally:
         if process.poll() is None:
@@ -87,18 +87,18 @@ def running_viewer(grpc_port: int, web_port: int | None = None) -> Iterator["sub
             process.wait()
 
 
-def wait_until_served(process: "subprocess.Popen[bytes]", ports: Sequence[int]) -> None:
-    """Wait until a viewer takes connections.
+def wait_until_ready(process: "subprocess.Popen[bytes]", ports: Sequence[int]) -> None:
+    """Wait until the viewer accepts connections on all ports.
 
     Raises:
-        OperationError: it ended, or takes too long.
+        OperationError: the viewer exited, or the timeout expired.
     """
     deadline_s = time.monotonic() + START_TIMEOUT_S
     for port in ports:
         while True:
             if process.poll() is not None:
                 raise OperationError(
-                    "the rerun viewer ended at once (it needs a display; without one use --save or --web)"
+                    "the rerun viewer exited during start-up; it needs a display (without one use --save or --web)"
                 )
             with closing(socket.socket()) as probe:
                 probe.settimeout(1.0)
@@ -106,24 +106,24 @@ def wait_until_served(process: "subprocess.Popen[bytes]", ports: Sequence[int]) 
                     break
             if time.monotonic() > deadline_s:
                 raise OperationError(
-                    f"the rerun viewer does not answer at {LOOPBACK}:{port} after {START_TIMEOUT_S:.0f} s"
+                    f"the rerun viewer does not accept connections at {LOOPBACK}:{port} within {START_TIMEOUT_S:.0f} s"
                 )
             time.sleep(_POLL_S)
 
 
 def wait_for_end(process: "subprocess.Popen[bytes]", stopping: threading.Event) -> None:
-    """Wait until the viewer is closed, or `stopping` is set."""
+    """Wait until the viewer exits or `stopping` is set."""
     while process.poll() is None and not stopping.wait(_POLL_S):
         pass
 
 
 def free_port() -> int:
-    """A TCP port that nobody uses on loopback now."""
+    """Find a free TCP port on the loopback interface."""
     with closing(socket.socket()) as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
 def browser_address(grpc_port: int, web_port: int) -> str:
-    """What to open in a browser."""
+    """URL of the web viewer, with the data source as a parameter."""
     return f"http://{LOOPBACK}:{web_port}?url=rerun%2Bhttp://{LOOPBACK}:{grpc_port}/proxy"

@@ -1,1 +1,1 @@
-"""Controllers for studies: built in, LQR and the user's own."""
+"""Controllers for studies: PID, computed torque, LQR with prediction, and user-written controllers."""

@@ -1,13 +1,13 @@
-"""A student's controller out of a Python file: a class `Controller` of his own, checked at every turn.
+"""User-written controller: loads a class `Controller` from a Python file and checks each of its results.
 
-The file needs nothing of hilrig (`examples/controllers/`):
+The file need not import hilrig (see `examples/controllers/`):
 
     class Controller:
         def __init__(self, period_s, gain): ...
         def update(self, time_s, position, goal, latency_s): return [t1, t2, t3, t4]
 
-`position` and `goal` are four floats each (rad, rad, m, rad), the return value four efforts (N·m, N·m, N, N·m). Each
-run has an object of its own, so what it remembers is its own matter.
+`position` and `goal` are four floats each (rad, rad, m, rad). The return value is four efforts (N·m, N·m, N, N·m). Each
+run has its own instance of the class.
 """
 
 import importlib.util
@@ -23,42 +23,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_runtime.errors import InputError
-from hilrig_study.controllers.controllers import Measured
+from hilrig_study.controllers.control_laws import Measurement
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_numbers = itertools.count()
+_module_numbers = itertools.count()
 
 
-class StudentController:
-    """As `controllers.Controller`: one object of the student's class a run."""
+class UserController:
+    """Controller that calls one instance of the user's class per run."""
 
     def __init__(self, path: Path, period_s: float, gain: Floats | float = 1.0) -> None:
-        """Load the file; `gain` is a number for all runs or one a run, (N,).
+        """Load the file; `gain` is one number for all runs or one per run, (N,).
 
         Raises:
-            InputError: the file can't be read or run, or has no class `Controller` with a method `update`.
+            InputError: the file can't be read or executed, or has no class `Controller` with a method `update`.
         """
         self._path, self._period_s = path, period_s
         self._gain = np.atleast_1d(np.asarray(gain, dtype=np.float64))
         self._class = _class_of(_load(path), path)
         self._objects: list[Any] = []
 
-    def begin(self, runs: int) -> None:
-        """As `Controller`.
+    def reset(self, runs: int) -> None:
+        """Implement `Controller.reset`.
 
         Raises:
-            InputError: the class can't be made.
+            InputError: the class can't be instantiated.
         """
         gains = np.broadcast_to(self._gain, runs).tolist()
         self._objects = [self._call(partial(self._class, self._period_s, gain), "__init__") for gain in gains]
 
-    def update(self, measured: Measured, due: Bools | None = None) -> Floats:
-        """As `Controller`.
+    def update(self, measured: Measurement, due: Bools | None = None) -> Floats:
+        """Implement `Controller.update`.
 
         Raises:
-            InputError: an `update` raised, or gave something else than four finite numbers.
+            InputError: `update` raised an exception, or did not return four finite numbers.
         """
         effort = np.zeros_like(measured.position)
         runs = range(len(self._objects)) if due is None else np.flatnonzero(due).tolist()
@@ -75,33 +75,33 @@ class StudentController:
         except Exception as error:
             frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(self._path)]
             line = f", line {frames[-1].lineno}" if frames else ""
-            when = "" if time_s is None else f" at {time_s:.3f} s of the run"
+            when = "" if time_s is None else f" at t = {time_s:.3f} s"
             raise InputError(
                 f"{self._path}{line}: Controller.{method} raised {type(error).__name__}: {error}{when}"
             ) from error
 
-    def _checked(self, given: Any, time_s: float) -> Floats:
+    def _checked(self, result: Any, time_s: float) -> Floats:
         try:
-            effort = np.asarray(given, dtype=np.float64)
+            effort = np.asarray(result, dtype=np.float64)
         except (TypeError, ValueError):
             effort = np.empty(0)
         if effort.shape != (4,) or not np.isfinite(effort).all():
             raise InputError(
-                f"{self._path}: Controller.update must give four finite numbers (N·m, N·m, N, N·m); "
-                f"at {time_s:.3f} s of the run it gave {given!r}"
+                f"{self._path}: Controller.update must return four finite numbers (N·m, N·m, N, N·m), "
+                f"got {result!r} at t = {time_s:.3f} s"
             )
         return effort
 
 
 def _load(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"hilrig_student_{next(_numbers)}", path)
+    spec = importlib.util.spec_from_file_location(f"hilrig_user_controller_{next(_module_numbers)}", path)
     if path.suffix != ".py" or not path.is_file() or spec is None or spec.loader is None:
-        raise InputError(f"{path}: a controller is a Python file (.py) that can be read")
+        raise InputError(f"{path}: not a readable Python file (.py)")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise InputError(f"{path}: can't be run: {type(error).__name__}: {error}") from error
+        raise InputError(f"{path}: import failed: {type(error).__name__}: {error}") from error
     return module
 
 
@@ -109,8 +109,8 @@ def _class_of(module: ModuleType, path: Path) -> Callable[[float, float], Any]:
     found = getattr(module, "Controller", None)
     if not isinstance(found, type) or not callable(getattr(found, "update", None)):
         raise InputError(
-            f"{path}: has no class Controller with a method update(time_s, position, goal, latency_s): "
-            "examples/controllers/pd.py is one to start from"
+            f"{path}: no class Controller with a method update(time_s, position, goal, latency_s); "
+            "see the example examples/controllers/pd.py"
         )
-    made: Callable[[float, float], Any] = found
-    return made
+    loaded: Callable[[float, float], Any] = found
+    return loaded

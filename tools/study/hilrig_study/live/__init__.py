@@ -1,1 +1,1 @@
-"""Studies on a running rig, and simulations of recorded conditions."""
+"""Studies on running rigs, and studies based on the latency of a recording."""

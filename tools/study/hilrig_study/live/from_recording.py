@@ -1,7 +1,8 @@
-"""The latency of a real session, put under other gains: which would have been stable, and with what to spare?
+"""Evaluation of controller gains under the loop latency of a recording: stability, delay margin and expected cost.
 
-The age of what acted at each tick of the recording is a Markov chain (`expected_cost.age_chain`). Under it the loop of
-a controller that polls once a step is a jump linear system, whose mean-square growth and expected cost are exact.
+The age of the acting command at each tick of the recording is modeled as a Markov chain (`expected_cost.age_chain`).
+Under it, the loop of a controller that polls once per step is a Markov jump linear system, for which mean-square growth
+and expected cost are exact.
 """
 
 from dataclasses import asdict, dataclass
@@ -14,54 +15,60 @@ from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import RigParameters
-from hilrig_study.controllers.controllers import LawController
+from hilrig_study.controllers.control_laws import LawController
+from hilrig_study.linear_model import linearize
 from hilrig_study.study_config import AxisConfig, ControllerConfig, StudyConfig
-from hilrig_study.theory.expected_cost import AgeChain, age_chain, expected_cost, mean_square_radius, turns
-from hilrig_study.theory.linear import linearise
-from hilrig_study.theory.margins import linearise_law
+from hilrig_study.theory.expected_cost import (
+    AgeChain,
+    age_chain,
+    expected_cost,
+    mean_square_radius,
+    transition_matrices,
+)
+from hilrig_study.theory.margins import linearize_law
 
 Ints = NDArray[np.int64]
 
 GAINS: Final = np.round(np.geomspace(0.1, 2.0, 14), 3)
-"""Gain factors that are judged where no study's file names others."""
-LONGEST: Final = 12
-"""Ages beyond this, steps, count as so many: a stall is no latency, and what is rare adds little."""
-MOST_SPARE: Final = 6
-"""Further delays up to this are tried, steps."""
-_INSIDE: Final = np.array([0.01, 0.01, 0.001, 0.01])
+"""Gain factors evaluated by default, without a study file."""
+MAX_AGE_STEPS: Final = 12
+"""Upper limit of the age, steps; larger ages are clipped, because they are rare stalls."""
+MAX_SPARE_STEPS: Final = 6
+"""Largest additional delay that is tried, steps."""
+_STOP_CLEARANCE: Final = np.array([0.01, 0.01, 0.001, 0.01])
 
 
 @dataclass(frozen=True, slots=True)
 class GainVerdict:
-    """One controller at one gain under the recorded latency."""
+    """Stability and cost of one controller at one gain under the recorded latency."""
 
     controller: str
     gain: float
     stable: bool
-    """In the mean square."""
+    """Mean-square stable."""
     mean_square_radius: float
-    """Growth of the mean square a step."""
+    """Growth of the second moment per step."""
     expected_cost: float | None
-    """Of going 3°, 3°, 5 mm, 3° in 10 s, or as the study's file says; None: it is not stable."""
+    """Expected cost of the study's task (default: a step of 3°, 3°, 5 mm, 3° in 10 s); None: unstable."""
     spare_ms: float | None
-    """Constant delay that could have been added, in whole steps; None: it is not stable."""
+    """Delay margin: largest constant additional delay, in whole steps; None: unstable."""
     spare_at_least: bool
-    """More than `spare_ms` was not tried."""
+    """Whether the loop is stable at the largest delay that was tried."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """A recording's latency and what gains it would have borne."""
+class GainReport:
+    """Loop latency of a recording and the verdicts on the gains."""
 
     session: str
     step_ms: float
     samples: int
     ages_ms: tuple[float, float, float]
-    """Loop latency of new commands: p50, p99, largest."""
+    """Loop latency of new commands: p50, p99, maximum."""
     gains: tuple[GainVerdict, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the report as JSON values."""
         p50, p99, largest = self.ages_ms
         return {
             "session": self.session,
@@ -72,17 +79,17 @@ class Judged:
 
 
 def recorded_ages(run: Run) -> list[Ints]:
-    """Age of what acts at each tick, steps, (T,), from the first command on, of each start of the simulation.
+    """Return the ages of the acting command, steps, (T,), from the first command on, per incarnation of the simulation.
 
     Raises:
-        InputError: no command took effect, or states are missing in between, whose ages nobody knows.
+        InputError: no command took effect, or states are missing.
     """
     sequences = []
     states = run.states
     for incarnation in np.unique(states["incarnation"]):
-        mine: Rows = states[states["incarnation"] == incarnation]
-        steps = mine["step"].astype(np.int64)
-        new = np.flatnonzero(mine["basis_step"])
+        rows: Rows = states[states["incarnation"] == incarnation]
+        steps = rows["step"].astype(np.int64)
+        new = np.flatnonzero(rows["basis_step"])
         if not len(new):
             continue
         gaps = np.flatnonzero(np.diff(steps[new[0] :]) != 1)
@@ -90,30 +97,32 @@ def recorded_ages(run: Run) -> list[Ints]:
             at = int(steps[new[0] + gaps[0]])
             missing = int(steps[new[0] + gaps[0] + 1]) - at - 1
             raise InputError(
-                f"{run.path}: a trace with gaps: {missing} states are missing after step {at}, so the age of what "
-                f"acted is not known there ({len(gaps)} gaps in all); take a recording without losses"
+                f"{run.path}: {missing} states are missing after step {at} ({len(gaps)} gaps in total), so the age "
+                "of the acting command is unknown there; use a recording without losses"
             )
-        last = np.maximum.accumulate(np.where(mine["basis_step"] != 0, np.arange(len(mine)), -1))[new[0] :]
-        ages = steps[new[0] :] - mine["basis_step"][last].astype(np.int64)
-        sequences.append(np.clip(ages[: new[-1] - new[0] + 1], 1, LONGEST))
+        last = np.maximum.accumulate(np.where(rows["basis_step"] != 0, np.arange(len(rows)), -1))[new[0] :]
+        ages = steps[new[0] :] - rows["basis_step"][last].astype(np.int64)
+        sequences.append(np.clip(ages[: new[-1] - new[0] + 1], 1, MAX_AGE_STEPS))
     if not sequences:
-        raise InputError(f"{run.path}: no controller's command took effect in this session, so it has no loop latency")
+        raise InputError(f"{run.path}: no loop latency: no command of a controller took effect in this session")
     return sequences
 
 
-def judge_gains(run: Run, study: StudyConfig | None = None) -> Judged:
-    """Judge gains under a recording's latency: those of a study's file, or a PD's from 0.1 to 2.
+def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
+    """Evaluate gains under the latency of a recording: those of a study file, or a PD with factors from 0.1 to 2.
 
     Raises:
-        InputError: as `recorded_ages`; or the recording does not say what its rig is.
+        InputError: as `recorded_ages`; or the recording has no parameters of its rig.
     """
     sequences = recorded_ages(run)
     chain = age_chain(sequences)
     rig = RigParameters.from_json(run.parameters_json)
-    pose = np.clip(np.median(run.states["position"], axis=0), rig.arm.lower + _INSIDE, rig.arm.upper - _INSIDE)
+    pose = np.clip(
+        np.median(run.states["position"], axis=0), rig.arm.lower + _STOP_CLEARANCE, rig.arm.upper - _STOP_CLEARANCE
+    )
     step_s = run.step_ns * 1e-9
-    near = linearise(rig.arm, pose.tolist())
-    phi, gamma = near.discretise(step_s, rig.sim.integrator, rig.sim.substeps)
+    plant_model = linearize(rig.arm, pose.tolist())
+    phi, gamma = plant_model.discretize(step_s, rig.sim.integrator, rig.sim.substeps)
     latency = run.states["loop_latency_ns"][run.states["basis_step"] != 0] / 1e6
     p50, p99 = np.percentile(latency, (50, 99))
     plane = study or StudyConfig(x=AxisConfig(what="delay_ms", values=(0.0,)), y=AxisConfig(what="gain", values=(1.0,)))
@@ -122,19 +131,19 @@ def judge_gains(run: Run, study: StudyConfig | None = None) -> Judged:
     for config in plane.controllers:
         for gain in _gains(study).tolist():
             controller = _law(config, rig, near_period=step_s, gain=gain, pose=pose.tolist())
-            law = linearise_law(controller, near, step_s, float(p50) / 1e3)
+            law = linearize_law(controller, plant_model, step_s, float(p50) / 1e3)
 
-            def radius(more: int, law: Any = law) -> float:
-                shifted = AgeChain(np.where(chain.ages > 0, chain.ages + more, 0), chain.transition, chain.start)
-                return mean_square_radius(shifted, turns(phi, gamma, law, shifted.most))
+            def radius(added: int, law: Any = law) -> float:
+                shifted = AgeChain(np.where(chain.ages > 0, chain.ages + added, 0), chain.transition, chain.start)
+                return mean_square_radius(shifted, transition_matrices(phi, gamma, law, shifted.max_age))
 
-            now = radius(0)
-            stable = now < 1.0
-            cost = expected_cost(near, phi, gamma, controller, law, chain, offset, ticks) if stable else None
-            spare = _largest(lambda more, of=radius: of(more) < 1.0) if stable else None
+            growth = radius(0)
+            stable = growth < 1.0
+            cost = expected_cost(plant_model, phi, gamma, controller, law, chain, offset, ticks) if stable else None
+            spare = _largest(lambda added, growth_of=radius: growth_of(added) < 1.0) if stable else None
             spare_ms = None if spare is None else spare * run.step_ns / 1e6
-            verdicts.append(GainVerdict(config.name, gain, stable, now, cost, spare_ms, spare == MOST_SPARE))
-    return Judged(
+            verdicts.append(GainVerdict(config.name, gain, stable, growth, cost, spare_ms, spare == MAX_SPARE_STEPS))
+    return GainReport(
         run.session, run.step_ns / 1e6, len(latency), (float(p50), float(p99), float(latency.max())), tuple(verdicts)
     )
 
@@ -151,16 +160,16 @@ def _law(
 ) -> LawController:
     if config.kind == "file":
         raise InputError(
-            f"controller {config.name!r} is a file: theory needs a law; take pd, pid, computed_torque, lqr"
+            f"controller {config.name!r}: kind 'file' can't be linearized; use pd, pid, computed_torque or lqr"
         )
-    built = config.build(rig, linearise(rig.arm, pose), near_period, np.array([gain]))
+    built = config.build(rig, linearize(rig.arm, pose), near_period, np.array([gain]))
     assert isinstance(built, LawController)
     return built
 
 
 def _largest(holds: Any) -> int:
-    """Largest number up to `MOST_SPARE` for which it holds, given that it does for 0."""
-    low, high = 0, MOST_SPARE + 1
+    """Return the largest number up to `MAX_SPARE_STEPS` for which `holds` is true, given that it is true for 0."""
+    low, high = 0, MAX_SPARE_STEPS + 1
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if holds(middle) else (low, middle)

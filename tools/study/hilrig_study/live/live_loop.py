@@ -1,7 +1,8 @@
-"""A study's controller on a real rig, over Modbus TCP: the same object that runs in virtual time, one run of it.
+"""Live control loop: runs a controller of a study on a real rig over Modbus TCP.
 
-The controller polls at absolute times, so that its phase to the simulation's ticks is the study's. Where the ticks are
-is heard from a rig of the same simulation that nothing is injected into: rigs of one simulation tick together.
+The controller polls at absolute times, so that its phase relative to the ticks of the simulation is the phase in the
+study. The tick times are measured on a rig of the same simulation without impairment, because all rigs of a simulation
+share their ticks.
 """
 
 import time
@@ -16,84 +17,91 @@ from pymodbus.pdu import ModbusPDU
 from hilrig_modbus_edge.registers import codec
 from hilrig_modbus_edge.registers import map as registers
 from hilrig_runtime.errors import OperationError
-from hilrig_study.controllers.controllers import Controller, Measured
+from hilrig_study.controllers.control_laws import Controller, Measurement
 from hilrig_study.simulation.simulated_loop import Scenario
 
-LISTEN_S: Final = 0.5
-"""How long the ticks are listened to."""
+TICK_OBSERVATION_S: Final = 0.5
+"""Duration of the tick phase measurement, s."""
+MIN_TICKS: Final = 3
+"""Fewest observed ticks of a valid measurement."""
 _STEP_ADDRESS: Final = 2
 _LATENCY_ADDRESS: Final = 4
-_SPIN_NS: Final = 300_000
+_BUSY_WAIT_NS: Final = 300_000
 
 
 class RigClient:
-    """A connection to one rig."""
+    """Modbus TCP connection to one rig."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Connect.
+        """Connect to the rig.
 
         Raises:
-            OperationError: no rig answers there.
+            OperationError: no rig accepts the connection.
         """
-        self._where = f"{host}:{port}"
-        # pymodbus leaves some of its methods without types.
+        self._address = f"{host}:{port}"
+        # Some methods of pymodbus have no type annotations.
         self._client = cast(Any, ModbusTcpClient(host, port=port, timeout=3))
         if not self._client.connect():
-            raise OperationError(f"no rig answers at {self._where}")
+            raise OperationError(f"no rig answers at {self._address}")
 
     def step(self) -> int:
-        """Step counter of the newest state, low 32 bits."""
-        high, low = self._read(lambda: self._client.read_input_registers(_STEP_ADDRESS, count=2))
+        """Read the step counter of the newest state, low 32 bits."""
+        high, low = self._request(lambda: self._client.read_input_registers(_STEP_ADDRESS, count=2))
         return high << 16 | low
 
     def latency_s(self) -> float:
-        """Last loop latency that the rig saw, s."""
-        high, low = self._read(lambda: self._client.read_input_registers(_LATENCY_ADDRESS, count=2))
+        """Read the latest loop latency of the rig, s."""
+        high, low = self._request(lambda: self._client.read_input_registers(_LATENCY_ADDRESS, count=2))
         return (high << 16 | low) * 1e-6
 
     def position(self) -> tuple[float, float, float, float]:
-        """Joint positions as registers 5-8 say them; rad, rad, m, rad."""
-        words = self._read(lambda: self._client.read_holding_registers(registers.POSITION, count=4))
-        return codec.position_of(b"".join(word.to_bytes(2, "big") for word in words))
+        """Read the joint positions, registers 5-8; rad, rad, m, rad."""
+        values = self._request(lambda: self._client.read_holding_registers(registers.POSITION, count=4))
+        return codec.position_of(b"".join(value.to_bytes(2, "big") for value in values))
 
     def write(self, effort: list[float]) -> None:
-        """Write registers 1-4; N·m, N·m, N, N·m."""
+        """Write the efforts, registers 1-4; N·m, N·m, N, N·m."""
         data, _ = codec.words_of_effort(effort)
-        words = [int.from_bytes(data[at : at + 2], "big") for at in range(0, 8, 2)]
-        self._read(lambda: self._client.write_registers(registers.TORQUE, words))
+        values = [int.from_bytes(data[at : at + 2], "big") for at in range(0, 8, 2)]
+        self._request(lambda: self._client.write_registers(registers.TORQUE, values))
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._client.close()
 
-    def _read(self, request: Callable[[], ModbusPDU]) -> list[int]:
+    def _request(self, send: Callable[[], ModbusPDU]) -> list[int]:
         try:
-            answer = request()
+            answer = send()
         except ModbusException as error:
-            raise OperationError(f"the rig at {self._where} does not answer any more: {error}") from error
+            raise OperationError(f"the rig at {self._address} stopped responding: {error}") from error
         if answer.isError():
-            raise OperationError(f"the rig at {self._where} refused a request: {answer}")
+            raise OperationError(f"the rig at {self._address} rejected a request: {answer}")
         return list(answer.registers)
 
 
-def listen_for_ticks(clock_rig: RigClient, step_ns: int) -> int:
-    """A time of the monotonic clock, ns, at which a state of the simulation got to the edge, as early as was seen.
+def measure_tick_phase(clock_rig: RigClient, step_ns: int) -> int:
+    """Measure a time, ns, monotonic clock, at which a state of the simulation arrived at the edge.
+
+    The estimate is the earliest observed phase, since an observation can only be late.
 
     Raises:
-        OperationError: the step counter stood still.
+        OperationError: the step counter does not change.
     """
-    begin_ns = time.monotonic_ns()
+    start_ns = time.monotonic_ns()
     before, phases = clock_rig.step(), []
-    while time.monotonic_ns() - begin_ns < LISTEN_S * 1e9:
+    while time.monotonic_ns() - start_ns < TICK_OBSERVATION_S * 1e9:
         step = clock_rig.step()
         if step != before:
-            # Not when it was asked: a request that is held up would show a change before it was.
+            # The time after the reply: with the time of the request, a delayed request would show a change too early.
             phases.append(time.monotonic_ns())
             before = step
         time.sleep(2e-4)
-    if len(phases) < 3:
-        raise OperationError("the simulation does not step: its counter stood still")
-    # A change is seen late by a request and the time between two, or more, never early: the earliest is the nearest.
+    if len(phases) < MIN_TICKS:
+        raise OperationError(
+            "the simulation does not step: its step counter changed less than "
+            f"{MIN_TICKS} times in {TICK_OBSERVATION_S:g} s"
+        )
+    # A change is observed late, by the duration and the spacing of the requests, and never early: use the earliest.
     later = (np.array(phases) - phases[0] + step_ns // 2) % step_ns - step_ns // 2
     return int(phases[0] + later.min())
 
@@ -106,28 +114,28 @@ def drive(
     period_ns: int,
     duration_s: float,
 ) -> None:
-    """Run a controller of one run on a rig for `duration_s`, reading first at `first_read_ns`, monotonic clock.
+    """Run a controller on a rig for `duration_s`; the first read is at `first_read_ns`, monotonic clock.
 
     Raises:
-        InputError: the controller raised or gave no numbers.
+        InputError: the controller raised an exception or returned invalid efforts.
         OperationError: the rig stopped answering.
     """
-    controller.begin(1)
+    controller.reset(1)
     latency_s, due_ns = 0.0, first_read_ns
     while due_ns - first_read_ns < duration_s * 1e9:
         _wait_until(due_ns)
         position = np.array(rig.position())[:, np.newaxis]
         now = np.array([(due_ns - first_read_ns) * 1e-9])
-        effort = controller.update(Measured(now, position, scenario.goal(now), np.array([latency_s])), None)
+        effort = controller.update(Measurement(now, position, scenario.goal(now), np.array([latency_s])), None)
         rig.write(effort[:, 0].tolist())
-        # Asked for after the write, so that it delays nothing.
+        # Read after the write, so that the read does not delay the command.
         latency_s = rig.latency_s()
         due_ns += period_ns
 
 
 def _wait_until(due_ns: int) -> None:
     remaining_ns = due_ns - time.monotonic_ns()
-    if remaining_ns > _SPIN_NS:
-        time.sleep((remaining_ns - _SPIN_NS) * 1e-9)
+    if remaining_ns > _BUSY_WAIT_NS:
+        time.sleep((remaining_ns - _BUSY_WAIT_NS) * 1e-9)
     while time.monotonic_ns() < due_ns:
         pass

@@ -1,9 +1,8 @@
-"""A live point beside its twin in virtual time: what was recorded, what the same loop does without a clock, and how far
-they are apart.
+"""Comparison of a live point with its twins: simulations of the same loop under the measured conditions.
 
-The twin has the loop's own times as the recording tells them (phase, the controller's time, transport; medians) and
-draws its delays anew from what was injected, several times over. Joints 1 and 2 are compared: the quill drops while a
-rig waits for its controller, and they do not feel it.
+A twin uses the medians of phase, controller time and transport in the recording, and draws new delays from the injected
+impairment. Several twins are run. Only joints 1 and 2 are compared, because the quill (joint 3) drops while a rig waits
+for its controller; this does not affect joints 1 and 2.
 """
 
 from dataclasses import asdict, dataclass
@@ -21,62 +20,68 @@ from hilrig_study.sweep import CELL, run_cells, timelines
 
 Floats = NDArray[np.float64]
 
-TWINS: Final = 20
-"""Virtual runs of a live one: their spread tells what is chance."""
+TWIN_RUNS: Final = 20
+"""Simulated runs per live run; their spread is the random variation."""
 LOOP_TOLERANCE_STEPS: Final = 0.5
-"""Means of the loop latency may differ by this, and by three standard errors of what is drawn."""
+"""Tolerance of the mean loop latency, steps; three standard errors of the drawn delays are added."""
 ERROR_TOLERANCE: Final = 0.15
-"""Tracking errors may differ by this share, by 0.05°, and by three standard deviations of the twins."""
+"""Relative tolerance of the tracking error; 0.05° and three standard deviations of the twins are added."""
 ERROR_FLOOR_DEG: Final = 0.05
+"""Absolute tolerance of the tracking error, degrees."""
+MIN_COMMANDS: Final = 10
+"""Fewest effective commands of a recording that can be compared."""
 
 
 @dataclass(frozen=True, slots=True)
-class Observed:
-    """What a run did, live or virtual."""
+class RunMetrics:
+    """Loop latency and tracking error of a run, live or simulated."""
 
     loop_p50_ms: float
     loop_p95_ms: float
     loop_mean_ms: float
     error_rms_deg: float
-    """Of joints 1 and 2 together, over the run."""
+    """Tracking error of joints 1 and 2, root mean square over the run."""
     settled: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """A live point beside its twins."""
+class TwinComparison:
+    """Result of the comparison of a live point with its twins."""
 
-    live: Observed
-    virtual: Observed
-    """Means over the twins; settled: most of them."""
+    live: RunMetrics
+    virtual: RunMetrics
+    """Means over the twins; `settled`: whether most of them settled."""
     phase_ms: float
-    """Of the controller's reads behind the ticks, as recorded."""
+    """Phase of the controller's reads relative to the ticks, from the recording."""
     compute_ms: float
-    """From read to write, as recorded."""
+    """Time from read to write, from the recording."""
     latency_ks: float
-    """Largest distance between the two distributions of the loop latency, 0 to 1."""
+    """Kolmogorov-Smirnov distance between the two distributions of the loop latency, 0 to 1."""
     as_predicted: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the comparison as JSON values."""
         return asdict(self)
 
 
-def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, folder: Path) -> Comparison:
-    """Measure a recording of a live point, and run its twins.
+def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, folder: Path) -> TwinComparison:
+    """Evaluate the recording of a live point and compare it with simulated twins.
 
     Args:
-        study: of which it is a point.
+        study: the study of the point.
         cell: the point, (1,), fields as `CELL`.
         run: its recording.
-        folder: of the study's file.
+        folder: folder of the study file.
 
     Raises:
-        InputError: the recording has no commands of a controller.
+        InputError: the recording has too few commands of a controller.
     """
     report = measure(run)
-    if len(report.table) < 10:
-        raise InputError(f"{run.path}: only {len(report.table)} commands took effect: there is no loop to compare")
+    if len(report.table) < MIN_COMMANDS:
+        raise InputError(
+            f"{run.path}: too few effective commands to compare: at least {MIN_COMMANDS} needed, "
+            f"got {len(report.table)}"
+        )
     commands, states = run.commands, run.states
     answered = commands[commands["state_served_ns"] > 0]
     step_ns, own = run.step_ns, study.loop
@@ -93,9 +98,9 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     times = np.arange(len(window)) * step_ns * 1e-9
     size = np.maximum(np.abs(scenario.offset[:2]), np.abs(scenario.amplitude[:2]))
     at_rest = 0.5 * np.maximum(size, np.radians(0.1))
-    (error,), (came_to_rest,) = _judged((window - scenario.goal(times).T[:, :2])[:, :, np.newaxis], at_rest)
+    (error,), (live_settled,) = _tracking_error((window - scenario.goal(times).T[:, :2])[:, :, np.newaxis], at_rest)
     live_samples = report.table["loop"] / 1e6
-    live = Observed(*_latency(live_samples), error_rms_deg=float(error), settled=bool(came_to_rest))
+    live = RunMetrics(*_latency(live_samples), error_rms_deg=float(error), settled=bool(live_settled))
 
     loop = own.model_copy(
         update={
@@ -105,26 +110,28 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
             "duration_s": study.live_duration_s,
         }
     )
-    # No limit: a live run goes on when its error is large.
+    # No failure limit: a live run is not stopped when its error is large.
     task = study.task.model_copy(update={"limit": (1e6, 1e6, 1e9, 1e6)})
     twin_study = study.model_copy(update={"loop": loop, "task": task})
-    cells = np.zeros(TWINS, CELL)
+    cells = np.zeros(TWIN_RUNS, CELL)
     cells[:] = cell[0]
-    cells["run"] = np.arange(TWINS)
+    cells["run"] = np.arange(TWIN_RUNS)
     _, outcome = run_cells(twin_study, cells, folder, keep=True)
     twin_error = outcome.positions[:, :2] - scenario.goal(np.arange(ticks) * step_ns * 1e-9).T[:, :2, np.newaxis]
-    errors, settled = _judged(twin_error, at_rest)
+    errors, settled = _tracking_error(twin_error, at_rest)
     timing = loop.timing(float(cell["step_ms"][0]), float(cell["poll_ms"][0]))
     samples = [line.samples_ns / 1e6 for line in timelines(twin_study, cells, timing, ticks)]
-    every = np.concatenate(samples)
-    virtual = Observed(*_latency(every), error_rms_deg=float(errors.mean()), settled=bool(settled.mean() > 0.5))
-    slack_ms = LOOP_TOLERANCE_STEPS * step_ns / 1e6 + 3 * float(every.std()) / np.sqrt(len(live_samples))
-    slack_deg = ERROR_TOLERANCE * virtual.error_rms_deg + ERROR_FLOOR_DEG + 3 * float(errors.std())
-    agree = abs(live.loop_mean_ms - virtual.loop_mean_ms) <= slack_ms
-    agree &= abs(live.error_rms_deg - virtual.error_rms_deg) <= slack_deg
+    all_samples = np.concatenate(samples)
+    virtual = RunMetrics(*_latency(all_samples), error_rms_deg=float(errors.mean()), settled=bool(settled.mean() > 0.5))
+    tolerance_ms = LOOP_TOLERANCE_STEPS * step_ns / 1e6 + 3 * float(all_samples.std()) / np.sqrt(len(live_samples))
+    tolerance_deg = ERROR_TOLERANCE * virtual.error_rms_deg + ERROR_FLOOR_DEG + 3 * float(errors.std())
+    agree = abs(live.loop_mean_ms - virtual.loop_mean_ms) <= tolerance_ms
+    agree &= abs(live.error_rms_deg - virtual.error_rms_deg) <= tolerance_deg
     if settled.all() or not settled.any():
         agree &= live.settled == virtual.settled
-    return Comparison(live, virtual, phase_ms, compute_ms, _ks(live_samples, every, step_ns / 1e6), bool(agree))
+    return TwinComparison(
+        live, virtual, phase_ms, compute_ms, _ks(live_samples, all_samples, step_ns / 1e6), bool(agree)
+    )
 
 
 def _latency(samples_ms: Floats) -> tuple[float, float, float]:
@@ -132,25 +139,27 @@ def _latency(samples_ms: Floats) -> tuple[float, float, float]:
     return float(p50), float(p95), float(samples_ms.mean())
 
 
-def _judged(errors: Floats, at_rest: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Of runs' errors, rad, (T, 2, N): root mean square, degrees, and whether the last fifth is within `at_rest`, rad,
-    (2,)."""
+def _tracking_error(errors: Floats, at_rest: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the root mean square, degrees, (N,), of errors, rad, (T, 2, N), and which runs settled, (N,).
+
+    A run is settled if the root mean square of the last fifth is at most `at_rest`, rad, (2,).
+    """
     tail = errors[-max(1, len(errors) // 5) :]
     settled = (np.sqrt((tail**2).mean(axis=0)) <= at_rest[:, np.newaxis]).all(axis=0)
     return np.degrees(np.sqrt((errors**2).mean(axis=(0, 1)))), settled
 
 
 def _circular_median(values: NDArray[np.int64], period: int) -> float:
-    """Median of times on a circle: around the mean direction."""
+    """Return the median of periodic times, taken around their circular mean."""
     angle = 2 * np.pi * values / period
-    centre = np.angle(np.exp(1j * angle).mean()) / (2 * np.pi) * period
-    away = (values - centre + period / 2) % period - period / 2
-    return float((centre + np.median(away)) % period)
+    center = np.angle(np.exp(1j * angle).mean()) / (2 * np.pi) * period
+    away = (values - center + period / 2) % period - period / 2
+    return float((center + np.median(away)) % period)
 
 
 def _ks(live_ms: Floats, virtual_ms: Floats, step_ms: float) -> float:
-    """Distance of the distributions, compared between multiples of the step, where neither has mass."""
-    most = max(float(live_ms.max()), float(virtual_ms.max()))
-    at = (np.arange(int(most / step_ms) + 2) + 0.5) * step_ms
+    """Return the Kolmogorov-Smirnov distance, evaluated halfway between multiples of the step."""
+    largest_ms = max(float(live_ms.max()), float(virtual_ms.max()))
+    at = (np.arange(int(largest_ms / step_ms) + 2) + 0.5) * step_ms
     shares = [np.searchsorted(np.sort(samples), at, side="right") / len(samples) for samples in (live_ms, virtual_ms)]
     return float(np.abs(shares[0] - shares[1]).max())

@@ -1,1 +1,1 @@
-"""The control loop simulated in virtual time."""
+"""Simulation of the sampled control loop, faster than real time."""

@@ -1,4 +1,4 @@
-"""What a study steps: the arm itself, or the linear system near a pose, N runs at once behind one interface."""
+"""Plant models of a study for N parallel runs: the nonlinear arm, or its linear model near a pose."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -8,31 +8,30 @@ from numpy.typing import NDArray
 
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.plant.plant import Plant
-from hilrig_study.controllers.lqr import product
-from hilrig_study.theory.linear import LinearPlant
+from hilrig_study.linear_model import LinearPlant, fixed_order_product
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
 class StudyPlant(Protocol):
-    """N arms that step together."""
+    """Interface of a plant model: N arms that step together."""
 
     position: Floats
     """rad, rad, m, rad, (4, N)."""
 
     def step(self, effort: Floats) -> None:
-        """Move on by a step of the loop under efforts, (4, N)."""
+        """Advance by one step of the loop with these efforts, (4, N)."""
 
     def park(self, runs: Bools) -> None:
-        """Put these runs, (N,), to rest at the pose: they are over, and must not disturb the others' arithmetic."""
+        """Reset these runs, (N,), to rest at the pose, so that a finished run can't overflow."""
 
 
 class ArmPlant:
-    """The arm of the simulation itself, with its stops; without parts, which nothing picks here."""
+    """Nonlinear arm of the simulation with hard stops, without parts."""
 
     def __init__(self, rig: RigParameters, start: Sequence[float], pose: Sequence[float], runs: int) -> None:
-        """`runs` arms of a rig at rest at `start`; `pose` is where runs that are over are parked."""
+        """Create `runs` arms of a rig at rest at `start`; finished runs are reset to `pose`."""
         self._plant = Plant([rig] * runs)
         for run in range(runs):
             self._plant.place(run, tuple(start), (0.0, 0.0, 0.0, 0.0))
@@ -41,20 +40,20 @@ class ArmPlant:
         self.position = self._plant.position
 
     def step(self, effort: Floats) -> None:
-        """As `StudyPlant`."""
+        """Implement `StudyPlant.step`."""
         self._plant.step(effort, self._magnet)
 
     def park(self, runs: Bools) -> None:
-        """As `StudyPlant`."""
+        """Implement `StudyPlant.park`."""
         np.copyto(self._plant.position, self._pose, where=runs)
         np.copyto(self._plant.velocity, 0.0, where=runs)
 
 
 class LinearArms:
-    """The linear system near a pose: no stops, nothing quadratic."""
+    """Linear model of the arm near a pose, without hard stops and velocity-quadratic terms."""
 
     def __init__(self, plant: LinearPlant, phi: Floats, gamma: Floats, start: Sequence[float], runs: int) -> None:
-        """`runs` systems x(k+1) = Φ x(k) + Γ u(k) at rest at `start`, (4,)."""
+        """Create `runs` systems x(k+1) = Φ x(k) + Γ u(k) at rest at `start`, (4,)."""
         self._phi, self._gamma = phi, gamma
         self._pose = np.array(plant.pose)[:, np.newaxis]
         self._holding = np.array(plant.holding)[:, np.newaxis]
@@ -63,11 +62,13 @@ class LinearArms:
         self.position = self._state[:4] + self._pose
 
     def step(self, effort: Floats) -> None:
-        """As `StudyPlant`."""
-        self._state = product(self._phi, self._state) + product(self._gamma, effort - self._holding)
+        """Implement `StudyPlant.step`."""
+        self._state = fixed_order_product(self._phi, self._state) + fixed_order_product(
+            self._gamma, effort - self._holding
+        )
         np.add(self._state[:4], self._pose, out=self.position)
 
     def park(self, runs: Bools) -> None:
-        """As `StudyPlant`."""
+        """Implement `StudyPlant.park`."""
         np.copyto(self._state, 0.0, where=runs)
         np.copyto(self.position, self._pose, where=runs)

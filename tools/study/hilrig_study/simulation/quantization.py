@@ -1,4 +1,4 @@
-"""What the paper's int16 registers make of positions and efforts, for many runs at once: `codec`, vectorised."""
+"""Quantization of positions and efforts by the int16 registers: vectorized form of the register codec."""
 
 from typing import Final
 
@@ -13,11 +13,11 @@ _COUNTS: Final = np.array(COUNTS_PER_UNIT)[:, np.newaxis]
 
 
 def position(values: Floats) -> Floats:
-    """Joint positions (rad, rad, m, rad), (4, N), as a controller reads them out of registers 5-8."""
+    """Quantize joint positions (rad, rad, m, rad), (4, N), as a controller reads them from registers 5-8."""
     return np.asarray(np.clip(np.rint(values * _COUNTS), -FULL_SCALE, FULL_SCALE) / _COUNTS)
 
 
 def effort(values: Floats) -> Floats:
-    """Efforts (N·m, N·m, N, N·m), (4, N), as the simulation gets them out of registers 1-4; no number becomes 0."""
+    """Quantize efforts (N·m, N·m, N, N·m), (4, N), as the simulation gets them from registers 1-4; NaN becomes 0."""
     counts = np.clip(np.rint(values * 1000), -FULL_SCALE, FULL_SCALE)
     return np.asarray(np.where(np.isnan(counts), 0.0, counts) / 1000)

@@ -1,9 +1,9 @@
-"""When things happen in the loop: which state each poll is served, and from which tick each command acts.
+"""Timing of the simulated loop: the state served to each poll, and the tick from which each command acts.
 
-The times do not depend on what the arm does, so a run's whole timeline is made before its first step: as arrays, from
-the controller's period and phase, the ways' transport and the injected delays. The rules are those of docs/timing.md. A
-state leaves at its tick; a read is served the newest state that has been released; a write acts from the first tick at
-or after its command's arrival; what arrives late behind a newer one acts no more.
+The timing does not depend on the motion of the arm, so the timeline of a run is computed before its first step, as
+arrays, from period and phase of the controller, transport times and injected delays. The rules are those of
+docs/timing.md: a state is published at its tick; a read is served the newest state released by then; a command acts
+from the first tick at or after its arrival; a command that arrives after a newer one is discarded.
 """
 
 import math
@@ -19,87 +19,87 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 NEVER: Final = np.iinfo(np.int64).max
-"""Arrival of what is lost, ns."""
+"""Arrival time of a lost message, ns."""
 NO_POLL: Final = -1
-"""`in_force` before the first command acts."""
+"""Value of `in_force` before the first command acts."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopTiming:
-    """The loop's own times, without what is injected; ns."""
+    """Timing of the loop without injected delays; ns."""
 
     step_ns: int = 20_000_000
-    """Of the simulation."""
+    """Step of the simulation."""
     period_ns: int = 20_000_000
-    """Between two polls of the controller."""
+    """Poll period of the controller."""
     phase_ns: int = 5_000_000
-    """From tick 0 to the first read."""
+    """Time from tick 0 to the first read."""
     compute_ns: int = 1_000_000
-    """From a read to its write, at the edge: the controller's own time and its network, both ways."""
+    """Time from a read to its write at the edge: computation and network round trip of the controller."""
     transport_ns: int = 400_000
-    """Over the bus, each way."""
+    """Transport time over the bus, per direction."""
 
     def __post_init__(self) -> None:
         for name in ("step_ns", "period_ns"):
             if getattr(self, name) <= 0:
-                raise InputError(f"{name} must be positive, found {getattr(self, name)}")
+                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("phase_ns", "compute_ns", "transport_ns"):
             if getattr(self, name) < 0:
-                raise InputError(f"{name} must not be negative, found {getattr(self, name)}")
+                raise InputError(f"{name} must be ≥ 0, got {getattr(self, name)}")
         if self.compute_ns >= self.period_ns:
             raise InputError(
-                f"the controller takes {self.compute_ns / 1e6:g} ms from reading to writing and polls every "
-                f"{self.period_ns / 1e6:g} ms: its period must be longer"
+                f"the poll period must be longer than the time from read to write, {self.compute_ns / 1e6:g} ms, "
+                f"got {self.period_ns / 1e6:g} ms"
             )
 
     def basis(self, poll: int, state_delay_ns: int = 0) -> int:
-        """Step of the state that a poll is served under a constant delay of the state's way, ns."""
+        """Return the step of the state served to a poll under a constant delay of the state link, ns."""
         read_ns = self.phase_ns + poll * self.period_ns
         return (read_ns - self.transport_ns - state_delay_ns) // self.step_ns
 
     def acts(self, poll: int, command_delay_ns: int = 0) -> int:
-        """Tick from which a poll's command acts under a constant delay of the command's way, ns."""
-        arrived_ns = self.phase_ns + poll * self.period_ns + self.compute_ns + self.transport_ns + command_delay_ns
-        return -(-arrived_ns // self.step_ns)
+        """Return the tick from which the command of a poll acts under a constant delay of the command link, ns."""
+        arrival_ns = self.phase_ns + poll * self.period_ns + self.compute_ns + self.transport_ns + command_delay_ns
+        return -(-arrival_ns // self.step_ns)
 
     def latency_steps(self, state_delay_ns: int = 0, command_delay_ns: int = 0) -> tuple[int, int]:
-        """Smallest and largest loop latency under constant delays, steps, over the pattern's period."""
+        """Return the smallest and largest loop latency over a period of the poll pattern, in steps."""
         polls = range(math.lcm(self.step_ns, self.period_ns) // self.period_ns)
-        steps = [self.acts(p, command_delay_ns) - self.basis(p, state_delay_ns) for p in polls]
+        steps = [self.acts(poll, command_delay_ns) - self.basis(poll, state_delay_ns) for poll in polls]
         return min(steps), max(steps)
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """One run's times, over T ticks and P polls."""
+    """Timing of one run, over T ticks and P polls."""
 
     step_ns: int
     poll_ns: Ints
-    """When each poll reads, from tick 0, ns, (P,)."""
+    """Read time of each poll relative to tick 0, ns, (P,)."""
     poll_tick: Ints
-    """Tick in whose step it does, (P,)."""
+    """Tick of the step into which the read falls, (P,)."""
     basis: Ints
-    """Step of the state that it is served; negative: none has come yet, and the controller does not write, (P,)."""
+    """Step of the served state, (P,); negative: no state has arrived yet, and the controller does not write."""
     in_force: Ints
-    """Poll whose command acts from each tick on, or `NO_POLL`, (T,)."""
+    """Poll whose command acts from each tick on, (T,); `NO_POLL`: none."""
     latency: Ints
-    """Loop latency of the command that is new at a tick, in steps; 0: none is, (T,)."""
+    """Loop latency of the command that takes effect at a tick, steps, (T,); 0: no new command."""
     shown_latency: Ints
-    """Last loop latency that the served state tells of, steps; 0: none yet, (P,)."""
+    """Latest loop latency contained in the served state, steps, (P,); 0: none yet."""
 
     @property
     def samples_ns(self) -> Ints:
-        """Loop latencies as `hilrig latency` takes them, one each new command, ns, (samples,)."""
+        """Loop latency samples as defined by `hilrig latency`, one per new command, ns, (samples,)."""
         return self.latency[self.latency > 0] * self.step_ns
 
     def ages(self) -> Ints:
-        """Age of what acts at each tick, steps, (T',), from the first tick at which a command acts."""
+        """Return the age of the acting command at each tick, steps, (T',), from the first tick with a command."""
         ticks = np.flatnonzero(self.in_force != NO_POLL)
         return np.asarray(ticks - self.basis[self.in_force[ticks]], dtype=np.int64)
 
 
 def poll_count(timing: LoopTiming, ticks: int) -> int:
-    """Polls that read before tick `ticks`."""
+    """Return the number of polls that read before tick `ticks`."""
     return max(0, -(-(ticks * timing.step_ns - timing.phase_ns) // timing.period_ns))
 
 
@@ -111,21 +111,22 @@ def timeline(
     state_lost: Bools | None = None,
     command_lost: Bools | None = None,
 ) -> Timeline:
-    """One run's timeline.
+    """Compute the timeline of one run.
 
     Args:
-        timing: the loop's own times.
+        timing: timing of the loop without injected delays.
         ticks: T.
-        state_delay_ns: injected into each state's way, ns, one number or (T,).
-        command_delay_ns: injected into each command's way, ns, one number or (P,), P of `poll_count`.
-        state_lost: which states never get to the edge, (T,).
-        command_lost: which commands never get to the simulation, (P,).
+        state_delay_ns: injected delay of the state link, ns, one number or (T,).
+        command_delay_ns: injected delay of the command link, ns, one number or (P,), P from `poll_count`.
+        state_lost: which states are lost, (T,).
+        command_lost: which commands are lost, (P,).
 
     Raises:
         InputError: a delay is negative.
     """
-    if np.min(state_delay_ns) < 0 or np.min(command_delay_ns, initial=0) < 0:
-        raise InputError("a delay must not be negative: nothing arrives before it was sent")
+    smallest_ns = int(min(np.min(state_delay_ns), np.min(command_delay_ns, initial=0)))
+    if smallest_ns < 0:
+        raise InputError(f"injected delays must be ≥ 0 ns, got {smallest_ns}")
     step_ns, polls = timing.step_ns, poll_count(timing, ticks)
     tick_ns = np.arange(ticks, dtype=np.int64) * step_ns
     released = tick_ns + timing.transport_ns + state_delay_ns
@@ -136,25 +137,25 @@ def timeline(
     if command_lost is not None:
         arrived = np.where(command_lost, NEVER, arrived)
     basis = _newest(released, poll_ns)
-    # Before the first state has come there is nothing to answer to.
+    # Before the first state has arrived, the controller writes no command.
     arrived = np.where(basis < 0, NEVER, arrived)
     in_force = _newest(arrived, tick_ns)
     changed = np.diff(in_force, prepend=NO_POLL) != 0
     latency = np.zeros(ticks, dtype=np.int64)
     new = np.flatnonzero(changed)
     latency[new] = new - basis[in_force[new]]
-    # A state tells of the last command that took effect at or before its own tick.
+    # A state contains the latency of the last command that took effect at or before its tick.
     last = np.maximum.accumulate(np.where(latency > 0, np.arange(ticks), -1))
-    told = np.where(last >= 0, latency[last], 0)
-    shown = np.where(basis >= 0, told[np.maximum(basis, 0)], 0)
+    published = np.where(last >= 0, latency[last], 0)
+    shown = np.where(basis >= 0, published[np.maximum(basis, 0)], 0)
     return Timeline(step_ns, poll_ns, poll_ns // step_ns, basis, in_force, latency, shown)
 
 
-def _newest(available_ns: Ints, asked_ns: Ints) -> Ints:
-    """For each time asked, the index of the newest of what is available by then; -1: nothing is."""
+def _newest(available_ns: Ints, query_ns: Ints) -> Ints:
+    """Return for each query time the largest index that is available by then; -1: none."""
     if not len(available_ns):
-        return np.full(len(asked_ns), -1, dtype=np.int64)
+        return np.full(len(query_ns), -1, dtype=np.int64)
     order = np.argsort(available_ns, kind="stable")
     newest = np.maximum.accumulate(np.where(available_ns[order] == NEVER, -1, order))
-    count = np.searchsorted(available_ns[order], asked_ns, side="right")
+    count = np.searchsorted(available_ns[order], query_ns, side="right")
     return np.where(count > 0, newest[np.maximum(count - 1, 0)], -1).astype(np.int64)

@@ -1,1 +1,1 @@
-"""Theory of the control loop: linear models, stability margins and expected cost."""
+"""Theory of the linearized control loop: stability margins, mean-square stability and expected cost."""

@@ -1,8 +1,8 @@
-"""Where the loop is stable in the mean square: the boundary of a plane whose delays are drawn, not constant.
+"""Mean-square stability limit of loops with random delays.
 
-Under a constant delay the spectral radius tells. Where delays are drawn, the age of what acts is a Markov chain
-(`expected_cost.age_chain`), taken from a long course of draws, and the second moments of the linear loop either die out
-or grow.
+For constant delays the spectral radius determines stability. For random delays, the age of the acting command is
+modeled as a Markov chain (`expected_cost.age_chain`), estimated from a long sequence of draws. The loop is mean-square
+stable if the second moments of its state decay.
 """
 
 import math
@@ -12,17 +12,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_study.controllers.controllers import LawController
+from hilrig_study.controllers.control_laws import LawController
 from hilrig_study.study_config import StudyConfig
-from hilrig_study.theory.expected_cost import age_chain, mean_square_radius, turns
-from hilrig_study.theory.margins import STABLE, linearise_law
+from hilrig_study.theory.expected_cost import age_chain, mean_square_radius, transition_matrices
+from hilrig_study.theory.margins import STABLE_RADIUS, linearize_law
 
 Ints = NDArray[np.int64]
 
-TICKS: Final = 4000
-"""Of the course of draws that the chain is taken from."""
-LARGEST_AGE: Final = 24
-"""The loop's matrices grow with the age of what acts: beyond this, steps, nothing is said."""
+CHAIN_TICKS: Final = 4000
+"""Length of the sequence from which the chain is estimated, ticks."""
+MAX_AGE_STEPS: Final = 24
+"""Largest age of the acting command for which the limit is computed, steps; the matrices grow with the age."""
 
 
 def stable_until(
@@ -33,35 +33,35 @@ def stable_until(
     points: Sequence[float],
     ages_at: Callable[[float], Ints],
 ) -> float:
-    """Largest of `points` up to which a loop with one poll a step is stable in the mean square.
+    """Return the largest of `points` for which a loop with one poll per step is mean-square stable.
 
     Args:
         study: the study.
-        controller: its number; it has a law, and does not predict.
+        controller: index of the controller, which must be a control law without prediction.
         gain: its gain factor.
-        step_ms: of the simulation, and of the controller.
-        points: values of what is swept beside the gain, ascending; a larger one is taken to be no better.
-        ages_at: ages of what acts at one of them, steps, (T,).
+        step_ms: step of the simulation and poll period of the controller.
+        points: ascending values of the other swept parameter; stability is assumed to be monotonic in it.
+        ages_at: returns the ages of the acting command at one of the points, steps, (T,).
 
     Returns:
-        -1 where the first is not stable, inf where all are, NaN where ages are too large to tell.
+        -1 if the first point is unstable, inf if all are stable, NaN if the ages are too large.
     """
-    rig, near = study.rig(step_ms), study.near()
+    rig, plant_model = study.rig(step_ms), study.linear_plant()
     step_s = step_ms * 1e-3
-    built = study.controllers[controller].build(rig, near, step_s, np.array([gain]))
+    built = study.controllers[controller].build(rig, plant_model, step_s, np.array([gain]))
     assert isinstance(built, LawController)
-    law = linearise_law(built, near, step_s, step_s)
-    phi, gamma = study.discretised(step_ms)
+    law = linearize_law(built, plant_model, step_s, step_s)
+    phi, gamma = study.discretized_plant(step_ms)
 
     def radius(number: int) -> float:
         ages = ages_at(points[number])
-        if not len(ages) or ages.max() > LARGEST_AGE:
+        if not len(ages) or ages.max() > MAX_AGE_STEPS:
             return math.nan
         chain = age_chain([ages])
-        return mean_square_radius(chain, turns(phi, gamma, law, chain.most))
+        return mean_square_radius(chain, transition_matrices(phi, gamma, law, chain.max_age))
 
     first = radius(0)
-    if not first < STABLE:
+    if not first < STABLE_RADIUS:
         return math.nan if math.isnan(first) else -1.0
     low, high = 0, len(points)
     while high - low > 1:
@@ -69,5 +69,5 @@ def stable_until(
         found = radius(middle)
         if math.isnan(found):
             return math.nan
-        low, high = (middle, high) if found < STABLE else (low, middle)
+        low, high = (middle, high) if found < STABLE_RADIUS else (low, middle)
     return math.inf if high == len(points) else points[low]
