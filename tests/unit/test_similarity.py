@@ -41,9 +41,9 @@ def test_finds_a_replay_with_additional_torques() -> None:
     assert torques(copied).overlap(torques(drawn(500, 2), copied)) == 1.0
 
 
-def test_finds_a_segment_of_a_long_run() -> None:
+def test_finds_a_section_of_a_long_run() -> None:
     long = drawn(20_000, 1)
-    # The sketch of the long run has only its smallest hashes: larger hashes of the segment are not compared.
+    # The sketch of the long run has only its smallest hashes: larger hashes of the section are not compared.
     assert torques(long).overlap(torques(long[5000:8000])) == 1.0
 
 

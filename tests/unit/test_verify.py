@@ -49,7 +49,7 @@ def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[Made], tmp_path:
     assert found.exact
     assert found.gaps == 0
     assert found.largest_deviation == (0.0, 0.0, 0.0, 0.0)
-    # A reset starts a new segment, and the last state has no successor.
+    # A reset starts a new interval, and the last state has no successor.
     assert found.steps == len(states(run)) - 2
     assert "bit-identical" in found.sentence()
 

@@ -1,9 +1,9 @@
 """Verification of a recording: re-simulates it from the recorded efforts and compares the states bit for bit.
 
-A run is read in blocks. Each block is split into segments that are simulated in parallel, as if each were a separate
-rig: the results of a rig do not depend on the number of rigs. A segment starts at a recorded state and then uses only
-the recorded efforts and the magnet. Its last step must lead to the first state of the next segment, and the last
-segment of a block continues in the next block, so the complete run is re-simulated. An hour takes seconds.
+A run is read in blocks. Each block is split into intervals that are simulated in parallel, as if each were a separate
+rig: the results of a rig do not depend on the number of rigs. An interval starts at a recorded state and then uses only
+the recorded efforts and the magnet. Its last step must lead to the first state of the next interval, and the last
+interval of a block continues in the next block, so the complete run is re-simulated. An hour takes seconds.
 """
 
 from collections.abc import Sequence
@@ -26,11 +26,11 @@ from hilrig_sim.platform_fingerprint import machine_name
 OTHER_PLATFORM_TOLERANCE: Final = 1e-9
 """Tolerance for a run of another platform, whose sine function can differ; rad, m, rad/s, m/s."""
 PARTS_TOLERANCE: Final = 1e-9
-"""Tolerance for parts, m: the pose of a held part on the magnet is not recorded, but computed from its pose."""
-MAX_SEGMENTS: Final = 64
-"""Segments per block without gaps."""
-MIN_SEGMENT_STEPS: Final = 50
-"""Minimum number of steps per segment, unless a gap ends it earlier."""
+"""Tolerance for parts, m: the offset of a held part from the magnet is not recorded, but computed from its pose."""
+MAX_INTERVALS: Final = 64
+"""Intervals per block without gaps."""
+MIN_INTERVAL_STEPS: Final = 50
+"""Minimum number of steps per interval, unless a gap ends it earlier."""
 BLOCK_STATES: Final = 16_384
 """Number of states in memory."""
 
@@ -148,7 +148,7 @@ class _Resimulation:
         self._before: tuple[Rows, Rows] | None = None
         self._probe, self._unfinished = Plant([parameters]), Plant([parameters])
         self._continues = False
-        """Whether a segment reached the end of the previous block: `_unfinished` is its rig at this point."""
+        """Whether an interval reached the end of the previous block: `_unfinished` is its rig at this point."""
         self._gaps = self._verified = self._skipped = 0
         self._exact = True
         self._first: int | None = None
@@ -160,13 +160,13 @@ class _Resimulation:
             states, parts = np.concatenate((self._before[0], states)), np.concatenate((self._before[1], parts))
         block = self._block(states, parts)
         self._before = block.last()
-        segments = self._segments(block)
-        verified = sum(end - begin for begin, end in segments)
+        intervals = self._intervals(block)
+        verified = sum(end - begin for begin, end in intervals)
         self._verified += verified
         self._skipped += int(np.count_nonzero(block.follows)) - verified
-        continues = bool(segments) and segments[-1][1] == len(states) - 1
-        if segments:
-            self._step(block, segments, continues=continues)
+        continues = bool(intervals) and intervals[-1][1] == len(states) - 1
+        if intervals:
+            self._step(block, intervals, continues=continues)
         self._continues = continues
 
     def result(self, machine: str) -> Verification:
@@ -194,14 +194,14 @@ class _Resimulation:
         held = _indices(states["held_part"], self._names, names)
         return _Block(states, parts, held, _first_part_rows(states, parts, len(names)), follows)
 
-    def _step(self, block: _Block, segments: Sequence[tuple[int, int]], *, continues: bool) -> None:
-        plant = Plant([self._parameters] * len(segments))
-        for rig, (begin, _) in enumerate(segments):
+    def _step(self, block: _Block, intervals: Sequence[tuple[int, int]], *, continues: bool) -> None:
+        plant = Plant([self._parameters] * len(intervals))
+        for rig, (begin, _) in enumerate(intervals):
             if begin == 0 and self._continues:
                 plant.adopt(self._unfinished, [rig], [0])
             else:
                 self._place(plant, rig, block, begin)
-        begins, ends = (np.array(column) for column in zip(*segments, strict=True))
+        begins, ends = (np.array(column) for column in zip(*intervals, strict=True))
         diverging = len(block.states)
         for step in range(int((ends - begins).max())):
             rows = np.minimum(begins + step, ends - 1)
@@ -209,7 +209,7 @@ class _Resimulation:
             active = np.flatnonzero(begins + step < ends)
             diverging = min(diverging, self._compare(block, plant, active, rows[active] + 1))
             if continues and begins[-1] + step == ends[-1] - 1:
-                self._unfinished.adopt(plant, [0], [len(segments) - 1])
+                self._unfinished.adopt(plant, [0], [len(intervals) - 1])
         if self._first is None and diverging < len(block.states):
             self._first = int(block.states["step"][diverging])
 
@@ -226,11 +226,11 @@ class _Resimulation:
         diverging = ~(worst <= self._tolerance) | ~(off_parts <= PARTS_TOLERANCE)
         return int(rows[diverging].min()) - 1 if diverging.any() else len(block.states)
 
-    def _segments(self, block: _Block) -> list[tuple[int, int]]:
-        """First and last row of each segment."""
+    def _intervals(self, block: _Block) -> list[tuple[int, int]]:
+        """First and last row of each interval."""
         breaks = [0, *(np.flatnonzero(~block.follows) + 1).tolist(), len(block.states)]
-        length = max(MIN_SEGMENT_STEPS, len(block.states) // MAX_SEGMENTS)
-        segments: list[tuple[int, int]] = []
+        length = max(MIN_INTERVAL_STEPS, len(block.states) // MAX_INTERVALS)
+        intervals: list[tuple[int, int]] = []
         for low, high in pairwise(breaks):
             continued = low == 0 and self._continues
             begin = 0 if continued else self._next_begin(block, low, high, any_held=True)
@@ -238,9 +238,9 @@ class _Resimulation:
                 end = self._next_begin(block, begin + length, high, any_held=False)
                 last = high - 1 if end is None else end
                 if last > begin:
-                    segments.append((begin, last))
+                    intervals.append((begin, last))
                 begin = end
-        return segments
+        return intervals
 
     def _next_begin(self, block: _Block, low: int, high: int, *, any_held: bool) -> int | None:
         """First row in [`low`, `high`) that contains everything that the next step depends on."""
