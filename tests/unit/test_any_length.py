@@ -64,7 +64,7 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples, "MATCH_WINDOW_ROWS", ROWS)
     monkeypatch.setattr(verify, "BLOCK_STATES", ROWS)
     monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
-    monkeypatch.setattr(summary, "COURSE_POINTS", ROWS)
+    monkeypatch.setattr(summary, "TRAJECTORY_POINTS", ROWS)
     monkeypatch.setattr(latency_plot, "_MAX_HISTORY_POINTS", ROWS)
     monkeypatch.setattr(diagnosis, "WINDOW_S", 1.0)
 

@@ -172,7 +172,7 @@ def test_report_of_a_run_without_a_controller(tmp_path: Path) -> None:
 
 
 def test_comparison_of_one_run_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="two runs or more"):
+    with pytest.raises(InputError, match="at least two runs"):
         compare([named(tmp_path, "run", Script(seconds=1.0))])
 
 
@@ -224,7 +224,7 @@ def test_report_is_a_self_contained_page(tmp_path: Path) -> None:
         "Not valid for latency measurements",
     ):
         assert expected in page.text, expected
-    assert "pass between reading the positions and writing the torques" in page.text
+    assert "between reading the positions and writing the torques" in page.text
 
 
 def test_group_report_ranks_the_runs(tmp_path: Path) -> None:

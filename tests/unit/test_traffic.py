@@ -96,7 +96,7 @@ def test_columns_that_do_not_fit_together_are_no_record(
     message = ModbusTraffic(
         kinds=[ModbusKind(function=3)], kind_indexes=indexes, arrived_ns=arrived, answered_after_ns=after
     )
-    with pytest.raises(DecodeError, match="do not fit together"):
+    with pytest.raises(DecodeError, match="inconsistent request columns"):
         rows_of(message)
 
 

@@ -11,8 +11,8 @@ from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
 from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
-from hilrig_replay.rerun_view.sinks import to_file, to_viewer
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_replay.rerun_view.sinks import flush_file, to_file, to_viewer
+from hilrig_runtime.errors import InputError
 
 
 def geometry_of(run: Run) -> RigGeometry:
@@ -88,13 +88,6 @@ def _write(
                     return
                 view.add(block)
                 if file is not None:
-                    _flush(stream, file)
+                    flush_file(stream, file)
             view.end()
     stream.disconnect()
-
-
-def _flush(stream: rr.RecordingStream, file: Path) -> None:
-    try:
-        stream.flush()
-    except RuntimeError as error:
-        raise OperationError(f"{file}: can't be written: {error}") from error
