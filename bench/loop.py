@@ -31,7 +31,7 @@ from stolen import StolenTime
 
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_cli.local.supervisor import WHOLE_LAB, Supervisor
+from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, Supervisor
 from hilrig_replay.analysis import latency
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
@@ -161,8 +161,8 @@ def recorder_comes_and_goes(client: Path, step_ms: float, pairs: int, seconds: f
     found = []
     with tempfile.TemporaryDirectory() as folder:
         lab, config, port = write_lab(Path(folder), step_ms=step_ms)
-        others = tuple(part for part in WHOLE_LAB if part.service != "recorder")
-        recorder = tuple(part for part in WHOLE_LAB if part.service == "recorder")
+        others = tuple(spec for spec in DEFAULT_PROCESSES if spec.service != "recorder")
+        recorder = tuple(spec for spec in DEFAULT_PROCESSES if spec.service == "recorder")
         with (
             running_lab(lab, config, say, threading.Event(), others),
             ZenohBus(lab.bus, "tool") as bus,

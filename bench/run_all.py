@@ -12,7 +12,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "performance.md"
-NOT_A_BENCHMARK = {"harness.py", "modbus_servers.py", "run_all.py", "soak.py", "stolen.py"}
+NOT_A_BENCHMARK = {"ablation.py", "harness.py", "modbus_servers.py", "run_all.py", "soak.py", "stolen.py"}
 LONGEST_S = 1800
 
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from stolen import StolenTime
 
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_cli.local.supervisor import shared
+from hilrig_cli.local.supervisor import lab_processes
 from hilrig_modbus_edge.command_scheduler import DEADLINE_MARGIN_NS
 from hilrig_replay.analysis.latency import measure as latency_of
 from hilrig_replay.analysis.samples import join_commands
@@ -141,7 +141,7 @@ def carry(load: Path, count: int, edges: int, seconds: float) -> Found:
     """Run a lab of `count` rigs on some edges under load; what came of it."""
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
         lab, config, port = write_lab(Path(folder), rigs=count, step_ms=STEP_MS)
-        parts = shared([rig.name for rig in lab.rigs], edges=edges)
+        parts = lab_processes([rig.name for rig in lab.rigs], edges=edges)
         healths: dict[str, list[Health]] = {}
 
         def hear(_: str, payload: bytes) -> None:

@@ -13,7 +13,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hilrig_cli.bench.jitter import stolen_s
+from hilrig_cli.bench.jitter import steal_time_s
 
 PERIOD_S: Final = 0.02
 NEAR_NS: Final = 100_000_000
@@ -54,9 +54,9 @@ class StolenTime:
         return nearest > NEAR_NS
 
     def _watch(self) -> None:
-        last_s = stolen_s() or 0.0
+        last_s = steal_time_s() or 0.0
         while not self._end.wait(PERIOD_S):
-            now_s = stolen_s() or 0.0
+            now_s = steal_time_s() or 0.0
             if now_s > last_s:
                 self._seen_wall_ns.append(time.time_ns())
                 self.total_s += now_s - last_s

@@ -43,13 +43,42 @@ def no_pre_encoding() -> None:
     Simulation.pre_encode = lambda self, tick_ns: None
 
 
+def asyncio_readers() -> None:
+    """Sockets are served from asyncio's queue: `loop.add_reader` with the same receive call."""
+    from selectors import EVENT_READ, EVENT_WRITE
+
+    from hilrig_modbus_edge.server.event_loop import SocketTransport
+
+    def update_events(self: Any) -> None:
+        events = 0
+        if not self._lost:
+            if self._reading_enabled and not self._closing and self._protocol is not None:
+                events = EVENT_READ
+            if self._send_buffer:
+                events |= EVENT_WRITE
+        changed, self._events = events ^ self._events, events
+        if changed & EVENT_READ:
+            if events & EVENT_READ:
+                self._loop.add_reader(self._socket, self._on_event, EVENT_READ)
+            else:
+                self._loop.remove_reader(self._socket)
+        if changed & EVENT_WRITE:
+            if events & EVENT_WRITE:
+                self._loop.add_writer(self._socket, self._on_event, EVENT_WRITE)
+            else:
+                self._loop.remove_writer(self._socket)
+
+    SocketTransport._update_events = update_events
+
+
 def millisecond_timers() -> None:
-    """The edge's event loop waits in whole milliseconds, as asyncio does."""
+    """The loop waits in whole milliseconds, as asyncio does; sockets are served from asyncio's queue too."""
     import selectors
 
-    from hilrig_modbus_edge.server.event_loop import ExactSelector
+    from hilrig_modbus_edge.server.event_loop import DirectSelector
 
-    ExactSelector.select = selectors.DefaultSelector.select
+    asyncio_readers()
+    DirectSelector.select = selectors.DefaultSelector.select
 
 
 def no_priorities() -> None:
@@ -110,7 +139,8 @@ VARIANTS: dict[str, tuple[Callable[[], None], ...]] = {
     "fixed window": (fixed_window,),
     "no rule for further writes": (no_further_writes,),
     "no pre-encoding": (no_pre_encoding,),
-    "timers in ms": (millisecond_timers,),
+    "sockets by add_reader": (asyncio_readers,),
+    "add_reader, timers in ms": (millisecond_timers,),
     "edge tick in one turn": (edge_tick_whole,),
     "no priorities": (no_priorities,),
     "receivers not ahead": (receivers_not_ahead,),

@@ -33,7 +33,8 @@ def tmpfs(folder: Path, size_kib: int, *, files: int = 0) -> Iterator[Path]:
         text=True,
     )
     if mounted.returncode:
-        pytest.skip(f"a small file system can't be mounted here: {mounted.stderr.strip()}")
+        said = mounted.stderr.strip().partition("\n")[0]
+        pytest.skip(f"needs the right to mount a small file system (CAP_SYS_ADMIN): {said}")
     try:
         yield folder
     finally:

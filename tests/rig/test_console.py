@@ -301,7 +301,7 @@ def test_simulation_restart_is_shown(running_lab: ConsoleWithLab) -> None:
         try:
             eventually(lambda: watcher.rig("rig2")["state"] == "no simulation")
             eventually(lambda: watcher.pose("rig2") is None)
-            assert any("sim/1" in trouble for trouble in watcher.newest["lab"]["troubles"])
+            assert any("sim/1" in alert for alert in watcher.newest["lab"]["alerts"])
         finally:
             os.kill(sim, signal.SIGKILL)
         eventually(lambda: watcher.rig("rig2")["state"] == "free" and watcher.pose("rig2"))
@@ -368,7 +368,7 @@ def test_password_is_required_off_loopback(tmp_path: Path) -> None:
             assert running.process.wait(PATIENT_S) == 0
             eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
-        assert "can be overheard" in running.process.stderr.read()
+        assert "the password is sent unencrypted" in running.process.stderr.read()
 
 
 def test_serves_https_with_certificate(tmp_path: Path) -> None:

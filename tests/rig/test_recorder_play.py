@@ -52,5 +52,5 @@ def test_play_is_rejected_while_a_lab_runs(tmp_path: Path) -> None:
         eventually(lambda: senders.count("rig1"))
         answer = hilrig("play", path, "--config", config)
     assert answer.returncode == 3
-    assert "a lab runs here already" in answer.stderr
+    assert "a lab is already running on this host" in answer.stderr
     assert "Traceback" not in answer.stderr

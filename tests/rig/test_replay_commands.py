@@ -84,7 +84,7 @@ def test_run_without_a_controller_has_no_latency(tmp_path: Path, run: Path) -> N
     assert "recorded manually" in page.read_text()
     compared = hilrig("compare", run, path, "--plot", tmp_path / "both.svg")
     assert compared.returncode == 0, compared.stderr
-    assert "no controller commanded, so it is aligned by its start" in " ".join(compared.stdout.split())
+    assert "no command by a controller; aligned by its start instead" in " ".join(compared.stdout.split())
 
 
 def test_compare_excludes_unreadable_runs(tmp_path: Path, run: Path) -> None:
@@ -95,7 +95,7 @@ def test_compare_excludes_unreadable_runs(tmp_path: Path, run: Path) -> None:
     found = json.loads(done.stdout)
     assert (len(found["runs"]), len(found["differences"])) == (2, 1)
     assert [f"{torn}: truncated" in reason for reason in found["left_out"]] == [True]
-    assert f"left out: {torn}: truncated" in hilrig("compare", run, run, torn).stderr
+    assert f"skipped: {torn}: truncated" in hilrig("compare", run, run, torn).stderr
     for others in ([run, torn], [torn, run, run], [run, torn, torn]):
         refused = hilrig("compare", *others)
         assert (refused.returncode, refused.stdout) == (2, "")
@@ -111,7 +111,7 @@ def test_replay_writes_a_file_readable_by_rerun(run: Path, tmp_path: Path) -> No
 def test_replay_rejects_save_with_web(run: Path, tmp_path: Path) -> None:
     result = hilrig("replay", run, "--save", tmp_path / "run.rrd", "--web")
     assert result.returncode == 2
-    assert "choose one" in result.stderr
+    assert "can't be combined" in result.stderr
 
 
 def test_compare_prints_differences_and_writes_plots(run: Path, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_compare_prints_differences_and_writes_plots(run: Path, tmp_path: Path) 
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "both.rrd").stat().st_size > 100_000
     table = hilrig("compare", run, slow)
-    assert "tools apart, rms, mm" in table.stdout
+    assert "tool distance, rms, mm" in table.stdout
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
-from hilrig_modbus_edge.registers.map import Table
+from hilrig_modbus_edge.registers.map import RegisterTable
 from hilrig_runtime.messaging.endpoints import Arrival
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -71,13 +71,15 @@ class Bench:
     def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
         return self.device.connect(host, port, **rights)
 
-    def read(self, client: Client, address: int, count: int, table: Table = Table.HOLDING_REGISTER) -> list[int]:
-        client.heard(self.clock.monotonic_ns())
+    def read(
+        self, client: Client, address: int, count: int, table: RegisterTable = RegisterTable.HOLDING_REGISTER
+    ) -> list[int]:
+        client.record_request(self.clock.monotonic_ns())
         return list(struct.unpack(f">{count}H", self.device.read_registers(client, table, address, count)))
 
     def write(self, client: Client, address: int, *words: int) -> None:
         now_ns = self.clock.monotonic_ns()
-        client.heard(now_ns)
+        client.record_request(now_ns)
         self.device.write_registers(client, address, struct.pack(f">{len(words)}H", *words), now_ns)
 
     def wait(self, ms: float) -> None:

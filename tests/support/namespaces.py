@@ -27,16 +27,17 @@ def require_namespaces() -> None:
 @cache
 def _missing() -> str | None:
     """What is missing for namespaces; tried once with all that a network needs."""
-    if shutil.which("ip") is None:
-        return "needs `ip` (Debian's package iproute2)"
     if os.name != "posix" or os.geteuid() != 0:
         return "needs root, for network namespaces"
+    if shutil.which("ip") is None:
+        return "needs `ip` (Debian's package iproute2)"
     try:
         with Network(["near", "far"]) as network:
             network.run("near", ["getent", "hosts", "far"], capture_output=True, text=True)
     except subprocess.CalledProcessError as error:
         said = " ".join((error.stderr or "").split()) or f"exit code {error.returncode}"
-        return f"network namespaces can't be had here: `{' '.join(error.cmd)}`: {said}"
+        need = "network namespaces and veth pairs (CAP_SYS_ADMIN, CAP_NET_ADMIN)"
+        return f"needs {need}; `{' '.join(error.cmd)}` failed: {said}"
     return None
 
 

@@ -11,7 +11,7 @@ from hilrig_console.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, pose_of, 
 from hilrig_console.events import MAX_EVENTS, EventBuffer
 from hilrig_console.poses import PoseCache
 from hilrig_console.view_model import ClientState, Frame, ViewModel
-from hilrig_monitoring.lab_view import FORGOTTEN_S, SILENT_S, LabView
+from hilrig_monitoring.lab_view import REMOVED_AFTER_S, SILENT_AFTER_S, LabView
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
 from hilrig_sim.arm.kinematics import forward
@@ -137,8 +137,8 @@ def test_silent_rig_expires_and_invalid_batch_is_ignored() -> None:
     made = poses("rig1")
     made.add([batch(rig1=state())], 1.0)
     made.add([b"\xff\xff garbage"], 1.0)
-    assert "rig1" in made.as_dict(1.0 + SILENT_S)
-    assert made.as_dict(1.1 + SILENT_S) == {}
+    assert "rig1" in made.as_dict(1.0 + SILENT_AFTER_S)
+    assert made.as_dict(1.1 + SILENT_AFTER_S) == {}
 
 
 def test_events_are_numbered_and_old_ones_evicted() -> None:
@@ -180,9 +180,9 @@ def model() -> ViewModel:
     made = ViewModel("lab", ("rig1", "rig2"), 0)
     sim = [RigReport(rig="rig1", loop_us=[20_000, 30_000]), RigReport(rig="rig2", safe=True)]
     edge = [RigReport(rig="rig1", controller="192.0.2.7:9", session="s"), RigReport(rig="rig2")]
-    made.view.hear(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
-    made.view.hear(Health(service="edge", instance="1", rig_reports=edge), 0.0)
-    made.view.hear(Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 0.0)
+    made.view.update(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
+    made.view.update(Health(service="edge", instance="1", rig_reports=edge), 0.0)
+    made.view.update(Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 0.0)
     made.set_addresses([Roster(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])])
     return made
 
@@ -243,14 +243,14 @@ def test_lab_message_is_sent_without_changes() -> None:
 def test_rig_state_text(edge: RigReport | None, sim: RigReport | None, state: str) -> None:
     view = LabView(("r",))
     for service, report in (("edge", edge), ("sim", sim)):
-        view.hear(Health(service=service, instance="1", rig_reports=[] if report is None else [report]), 0.0)
+        view.update(Health(service=service, instance="1", rig_reports=[] if report is None else [report]), 0.0)
     assert view.rigs(0.0)[0].state == state
 
 
 def test_service_is_removed_after_timeout() -> None:
     view = LabView(())
-    view.hear(Health(service="edge", instance="old"), 0.0)
-    view.hear(Health(service="edge", instance="new"), FORGOTTEN_S)
+    view.update(Health(service="edge", instance="old"), 0.0)
+    view.update(Health(service="edge", instance="new"), REMOVED_AFTER_S)
     assert len(view.services()) == 2
-    view.hear(Health(service="edge", instance="new"), FORGOTTEN_S + 1)
+    view.update(Health(service="edge", instance="new"), REMOVED_AFTER_S + 1)
     assert [service.name for service in view.services()] == ["edge/new"]

@@ -1,4 +1,4 @@
-"""The figures that `docs/controllers.md` gives a student are those of the rig with its defaults."""
+"""The numbers in `docs/controllers.md` match the rig with default settings."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ PAGE = (Path(__file__).parents[2] / "docs/controllers.md").read_text(encoding="u
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
 
-def test_the_joints_of_the_page_bring_the_tip_to_the_red_part() -> None:
+def test_documented_joints_reach_the_red_part() -> None:
     found = re.search(r"θ1 = (\S+)°, θ2 = (\S+)°, d3 = (\S+) mm is (\d+) mm above", PAGE)
     assert found is not None
     theta1, theta2, d3, above_mm = map(float, found.groups())
@@ -28,7 +28,7 @@ def test_the_joints_of_the_page_bring_the_tip_to_the_red_part() -> None:
     assert tuple(map(float, stated.groups())) == (magnet.reach_mm, magnet.gap_mm)
 
 
-def test_the_weights_of_the_page_are_those_of_quill_and_part() -> None:
+def test_documented_weights_match_quill_and_part() -> None:
     stated = re.search(r"(\S+) kg are (\S+) N more upwards, τ3 = -(\S+) N in all", PAGE)
     assert stated is not None
     mass, more, whole = map(float, stated.groups())

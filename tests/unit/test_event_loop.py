@@ -1,13 +1,16 @@
-"""The edge's event loop: exact timers, and transports whose errors close one connection only."""
+"""The edge's event loop: asyncio keeps working however busy the sockets are; timers are exact; errors stay local."""
 
 import asyncio
 import logging
 import socket
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from selectors import EVENT_READ
 
 import pytest
 
-from hilrig_modbus_edge.server.event_loop import HIGH_WATER, SocketTransport, new_event_loop
+from hilrig_modbus_edge.server.event_loop import HIGH_WATER, DirectEventLoop, SocketTransport
 
 
 def test_timer_is_not_rounded_to_milliseconds() -> None:
@@ -21,7 +24,7 @@ def test_timer_is_not_rounded_to_milliseconds() -> None:
             loop.call_at(due_s, lambda called=called: called.set_result(loop.time()))  # type: ignore[misc]
             late_s.append(await called - due_s)
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(body())
     # asyncio calls a timer that is due within the resolution of its clock.
     assert min(late_s) > -1e-6
@@ -39,17 +42,101 @@ def test_timers_are_called_in_order() -> None:
         await done.wait()
         return called
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         assert runner.run(body()) == [0.0003, 0.0007, 0.0012, 0.0012, 0.0041]
 
 
 def test_loop_without_timers_waits_for_other_threads() -> None:
-    loop = new_event_loop()
+    loop = DirectEventLoop()
     try:
         threading.Timer(0.01, loop.call_soon_threadsafe, (loop.stop,)).start()
         loop.run_forever()
     finally:
         loop.close()
+
+
+class Flood:
+    """A socket in the selector that is always ready; counts its events."""
+
+    def __init__(self, loop: DirectEventLoop) -> None:
+        self.served = 0
+        self.here, self.there = socket.socketpair()
+        self.there.send(b"x")
+        loop.direct.register(self.here, EVENT_READ, self.serve)
+
+    def serve(self, events: int) -> None:
+        assert events == EVENT_READ
+        self.here.recv(1)
+        self.there.send(b"x")
+        self.served += 1
+        self.on_event()
+
+    def on_event(self) -> None:
+        """Called at each event; replaced by tests."""
+
+
+@contextmanager
+def flooded() -> Iterator[tuple[DirectEventLoop, Flood]]:
+    loop = DirectEventLoop()
+    flood = Flood(loop)
+    try:
+        with flood.here, flood.there:
+            yield loop, flood
+            loop.direct.unregister(flood.here)
+    finally:
+        loop.close()
+
+
+def test_timer_is_called_during_a_flood() -> None:
+    with flooded() as (loop, flood):
+        loop.call_later(0.01, loop.stop)
+        loop.run_forever()
+        assert flood.served > 1
+
+
+def test_call_soon_runs_before_the_next_event() -> None:
+    with flooded() as (loop, flood):
+        done: list[int] = []
+
+        def on_event() -> None:
+            loop.call_soon(done.append, flood.served)
+            if flood.served == 10:
+                loop.call_soon(loop.stop)
+
+        flood.on_event = on_event  # type: ignore[method-assign]
+        loop.run_forever()
+        assert done == list(range(1, 11))
+
+
+def test_earlier_timer_of_an_event_is_not_delayed() -> None:
+    with flooded() as (loop, flood):
+
+        def on_event() -> None:
+            if flood.served == 1:
+                loop.call_later(0.001, loop.stop)
+
+        flood.on_event = on_event  # type: ignore[method-assign]
+        loop.call_later(3_600, pytest.fail, "the older timer was called first")
+        loop.run_forever()
+
+
+def test_other_threads_are_served_during_a_flood() -> None:
+    with flooded() as (loop, _):
+        threading.Timer(0.01, loop.call_soon_threadsafe, (loop.stop,)).start()
+        loop.run_forever()
+
+
+def test_asyncio_sockets_are_served_during_a_flood() -> None:
+    async def receive() -> bytes:
+        here, there = socket.socketpair()
+        with here, there:
+            here.setblocking(False)
+            threading.Timer(0.01, there.send, (b"hello",)).start()
+            return await asyncio.get_running_loop().sock_recv(here, 16)
+
+    with flooded() as (loop, flood):
+        assert loop.run_until_complete(receive()) == b"hello"
+        assert flood.served > 1
 
 
 class Protocol(asyncio.BufferedProtocol):
@@ -82,7 +169,9 @@ class Protocol(asyncio.BufferedProtocol):
 async def connect() -> tuple[SocketTransport, Protocol, socket.socket]:
     here, there = socket.socketpair()
     there.setblocking(False)
-    transport, protocol = SocketTransport(asyncio.get_running_loop(), here, "peer"), Protocol()
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, DirectEventLoop)
+    transport, protocol = SocketTransport(loop, here, "peer"), Protocol()
     transport.set_protocol(protocol)
     return transport, protocol, there
 
@@ -103,7 +192,7 @@ def test_internal_error_closes_one_connection_only(caplog: pytest.LogCaptureFixt
             await loop.sock_sendall(other, b"hello")
             await until(lambda: whole.received == b"hello")
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(body())
     assert "connection peer closed: internal error" in caplog.text
 
@@ -126,7 +215,7 @@ def test_slow_peer_pauses_the_protocol_and_receives_everything() -> None:
             assert await protocol.lost is None
             assert await loop.sock_recv(peer, 1) == b""
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(body())
 
 
@@ -144,5 +233,5 @@ def test_paused_reading_leaves_bytes_in_the_socket() -> None:
             transport.abort()
             await protocol.lost
 
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
         runner.run(body())

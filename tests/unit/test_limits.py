@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from hilrig_modbus_edge.server import listener as server
+from hilrig_modbus_edge.server.listener import bind
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import unknown_host
 from hilrig_runtime.config.lab import parse_lab
@@ -53,7 +53,7 @@ def test_any_other_error_is_no_such_thing() -> None:
 )
 def test_an_address_of_another_host_is_named_as_one(host: str, words: str) -> None:
     with pytest.raises(OperationError) as caught:
-        server.bind("rig1", host, free_ports(1))
+        bind("rig1", host, free_ports(1))
     if sys.platform == "linux" or host != "192.0.2.1":
         assert words in str(caught.value)
     assert "while attempting" not in str(caught.value)
@@ -62,10 +62,10 @@ def test_an_address_of_another_host_is_named_as_one(host: str, words: str) -> No
 def test_a_port_in_use_is_another_matter() -> None:
     port = free_ports(1)
     with (
-        server.bind("rig1", "127.0.0.1", port),
-        pytest.raises(OperationError, match=r"in use; stop what listens there, or choose another port"),
+        bind("rig1", "127.0.0.1", port),
+        pytest.raises(OperationError, match=r"in use; stop the program that listens there, or choose another port"),
     ):
-        server.bind("rig2", "127.0.0.1", port)
+        bind("rig2", "127.0.0.1", port)
 
 
 def test_a_router_whose_name_is_not_known_is_told_apart_from_one_that_is_silent() -> None:

@@ -32,7 +32,7 @@ def good_file(path: Path, chunks: int = 40) -> list[list[Found]]:
     rng = random.Random(1)
     writer = RecordingWriter(path)
     writer.add_metadata("hilrig.session", {"session": "s1", "rig": "rig1"})
-    made = []
+    written = []
     number = 0
     for chunk in range(chunks):
         content = []
@@ -43,12 +43,12 @@ def good_file(path: Path, chunks: int = 40) -> list[list[Found]]:
             writer.add(encode_message(channel, number, log_time, log_time, data))
             content.append((channel, number, log_time, data))
         writer.close_chunk()
-        made.append(content)
+        written.append(content)
         if chunk == chunks // 2:
             writer.add_attachment("a.txt", "text/plain", b"hello" * 100, log_time=START)
     writer.finish(lambda: {"hilrig.summary": {"ended": "ended"}})
     writer.publish()
-    return made
+    return written
 
 
 def read(path: Path) -> list[Found]:
@@ -92,13 +92,13 @@ def test_complete_file_is_not_changed(tmp_path: Path) -> None:
 
 def test_all_complete_chunks_of_a_truncated_file_are_kept(tmp_path: Path) -> None:
     path, truncated, new = (tmp_path / name for name in ("run.mcap", "truncated.mcap", "new.mcap"))
-    made = good_file(path)
+    written = good_file(path)
     good, ends = path.read_bytes(), chunk_ends(path)
     seed = random.randrange(1 << 30)
     rng = random.Random(seed)
     for length in sorted({0, 1, 8, 9, *ends[:3], *(rng.randrange(len(good)) for _ in range(200))}):
         truncated.write_bytes(good[:length])
-        expected = [message for end, content in zip(ends, made, strict=True) if end <= length for message in content]
+        expected = [message for end, content in zip(ends, written, strict=True) if end <= length for message in content]
         if length < HEADER_BYTES:
             with pytest.raises(InputError, match=r"not an MCAP file|without a complete record"):
                 recover(truncated, new)
@@ -112,7 +112,7 @@ def test_all_complete_chunks_of_a_truncated_file_are_kept(tmp_path: Path) -> Non
 
 def test_only_intact_chunks_of_a_corrupted_file_are_kept(tmp_path: Path) -> None:
     path, damaged, new = (tmp_path / name for name in ("run.mcap", "damaged.mcap.part", "new.mcap"))
-    made = good_file(path)
+    written = good_file(path)
     good = path.read_bytes()
     starts = [offset for offset, item in scan(good) if isinstance(item, Chunk)]
     ends = chunk_ends(path)
@@ -129,23 +129,23 @@ def test_only_intact_chunks_of_a_corrupted_file_are_kept(tmp_path: Path) -> None
             recover(damaged, new)
         except InputError:
             pytest.fail(f"seed {seed}: nothing recovered, flipped at {places}")
-        whole = [
+        complete = [
             content
-            for start, end, content in zip(starts, ends, made, strict=True)
+            for start, end, content in zip(starts, ends, written, strict=True)
             if not any(start <= place < end for place in places)
         ]
-        allowed = {message for content in made for message in content}
+        allowed = {message for content in written for message in content}
         found = read(new)
         assert set(found) <= allowed, f"seed {seed}, flipped at {places}"
         # Before the first chunk are the schemas and channels. Without them messages have no channel.
         if all(place > starts[0] for place in places):
-            assert set(found) >= {message for content in whole for message in content}, f"seed {seed}, {places}"
+            assert set(found) >= {message for content in complete for message in content}, f"seed {seed}, {places}"
         new.unlink()
 
 
 def test_finished_file_with_a_damaged_chunk_is_recovered(tmp_path: Path) -> None:
     path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
-    made = good_file(path)
+    written = good_file(path)
     starts = [offset for offset, item in scan(path.read_bytes()) if isinstance(item, Chunk)]
     data = bytearray(path.read_bytes())
     within = starts[1] + 60
@@ -154,7 +154,7 @@ def test_finished_file_with_a_damaged_chunk_is_recovered(tmp_path: Path) -> None
     assert is_complete(data)
     recovery = recover(path, new)
     assert recovery.damaged_chunks == 1
-    assert read(new) == [message for number, content in enumerate(made) if number != 1 for message in content]
+    assert read(new) == [message for number, content in enumerate(written) if number != 1 for message in content]
     # The new file is complete.
     assert recover(new, tmp_path / "again.mcap").path is None
 
@@ -289,7 +289,7 @@ def test_session_metadata_of_a_truncated_file_is_read(tmp_path: Path) -> None:
 
 def test_scan_agrees_with_the_mcap_library(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    made = good_file(path)
+    written = good_file(path)
     data = path.read_bytes()
     assert is_complete(data)
     found = [
@@ -299,7 +299,7 @@ def test_scan_agrees_with_the_mcap_library(tmp_path: Path) -> None:
         for message in read_chunk(item)
         if isinstance(message, Message)
     ]
-    assert found == [message for content in made for message in content] == read(path)
+    assert found == [message for content in written for message in content] == read(path)
 
 
 def test_command_recovers_and_reports_losses(tmp_path: Path) -> None:
@@ -309,12 +309,12 @@ def test_command_recovers_and_reports_losses(tmp_path: Path) -> None:
     answer = hilrig("recover", part)
     assert answer.returncode == 1
     assert "messages in" in answer.stdout
-    assert "not saved" in answer.stdout
+    assert "lost: " in answer.stdout
     assert not part.exists()
     assert read(tmp_path / "truncated.mcap")
-    whole = hilrig("recover", tmp_path / "run.mcap")
-    assert whole.returncode == 0
-    assert "nothing to do" in whole.stdout
+    complete = hilrig("recover", tmp_path / "run.mcap")
+    assert complete.returncode == 0
+    assert "nothing to do" in complete.stdout
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 1000])

@@ -399,11 +399,11 @@ def test_overruns_are_counted_from_events() -> None:
     bench.start("s2", "rig2")
     bench.states(1, "rig1")
     bench.states(1, "rig2")
-    whole = Event(kind=Event.OVERRUN)
-    whole.overrun_data.missed_steps = 3
+    all_rigs = Event(kind=Event.OVERRUN)
+    all_rigs.overrun_data.missed_steps = 3
     one = Event(kind=Event.OVERRUN, rig="rig2")
     one.overrun_data.missed_steps = 2
-    bench.sim.put(EVENT, "sim", whole, bench.wall)
+    bench.sim.put(EVENT, "sim", all_rigs, bench.wall)
     bench.sim.put(EVENT, "rig2", one, bench.wall)
     bench.accept(bench.sim.batch())
     first, second = (file.recording.counters for file in bench.store.files)

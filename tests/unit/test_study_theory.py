@@ -46,7 +46,7 @@ def test_linear_step_equals_derivative_of_arm_step(pose: tuple[float, float, flo
             moved = np.zeros(12)
             moved[index] = sign * small
             arm = Plant([rig])
-            arm.place(0, tuple(np.array(pose) + moved[:4]), tuple(moved[4:8]))
+            arm.set_state(0, tuple(np.array(pose) + moved[:4]), tuple(moved[4:8]))
             arm.step((np.array(plant.holding) + moved[8:])[:, np.newaxis], np.zeros(1, dtype=np.bool_))
             ends.append(np.concatenate([arm.position[:, 0], arm.velocity[:, 0]]))
         found[:, index] = (ends[0] - ends[1]) / (2 * small)

@@ -6,7 +6,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.request_log import TrafficRecord
+from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_replay.io.columns import TRAFFIC_DTYPE, RowBuffer, Rows, StringTable
 from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
@@ -34,13 +34,13 @@ _NOTES = st.lists(
 
 @given(_NOTES)
 def test_what_was_noted_is_what_is_read_in_its_order(notes: list[tuple[bytes, int, int, int, str]]) -> None:
-    record = TrafficRecord("rig1")
+    log = RequestLog("rig1")
     for pdu, arrived_ns, took_ns, exception, controller in notes:
-        record.note(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
-    assert record.count == len(notes)
+        log.record(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
+    assert log.count == len(notes)
     names = StringTable()
-    rows = rows_of(record.take(5_000, 7_000), names)
-    assert record.count == 0
+    rows = rows_of(log.drain(5_000, 7_000), names)
+    assert log.count == 0
     assert len(rows) == len(notes)
     for row, (pdu, arrived_ns, took_ns, exception, controller) in zip(rows, notes, strict=True):
         assert (row["function"], row["exception"], names[row["controller"]]) == (pdu[0], exception, controller)
@@ -63,18 +63,18 @@ def test_what_was_noted_is_what_is_read_in_its_order(notes: list[tuple[bytes, in
     ],
 )
 def test_address_and_count_are_those_of_the_request(pdu: str, address: int, count: int) -> None:
-    record = TrafficRecord("rig1")
-    record.note(bytes.fromhex(pdu), 1, 2, 0, "10.0.0.1:1")
-    [row] = rows_of(record.take(0, 0))
+    log = RequestLog("rig1")
+    log.record(bytes.fromhex(pdu), 1, 2, 0, "10.0.0.1:1")
+    [row] = rows_of(log.drain(0, 0))
     assert (row["address"], row["count"]) == (address, count)
 
 
 def test_who_asks_the_same_again_is_a_number_and_two_times() -> None:
-    record = TrafficRecord("rig1")
+    log = RequestLog("rig1")
     for number in range(100):
-        record.note(READ, number, number, 0, "10.0.0.1:1")
-        record.note(bytes((6, 0, 0, number, 7)), number, number, 0, "10.0.0.1:1")
-    message = record.take(0, 0)
+        log.record(READ, number, number, 0, "10.0.0.1:1")
+        log.record(bytes((6, 0, 0, number, 7)), number, number, 0, "10.0.0.1:1")
+    message = log.drain(0, 0)
     assert len(message.kinds) == 2
     assert list(message.kind_indexes) == [0, 1] * 100
 
@@ -101,7 +101,7 @@ def test_columns_that_do_not_fit_together_are_no_record(
 
 
 def test_a_batch_of_a_flood_is_small() -> None:
-    record = TrafficRecord("rig1")
+    log = RequestLog("rig1")
     for now_ns in np.arange(10**15, 10**15 + 256 * 20_000, 20_000).tolist():
-        record.note(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")
-    assert len(record.take(10**15, 10**18).SerializeToString()) < 256 * 12 + 100
+        log.record(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")
+    assert len(log.drain(10**15, 10**18).SerializeToString()) < 256 * 12 + 100

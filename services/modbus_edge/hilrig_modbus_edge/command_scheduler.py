@@ -49,9 +49,9 @@ class CommandScheduler:
     another until that deadline: a controller that polls as fast as it can sends one message a step instead of hundreds.
 
     Args:
-        source: name of the edge, for the messages.
+        source: name of the edge, put into the messages.
         put: publishes an encoded `RigBatch`.
-        newest_state: gives the newest state of a rig, whose arrival tells when the rig's simulation had its last tick.
+        newest_state: returns the newest state of a rig; its arrival is an estimate of the last tick of the simulation.
         step_ns: step of the simulation, ns.
         clock: monotonic time.
         call_at: calls a function on the event loop at a time of its clock, s.
@@ -73,7 +73,7 @@ class CommandScheduler:
         self._monotonic_ns = clock.monotonic_ns
         self._call_at = call_at
         self._pending: dict[str, bytes] = {}
-        """The newest command of each rig that waits, encoded."""
+        """By rig, its newest pending command, encoded."""
         self._writes: dict[str, _StateWrites] = {}
         self._flushed_ns = 0
         self._flush_due_ns = 0
@@ -93,7 +93,7 @@ class CommandScheduler:
             self._timer = self._call_at(due_ns * 1e-9, self.flush)
 
     def flush(self) -> None:
-        """Send the commands that wait."""
+        """Send the pending commands."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -104,7 +104,7 @@ class CommandScheduler:
             self._flushed_ns = self._monotonic_ns()
 
     def _send_time(self, rig: str, now_ns: int) -> int:
-        """Time at which a rig's new command is to be sent at the latest, ns, monotonic clock."""
+        """Return the latest time at which a new command of a rig is sent, ns, monotonic clock."""
         window_end_ns = self._flushed_ns + COALESCE_WINDOW_NS
         state = self._newest_state(rig)
         state_ns = 0 if state is None else state.arrived_ns
@@ -114,7 +114,7 @@ class CommandScheduler:
         writes.count += 1
         tick_ns = state_ns + self._step_ns
         if now_ns > tick_ns + self._step_ns:
-            # The simulation is silent: there is no tick to be in time for.
+            # No states from the simulation: there is no tick to be in time for.
             return window_end_ns
         deadline_ns = tick_ns - DEADLINE_MARGIN_NS
         if writes.count <= SEPARATE_WRITES:

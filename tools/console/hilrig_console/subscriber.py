@@ -22,7 +22,7 @@ from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import RigConfig
 from hilrig_schemas.topics import CONFIG, EVENT, HEALTH, STATES
 
-RETRY_S: Final = 2.0
+RECONNECT_DELAY_S: Final = 2.0
 """Delay between attempts to connect to the bus, s."""
 POLL_PERIOD_S: Final = 0.2
 """Period in which due queries are sent, s."""
@@ -84,7 +84,7 @@ class LabSubscriber:
                 # The page shows the error, and the next iteration connects again.
                 logger.exception("receiving from the bus failed")
                 self._set_bus_error("receiving from the bus failed; see the log of the console")
-            self._stopping.wait(RETRY_S)
+            self._stopping.wait(RECONNECT_DELAY_S)
 
     def _set_bus_error(self, error: str) -> None:
         with self._model.lock:
@@ -133,7 +133,7 @@ class LabSubscriber:
         except DecodeError:
             return
         with self._model.lock:
-            self._model.view.hear(health, time.monotonic())
+            self._model.view.update(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
         del key

@@ -282,7 +282,7 @@ class StudyConfig(Section):
         except ValidationError as error:
             raise InputError("; ".join(mistakes_in(error))) from error
 
-    def ways(self, controller: int) -> Ways:
+    def link_impairments(self, controller: int) -> Ways:
         """Return the link impairments of a controller, without the swept values."""
         own = self.controllers[controller].impairment
         return (self.impairment if own is None else own).ways

@@ -1,16 +1,21 @@
-"""The edge's event loop: asyncio with exact timers, and a transport of TCP connections with its own receive call.
+"""The edge's event loop: asyncio whose selector serves plain Modbus connections itself, with exact timers.
 
-asyncio's own transports are not used for plain connections: this one leaves the receive call to us, which kernel
-timestamps need, and costs less for each request (ADR 0027).
+asyncio queues a handle for each ready socket, runs it in a context, and asks the transport, then the protocol: as much
+time as a Modbus request takes. Here a ready socket is read and answered inside `select()` (ADR 0027). The
+transport has its own receive call, which kernel timestamps need.
 """
 
 import asyncio
 import logging
+import os
 import select
 import selectors
 import socket
 from collections.abc import Callable
-from typing import Any, Final
+from contextvars import Context
+from selectors import EVENT_READ, EVENT_WRITE
+from time import monotonic
+from typing import Any, Final, TypeVarTuple
 
 HIGH_WATER: Final = 65_536
 LOW_WATER: Final = 16_384
@@ -18,33 +23,133 @@ LOW_WATER: Final = 16_384
 ACCEPT_RETRY_S: Final = 1.0
 """Pause after a connection could not be accepted, s."""
 
+_MS: Final = 0.001
+_Args = TypeVarTuple("_Args")
+_Ready = list[tuple[int, int]]
+"""File descriptors and their events as the system reports them."""
+
 logger = logging.getLogger(__name__)
 
 
-class ExactSelector(selectors.DefaultSelector):
-    """A selector whose time-outs are exact; the standard library rounds those of epoll up to whole milliseconds."""
+class DirectSelector(selectors.DefaultSelector):
+    """Selector of an asyncio event loop that serves sockets inside `select()` (in-selector I/O), with exact timeouts.
+
+    A socket that was registered with a function is served by calling it, and the selector keeps waiting. asyncio gets
+    only the events of its own sockets, and control when there is work for it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asyncio_has_work = False
+        """A callback or timer was given to asyncio since it started to wait: `select` returns to it."""
+        self._callbacks: dict[int, Callable[[int], None]] = {}
+        """Functions of the sockets that are served here, by file descriptor."""
+        self._poll: Callable[[float | None], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        """See `selectors.BaseSelector.register`; `data` that is callable is called with the events."""
+        key = super().register(fileobj, events, data)
+        # asyncio's own data is a pair of handles.
+        if callable(data):
+            self._callbacks[key.fd] = data
+        return key
+
+    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
+        """See `selectors.BaseSelector.unregister`."""
+        key = super().unregister(fileobj)
+        self._callbacks.pop(key.fd, None)
+        return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """See `selectors.BaseSelector.select`."""
-        if timeout is not None and timeout > 0 and hasattr(select, "epoll"):
-            # The handle of the epoll set is older than those of all connections: `select` can wait for its number.
-            select.select((self,), (), (), timeout)
-            timeout = 0
-        return super().select(timeout)
+        """See `selectors.BaseSelector.select`; sockets that are served here do not end the wait."""
+        poll, callback_of = self._poll, self._callbacks.get
+        deadline_s = None if timeout is None else monotonic() + timeout
+        others: list[tuple[selectors.SelectorKey, int]] = []
+        self.asyncio_has_work = False
+        while True:
+            for descriptor, mask in poll(timeout):
+                callback = callback_of(descriptor)
+                # Nearly always there is only something to read.
+                events = EVENT_READ if mask == EVENT_READ else _events_of(mask)
+                if callback is not None:
+                    callback(events)
+                elif (key := self.get_map().get(descriptor)) is not None and events & key.events:
+                    others.append((key, events & key.events))
+            if others or self.asyncio_has_work:
+                return others
+            if deadline_s is not None:
+                timeout = deadline_s - monotonic()
+                if timeout <= 0:
+                    return others
+
+    def _super_poll(self, timeout: float | None) -> _Ready:
+        return [(key.fd, events) for key, events in super().select(timeout)]
 
 
-def new_event_loop() -> asyncio.SelectorEventLoop:
-    """An asyncio event loop with exact timers."""
-    return asyncio.SelectorEventLoop(ExactSelector())
+if hasattr(select, "epoll"):
+
+    def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float | None], _Ready]:
+        """Return a function that waits for events, possibly for less than its timeout.
+
+        The standard library makes a key of each event, which takes longer than the system call.
+        """
+        # A descriptor of its own for the same set, because it is closed with this object. It is older than those of all
+        # connections, so that `select` can wait for its number.
+        epoll = select.epoll.fromfd(os.dup(selector.fileno()))
+        poll, own_descriptor, wait = epoll.poll, (epoll,), select.select
+
+        def poll_for(timeout: float | None) -> _Ready:
+            if timeout is None:
+                return poll()
+            if timeout >= _MS:
+                # epoll counts whole milliseconds and rounds up: half a millisecond less gives no more than remain.
+                return poll(int(timeout / _MS) * _MS - _MS / 2)
+            if timeout > 0:
+                wait(own_descriptor, (), (), timeout)
+            return poll(0)
+
+        return poll_for
+
+    def _events_of(mask: int) -> int:
+        return (EVENT_READ if mask & ~select.EPOLLOUT else 0) | (EVENT_WRITE if mask & ~select.EPOLLIN else 0)
+
+    assert select.EPOLLIN == EVENT_READ
+else:
+
+    def _events_of(mask: int) -> int:
+        return mask
+
+
+class DirectEventLoop(asyncio.SelectorEventLoop):
+    """An asyncio event loop on a `DirectSelector`."""
+
+    def __init__(self) -> None:
+        self.direct = DirectSelector()
+        super().__init__(self.direct)
+
+    def call_soon(
+        self, callback: Callable[[*_Args], object], *args: *_Args, context: Context | None = None
+    ) -> asyncio.Handle:
+        """See `asyncio.loop.call_soon`."""
+        self.direct.asyncio_has_work = True
+        return super().call_soon(callback, *args, context=context)
+
+    def call_at(
+        self, when: float, callback: Callable[[*_Args], object], *args: *_Args, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """See `asyncio.loop.call_at`, which `call_later` uses too."""
+        self.direct.asyncio_has_work = True
+        return super().call_at(when, callback, *args, context=context)
 
 
 class SocketTransport(asyncio.Transport):
-    """Transport of one TCP connection, for an `asyncio.BufferedProtocol` that `set_protocol` names."""
+    """Transport of one TCP connection; its protocol is an `asyncio.BufferedProtocol`, set by `set_protocol`."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, connected: socket.socket, peer: Any) -> None:
+    def __init__(self, loop: DirectEventLoop, connected: socket.socket, peer: Any) -> None:
         super().__init__({"socket": connected, "peername": peer})
         connected.setblocking(False)
         self._loop = loop
+        self._selector = loop.direct
         self._socket = connected
         self._receive_into = connected.recv_into
         self._send = connected.send
@@ -54,8 +159,7 @@ class SocketTransport(asyncio.Transport):
         self._protocol_paused = False
         self._closing = False
         self._lost = False
-        self._reader_added = False
-        self._writer_added = False
+        self._events = 0
 
     # -- the interface of asyncio's transports
 
@@ -116,25 +220,31 @@ class SocketTransport(asyncio.Transport):
     # -- events of the socket
 
     def _update_events(self) -> None:
-        """Register with the event loop for the events that are needed now."""
-        reads = self._reading_enabled and not self._closing and self._protocol is not None
-        if reads != self._reader_added:
-            self._reader_added = reads
-            if reads:
-                self._loop.add_reader(self._socket, self._on_event, self._read)
-            else:
-                self._loop.remove_reader(self._socket)
-        writes = bool(self._send_buffer)
-        if writes != self._writer_added:
-            self._writer_added = writes
-            if writes:
-                self._loop.add_writer(self._socket, self._on_event, self._flush)
-            else:
-                self._loop.remove_writer(self._socket)
+        """Register with the selector for the events that are needed now."""
+        events = 0
+        if not self._lost:
+            if self._reading_enabled and not self._closing and self._protocol is not None:
+                events = EVENT_READ
+            if self._send_buffer:
+                events |= EVENT_WRITE
+        if events == self._events:
+            return
+        if not self._events:
+            self._selector.register(self._socket, events, self._on_event)
+        elif not events:
+            self._selector.unregister(self._socket)
+        else:
+            self._selector.modify(self._socket, events, self._on_event)
+        self._events = events
 
-    def _on_event(self, handle: Callable[[], None]) -> None:
+    def _on_event(self, events: int) -> None:
+        # An earlier callback of the same poll may have closed this connection.
+        events &= self._events
         try:
-            handle()
+            if events & EVENT_READ:
+                self._read()
+            if events & EVENT_WRITE:
+                self._flush()
         except Exception as error:
             logger.exception("connection %s closed: internal error", self.get_extra_info("peername"))
             self._abort(error)
@@ -185,16 +295,22 @@ class SocketTransport(asyncio.Transport):
             self._socket.close()
 
 
-async def accept_connections(listening: socket.socket, on_accept: Callable[[SocketTransport], None]) -> None:
-    """Pass each accepted connection to `on_accept`, until cancelled."""
-    loop = asyncio.get_running_loop()
+async def accept_connections(
+    loop: DirectEventLoop, listening: socket.socket, on_accept: Callable[[SocketTransport], None]
+) -> None:
+    """Pass each accepted connection to `on_accept`, until the task is canceled."""
     listening.setblocking(False)
     while True:
         try:
             connected, peer = await loop.sock_accept(listening)
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
-            logger.warning("connection not accepted on %s: %s", listening.getsockname(), error)
+            logger.warning(
+                "can't accept a connection on %s: %s; retrying in %g s",
+                listening.getsockname(),
+                error,
+                ACCEPT_RETRY_S,
+            )
             await asyncio.sleep(ACCEPT_RETRY_S)
             continue
         on_accept(SocketTransport(loop, connected, peer))

@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop p50 / p99", "big wide"], ["late", "tick p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
@@ -214,11 +214,11 @@ function showLab(lab) {
   }
   const alarms = [...rigs.values()].filter((rig) => rig.level === "bad").length;
   const totals = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
-    [lab.rigs.filter((rig) => rig.recording).length, "recorded"]];
+    [lab.rigs.filter((rig) => rig.recording).length, "recording"]];
   if (alarms) totals.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
   byId("summary").replaceChildren(...totals.map(([number, label]) =>
     html("li", label.startsWith("alarm") ? {class: "alarm"} : {}, html("b", {}, String(number)), ` ${label}`)));
-  const alerts = lab.troubles.map((text) => ["warn", text]);
+  const alerts = lab.alerts.map((text) => ["warn", text]);
   if (lab.link) alerts.unshift(["bad", lab.link]);
   else if (!runs) {
     alerts.unshift(["bad", `No services of the lab “${lab.lab}” found: start it with “hilrig up” and the same lab.toml.`]);
@@ -241,7 +241,7 @@ function showServices(services) {
     const cells = [service.host, service.rigs, service.cpu_percent.toFixed(0), service.memory_mib.toFixed(0),
       service.lateness_p99_ms.toFixed(2), service.overruns, service.lost_transport + service.lost_recorder,
       service.clock_peer ? `${service.clock_offset_ms < 0 ? "−" : "+"}${Math.abs(service.clock_offset_ms).toFixed(1)} ± ${service.clock_uncertainty_ms.toFixed(1)}` : "–"];
-    const row = html("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
+    const row = html("tr", service.silent || service.alert ? {"data-level": "bad"} : {},
       html("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
     row.append(...cells.map((cell, number) => html("td", number ? {class: "n"} : {}, String(cell))));
     return row;

@@ -20,7 +20,7 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.plant.world import NONE
+from hilrig_sim.plant.world import NO_PART
 from hilrig_sim.platform_fingerprint import machine_name
 
 OTHER_PLATFORM_TOLERANCE: Final = 1e-9
@@ -124,7 +124,7 @@ class _Block:
     states: Rows
     parts: Rows
     held: Ints
-    """Index of the held part in the scene, or `NONE`."""
+    """Index of the held part in the scene, or `NO_PART`."""
     first_part: Ints
     """Row of `parts` with the first part of each state, -1 if the state contains no parts."""
     follows: NDArray[np.bool_]
@@ -198,7 +198,7 @@ class _Resimulation:
         plant = Plant([self._parameters] * len(intervals))
         for rig, (begin, _) in enumerate(intervals):
             if begin == 0 and self._continues:
-                plant.adopt(self._unfinished, [rig], [0])
+                plant.copy_state_from(self._unfinished, [rig], [0])
             else:
                 self._place(plant, rig, block, begin)
         begins, ends = (np.array(column) for column in zip(*intervals, strict=True))
@@ -209,7 +209,7 @@ class _Resimulation:
             active = np.flatnonzero(begins + step < ends)
             diverging = min(diverging, self._compare(block, plant, active, rows[active] + 1))
             if continues and begins[-1] + step == ends[-1] - 1:
-                self._unfinished.adopt(plant, [0], [len(intervals) - 1])
+                self._unfinished.copy_state_from(plant, [0], [len(intervals) - 1])
         if self._first is None and diverging < len(block.states):
             self._first = int(block.states["step"][diverging])
 
@@ -246,7 +246,7 @@ class _Resimulation:
         """First row in [`low`, `high`) that contains everything that the next step depends on."""
         for offset in np.flatnonzero(block.first_part[low:high] >= 0):
             row = low + int(offset)
-            if not any_held and block.held[row] != NONE:
+            if not any_held and block.held[row] != NO_PART:
                 continue
             self._place(self._probe, 0, block, row)
             if self._probe.world.at_rest(0):
@@ -257,7 +257,7 @@ class _Resimulation:
         parts = block.parts[block.first_part[row] :][: len(self._parameters.scene.parts)]
         poses = list(zip(*(parts[name].tolist() for name in ("x", "y", "z", "yaw")), strict=True))
         state = block.states[row]
-        plant.place(rig, state["position"], state["velocity"], poses, int(block.held[row]))
+        plant.set_state(rig, state["position"], state["velocity"], poses, int(block.held[row]))
 
     def _part_deviation(self, block: _Block, plant: Plant, rigs: Ints, rows: Ints) -> Floats:
         """Largest deviation of a part from the recording, m, shape (rigs,); infinite if another part is held."""
@@ -274,11 +274,11 @@ class _Resimulation:
 
 
 def _indices(codes: Rows, names: StringTable, parts: Sequence[str]) -> Ints:
-    """Index of the part that is held in each state, or `NONE`."""
+    """Index of the part that is held in each state, or `NO_PART`."""
     index_of = {part: index for index, part in enumerate(parts)}
-    found = np.full(len(codes), NONE, dtype=np.int64)
+    found = np.full(len(codes), NO_PART, dtype=np.int64)
     for code in np.unique(codes):
-        found[codes == code] = index_of.get(names[code], NONE)
+        found[codes == code] = index_of.get(names[code], NO_PART)
     return found
 
 

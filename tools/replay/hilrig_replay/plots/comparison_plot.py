@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from hilrig_replay.analysis.compare import Comparison
 from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.summary import RunSummary
-from hilrig_replay.plots.axes_style import label_axes
+from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
 from hilrig_replay.plots.palette import JOINT_SYMBOLS, RUN_COLORS
 from hilrig_sim.arm.model import JOINT_SCALE
@@ -47,8 +47,8 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
             loop_ns, share = complementary_cdf(summary.latency.table.column("loop"))
             latency.step(loop_ns / 1e6, share, where="post", color=color, linewidth=1.2)
     top.set_aspect("equal", adjustable="datalim")
-    label_axes(top, "Tool paths, top view, mm", "x", "y")
-    latency.set_yscale("log")
+    label_axes(top, "Tool paths, top view", "x, mm", "y, mm")
+    set_log_scale(latency)
     latency.grid(color="#e5e5e5", linewidth=0.6)
     label_axes(latency, "Loop latency, tail distribution", "loop latency, ms", "share of slower samples")
     return figure

@@ -97,7 +97,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     axes.set_xlim(0, limit)
     axes.set_ylim(bottom=0.7)
     more = f"; {beyond} above {limit:g} ms" if beyond else ""
-    label_axes(axes, f"Loop latency histogram (grid: steps of {step:g} ms{more})", "loop latency, ms", "samples")
+    label_axes(axes, f"Loop latency histogram (grid: {step:g} ms steps{more})", "loop latency, ms", "samples")
 
 
 def _stages(axes: Axes, report: LatencyReport) -> None:

@@ -36,7 +36,7 @@ def motion_figure(trajectory: Trajectory, parameters: RigParameters, task: TaskC
     top = figure.add_subplot(grid[:, 1])
     _draw_workspace(top, parameters, task)
     top.plot(trajectory.tip[:, 0] * 1e3, trajectory.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
-    label_axes(top, "Tool path, top view, mm", "x", "y")
+    label_axes(top, "Tool path, top view", "x, mm", "y, mm")
     return figure
 
 

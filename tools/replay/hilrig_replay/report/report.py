@@ -226,7 +226,7 @@ def _session_and_origin(summary: RunSummary) -> str:
 
 def _facts(page: _Page) -> str:
     summary = page.summary
-    facts = [(f"{summary.duration_s:.1f} s", f"duration; end: {summary.ended or 'unknown'}")]
+    facts = [(f"{summary.duration_s:.1f} s", f"duration; {summary.ended or 'unknown ending'}")]
     if summary.grade is not None:
         facts.append((f"{summary.grade.percent} %", f"task: {summary.grade.headline()}"))
     if summary.placement is not None:
@@ -298,7 +298,7 @@ def _events(summary: RunSummary) -> str:
 def _overview(pages: Sequence[_Page]) -> str:
     graded = any(page.summary.grade is not None for page in pages)
     header = ["run", *(("goals", "time, s", "error, mm") if graded else ("parts placed", "placement error, mm"))]
-    header += ["loop p50 / p99, ms", "path, m", "work, J", "saturation", "alarms", "valid latency"]
+    header += ["loop p50 / p99, ms", "path, m", "work, J", "saturation", "alarms", "latency valid"]
     rows = []
     for number, page in enumerate(pages, start=1):
         summary, loop = page.summary, page.summary.latency.loop_ms

@@ -68,7 +68,7 @@ def run_live_points(
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
         mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        rigs = {f"point{i + 1}": _ways(study, cells[i]) for i in mine}
+        rigs = {f"point{i + 1}": _point_impairments(study, cells[i]) for i in mine}
         _write_lab(config, study, step_ms, rigs, recordings, find_ports)
         lab = load_lab(config)
         with start_lab(lab, config) as check_processes:
@@ -85,13 +85,13 @@ def _point_values(point: PointConfig, controller: str, run: Run) -> dict[str, An
     return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
-def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
+def _point_impairments(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
     """Return the link impairments of a point.
 
     Raises:
         InputError: the command link is impaired by the study and by the swept values.
     """
-    base = study.ways(int(cell["controller"][0]))
+    base = study.link_impairments(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base
@@ -121,8 +121,8 @@ def _write_lab(
         f"scene = {_toml({'trays': [], 'parts': []})}",
     ]
     arm = _toml(single_rig_lab.rigs[0].arm.model_dump())
-    for name, ways in {CLOCK_RIG: Ways(), **rigs}.items():
-        impairment = {"seed": study.seed, **ways.model_dump()}
+    for name, links in {CLOCK_RIG: Ways(), **rigs}.items():
+        impairment = {"seed": study.seed, **links.model_dump()}
         lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {_toml(impairment)}"]
     try:
         config.write_text("\n".join(lines) + "\n", encoding="utf-8")
