@@ -43,7 +43,7 @@ from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.server.admission import Limits
 from hilrig_modbus_edge.server.connection import Connection as ModbusConnection
 from hilrig_modbus_edge.server.listener import RigServer
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import JointState, topics
 
@@ -174,10 +174,10 @@ WRITE = bytes.fromhex("0002 0000 000f 01 10 0000 0004 08 0001 0002 0003 0004")
 def own_code_us(frame: bytes, times: int = 30_000) -> float:
     """Processor time of one request from the bytes that came to the bytes that go, without sockets, µs."""
     with Service("edge", lab_of(1, 1), NowhereBus()) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
+        service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
         state = JointState(rig="rig1", step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-        arrival = Arrival(state.SerializeToString(), service.clock.monotonic_ns())
-        output = Mock(send_command=service.sender(topics.COMMAND, "rig1").send)
+        arrival = TimestampedPayload(state.SerializeToString(), service.clock.monotonic_ns())
+        output = Mock(send_command=service.rig_publisher(topics.COMMAND, "rig1").publish)
         device = Device("rig1", DeviceSettings(), service.clock, output, lambda: arrival)
         server = RigServer(device, Limits(), service.clock, service.counters)
         transport = Mock(write=lambda _: None)

@@ -20,7 +20,7 @@ from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run, open_run
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 from support.edge_rig import RawClient
 from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import eventually
@@ -120,7 +120,7 @@ def shown(lab_folder: Path) -> dict[str, Any]:
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
         ports = lab.lab.ports
-        assert f"{ports['constant-way']}, step 10 ms, impaired: state way none; command way constant" in lab.output()
+        assert f"{ports['constant-way']}, step 10 ms, impairment: state way none; command way constant" in lab.output()
         assert f"{ports['free']}, step 10 ms\n" in lab.output()
         controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-way": write_for_each_state}
         threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
@@ -163,7 +163,7 @@ def test_injected_delay_has_configured_distribution(sessions: dict[str, Session]
 def test_each_command_has_the_delay_of_its_seed(sessions: dict[str, Session], rig: str) -> None:
     commands = sessions[rig].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
-    way = WayImpairment.model_validate(COMMAND_RIGS[rig])
+    way = LinkImpairment.model_validate(COMMAND_RIGS[rig])
     sampled, _ = Impairment(way, link_seed(SEED, rig, "command")).draw(2000)
     expected = sampled[(commands["seq"] - commands["seq"][0]).astype(int)]
     assert commands["command_injected_ns"].tolist() == expected.tolist()
@@ -191,7 +191,7 @@ def test_injected_state_delay_is_that_of_its_seed(sessions: dict[str, Session]) 
     assert_stages_add_up(session)
     assert session.report.samples > 250
     table = session.report.table[5:-5]
-    sampled, _ = Impairment(WayImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
+    sampled, _ = Impairment(LinkImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
     (first,) = np.flatnonzero(sampled == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
     assert table["injected"].tolist() == sampled[first + after].tolist()

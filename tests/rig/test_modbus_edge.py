@@ -134,7 +134,7 @@ def test_operator_queries_and_revokes_the_lease() -> None:
         key = topics.LEASE.key(rig.lab.name, "rig1")
 
         def ask(release: bool = False) -> LeaseStatus:
-            [answer] = teacher.ask(key, LeaseRequest(release=release).SerializeToString())
+            [answer] = teacher.query(key, LeaseRequest(release=release).SerializeToString())
             return LeaseStatus.FromString(answer.payload)
 
         assert ask().holder == ""

@@ -25,7 +25,7 @@ from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.security.x509 import (
     ROLE_OID,
-    Identity,
+    Credential,
     issue_client,
     issue_server,
     make_authority,
@@ -49,9 +49,9 @@ class Lab:
     """Certificates of a lab, in a folder."""
 
     folder: Path
-    authority: Identity
+    authority: Credential
 
-    def write(self, name: str, identity: Identity) -> None:
+    def write(self, name: str, identity: Credential) -> None:
         (self.folder / f"{name}.pem").write_bytes(identity.certificate_pem)
         (self.folder / f"{name}.key").write_bytes(identity.key_pem)
 
@@ -173,7 +173,7 @@ def client_with(lab: Lab, name: str, *values: bytes) -> ssl.SSLContext:
         # The builder rejects a duplicate extension.
         role = x509.Extension(ROLE_OID, critical=False, value=x509.UnrecognizedExtension(ROLE_OID, value))
         builder._extensions = [*builder._extensions, role]
-    lab.write(name, Identity(builder.sign(lab.authority.key, hashes.SHA256()), issued.key))
+    lab.write(name, Credential(builder.sign(lab.authority.key, hashes.SHA256()), issued.key))
     return lab.client(name)
 
 
@@ -521,7 +521,7 @@ def test_invalid_certificate_files_are_reported(tmp_path: Path) -> None:
     (folder / "bus/ca.key").write_text("no key")
     done = hilrig("certs", folder)
     assert done.returncode == 2
-    assert "bus/ca.pem and ca.key are no certificate and key" in done.stderr
+    assert "bus/ca.pem, ca.key: not a valid certificate with its key" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -77,7 +77,7 @@ def test_publishes_states_at_its_step_and_its_configuration(sim: SimProcess) -> 
     passed_ns = states[-1].sampled_ns - states[0].sampled_ns
     missed = sum(state.missed_steps for state in states[1:])
     assert passed_ns == pytest.approx((59 + missed) * 20e6, abs=20e6)
-    (answer,) = sim.bus.ask(CONFIG.key(sim.lab.name, "rig1"), timeout_s=5.0)
+    (answer,) = sim.bus.query(CONFIG.key(sim.lab.name, "rig1"), timeout_s=5.0)
     config = RigConfig.FromString(answer.payload)
     assert (config.rig, config.incarnation, config.step_ns) == ("rig1", states[0].incarnation, 20_000_000)
     assert len(RigParameters.from_json(config.parameters_json).scene.parts) == 4

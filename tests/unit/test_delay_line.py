@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hilrig_modbus_edge.impairment.delay_line import DelayedStates, DelayLine
 from hilrig_modbus_edge.impairment.schedule import ImpairmentSchedule
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 MS = 1_000_000
 
@@ -67,7 +67,7 @@ def test_reader_gets_newest_delivered_state_never_older(
     states = DelayedStates(iter([(delay, lost) for _, delay, lost in messages]), None)
     starts = list(itertools.accumulate(gap for gap, _, _ in messages))
     for start, number in zip(starts, range(len(messages)), strict=True):
-        states.arrive(Arrival(bytes([number]), start))
+        states.arrive(TimestampedPayload(bytes([number]), start))
     seen = -1
     # Reading before all messages were sent is no special case: each message has the sample of its number.
     for now in sorted(read_times):
@@ -88,13 +88,13 @@ def test_reader_gets_newest_delivered_state_never_older(
 
 
 def test_served_state_stays_until_newer_one_is_delivered() -> None:
-    first = Arrival(b"first", 0)
+    first = TimestampedPayload(b"first", 0)
     states = DelayedStates(itertools.repeat((100, False)), first)
     assert states.newest(10) is first
-    states.arrive(Arrival(b"second", 20))
+    states.arrive(TimestampedPayload(b"second", 20))
     assert states.newest(119) is first
     second = states.newest(120)
-    assert second == Arrival(b"second", 20, 100)
+    assert second == TimestampedPayload(b"second", 20, 100)
     assert states.newest(500) is second
 
 

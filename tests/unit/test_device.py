@@ -13,7 +13,7 @@ from hilrig_modbus_edge.registers.map import (
     RegisterTable,
     Status,
 )
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
 
@@ -585,7 +585,7 @@ def test_invalid_state_message_is_ignored(bench: Bench) -> None:
     client = bench.connect()
     before = bench.read(client, 4, 4)
     for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
-        bench.arrival = Arrival(payload, bench.clock.monotonic_ns())
+        bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
 
 

@@ -164,7 +164,7 @@ def test_stages_not_negative_and_numbers_increase(preset: str, seed: int, step_m
         assert_stages_not_negative(command)
     status = bench.device.impairment.status()
     assert status.commands == 60
-    assert len(client_commands(bench)) == status.commands - status.commands_lost - status.commands_overtaken
+    assert len(client_commands(bench)) == status.commands - status.commands_lost - status.commands_superseded
 
 
 def test_same_seed_gives_same_delays_in_each_session() -> None:
@@ -199,7 +199,7 @@ def test_watchdog_zero_is_not_delayed_and_drops_commands() -> None:
     assert last.command_injected_ns == 0
     advance(bench, 3000)
     assert not client_commands(bench), "the delayed torque must not be sent after the trip"
-    assert bench.device.impairment.status().commands_overtaken == 1
+    assert bench.device.impairment.status().commands_superseded == 1
 
 
 def test_watchdog_trips_when_all_commands_are_lost() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from hilrig_modbus_edge.impairment.model import Impairment, link_seed
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 
 COUNT = 20_000
 DISTRIBUTIONS = {
@@ -24,7 +24,7 @@ DISTRIBUTIONS = {
 
 
 def sampled_ms(text: str, count: int = COUNT, seed: int = 1) -> np.ndarray:
-    delay_ns, lost = Impairment(WayImpairment.model_validate(text), seed).draw(count)
+    delay_ns, lost = Impairment(LinkImpairment.model_validate(text), seed).draw(count)
     assert delay_ns.dtype == np.int64
     assert not lost.any()
     return np.asarray(delay_ns / 1e6)
@@ -46,7 +46,7 @@ def test_delay_is_never_negative() -> None:
 
 def test_trace_is_repeated_in_its_order() -> None:
     trace = [1.0, 2.0, 3.0, 50.0, 7.0]
-    link = WayImpairment.model_validate({"delay": {"kind": "trace", "delays_ms": trace}})
+    link = LinkImpairment.model_validate({"delay": {"kind": "trace", "delays_ms": trace}})
     starts = set()
     for seed in range(40):
         delays = (Impairment(link, seed).draw(3000)[0] / 1e6).tolist()
@@ -57,15 +57,15 @@ def test_trace_is_repeated_in_its_order() -> None:
 
 
 def test_independent_losses_have_their_rate() -> None:
-    link = WayImpairment.model_validate({"loss": "bernoulli:0.03"})
+    link = LinkImpairment.model_validate({"loss": "bernoulli:0.03"})
     lost = Impairment(link, 5).draw(100_000)[1]
     assert stats.binomtest(int(lost.sum()), len(lost), 0.03).pvalue > 0.01
-    assert Impairment(WayImpairment.model_validate({"loss": "bernoulli:1"}), 5).draw(3000)[1].all()
+    assert Impairment(LinkImpairment.model_validate({"loss": "bernoulli:1"}), 5).draw(3000)[1].all()
 
 
 def test_gilbert_losses_have_configured_burst_length() -> None:
     """A fraction to_bad / (to_bad + to_good) is lost, in bursts of geometric length with mean 1 / to_good."""
-    lost = Impairment(WayImpairment.model_validate({"loss": "gilbert:0.01,0.2"}), 5).draw(400_000)[1]
+    lost = Impairment(LinkImpairment.model_validate({"loss": "gilbert:0.01,0.2"}), 5).draw(400_000)[1]
     assert lost.mean() == pytest.approx(0.01 / 0.21, rel=0.05)
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     lengths = np.diff(edges)[(0 if lost[edges[0] + 1] else 1) :: 2]
@@ -78,13 +78,13 @@ def test_gilbert_losses_have_configured_burst_length() -> None:
 
 
 def test_gilbert_model_starts_in_stationary_distribution() -> None:
-    link = WayImpairment.model_validate({"loss": "gilbert:0.05,0.2"})
+    link = LinkImpairment.model_validate({"loss": "gilbert:0.05,0.2"})
     first = [Impairment(link, seed).draw(1)[1][0] for seed in range(400)]
     assert stats.binomtest(sum(map(int, first)), len(first), 0.05 / 0.25).pvalue > 0.01
 
 
 def test_gilbert_elliott_has_loss_rate_per_state() -> None:
-    lost = Impairment(WayImpairment.model_validate({"loss": "gilbert:0.1,0.3,0.6,0.05"}), 5).draw(200_000)[1]
+    lost = Impairment(LinkImpairment.model_validate({"loss": "gilbert:0.1,0.3,0.6,0.05"}), 5).draw(200_000)[1]
     assert lost.mean() == pytest.approx(0.25 * 0.6 + 0.75 * 0.05, rel=0.03)
 
 
@@ -95,7 +95,7 @@ def test_gilbert_elliott_has_loss_rate_per_state() -> None:
     seed=st.integers(0, 2**63 - 1),
 )
 def test_samples_do_not_depend_on_block_sizes(text: str, loss: str, pieces: list[int], seed: int) -> None:
-    link = WayImpairment.model_validate({"delay": text, "loss": loss})
+    link = LinkImpairment.model_validate({"delay": text, "loss": loss})
     delays, losses = Impairment(link, seed).draw(sum(pieces))
     again = Impairment(link, seed)
     parts = [again.draw(count) for count in pieces]
@@ -106,13 +106,13 @@ def test_samples_do_not_depend_on_block_sizes(text: str, loss: str, pieces: list
 
 
 def test_loss_model_does_not_change_the_delays() -> None:
-    without = Impairment(WayImpairment.model_validate("gamma:20,8"), 3).draw(2000)[0]
-    lossy = WayImpairment.model_validate({"delay": "gamma:20,8", "loss": "bernoulli:0.5"})
+    without = Impairment(LinkImpairment.model_validate("gamma:20,8"), 3).draw(2000)[0]
+    lossy = LinkImpairment.model_validate({"delay": "gamma:20,8", "loss": "bernoulli:0.5"})
     assert Impairment(lossy, 3).draw(2000)[0].tolist() == without.tolist()
 
 
 def test_each_rig_and_link_has_an_independent_stream() -> None:
-    link = WayImpairment.model_validate("uniform:0,10")
+    link = LinkImpairment.model_validate("uniform:0,10")
     streams = [
         Impairment(link, link_seed(seed, rig, name)).draw(4000)[0]
         for seed in (1, 2)

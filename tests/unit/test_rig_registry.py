@@ -8,7 +8,7 @@ import pytest
 
 from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
@@ -76,7 +76,9 @@ def test_added_rig_moves_and_is_recorded() -> None:
         mine = [state for state in lab.states if state.rig == "guest"]
         assert len(mine) == 20
         assert mine[-1].position[0] > 0.01
-        assert [key for key, *_ in lab.service.log._entries].count(topics.STATE.key(lab.lab.name, "guest")) == 20
+        assert [key for key, *_ in lab.service.recording_stream._entries].count(
+            topics.STATE.key(lab.lab.name, "guest")
+        ) == 20
 
 
 def test_copied_state_includes_falling_and_held_parts() -> None:
@@ -102,14 +104,14 @@ class RegistryRig(VirtualRig):
 
     def __init__(self) -> None:
         super().__init__(LAB)
-        turns = Turns()
+        turns = OwnerThreadExecutor()
         turns.call = lambda work: work()  # type: ignore[method-assign]
         self.registry = RigRegistry(self.service, self.simulation, turns)
 
     def ask(self, kind: Event.Kind, rig: str, settings: str = "") -> str:
         request = Event(kind=kind, rig=rig)
         request.configuration_data.text = settings
-        (answer,) = self.service.bus.ask(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
+        (answer,) = self.service.bus.query(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
         return answer.error or Event.FromString(answer.payload).text
 
 
@@ -125,11 +127,11 @@ def test_start_event_has_the_step_parameters() -> None:
 def test_rig_is_added_described_and_removed_by_query() -> None:
     with RegistryRig() as lab:
         assert lab.ask(Event.RIG_ADDED, "guest", GUEST.model_dump_json()) == "guest is simulated"
-        (answer,) = lab.service.bus.ask(topics.CONFIG.key(LAB.name, "guest"))
+        (answer,) = lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest"))
         assert RigConfig.FromString(answer.payload).rig == "guest"
         assert [rig.name for rig in lab.service.rigs] == ["rig1", "rig2", "rig3", "guest"]
         assert lab.ask(Event.RIG_REMOVED, "guest") == "guest is no longer simulated"
-        assert lab.service.bus.ask(topics.CONFIG.key(LAB.name, "guest")) == []
+        assert lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest")) == []
         assert lab.kinds()[-2:] == ["RIG_ADDED", "RIG_REMOVED"]
 
 
@@ -153,10 +155,10 @@ def test_invalid_requests_are_rejected_without_effect() -> None:
 
 def test_timed_out_call_fails_and_is_not_executed_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilrig_runtime.process.mailbox.TIMEOUT_S", 0.01)
-    turns, done = Turns(), []
+    turns, done = OwnerThreadExecutor(), []
     with pytest.raises(OperationError, match="too busy"):
         turns.call(lambda: done.append(1))
-    turns.run_waiting()
+    turns.run_pending()
     assert done == []
 
 

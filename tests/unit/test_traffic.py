@@ -1,4 +1,4 @@
-"""What controllers asked: from the note at the edge to the rows of a recording, and what is no such record."""
+"""Unit tests of the request log, from the edge to the rows of a recording."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def rows_of(message: ModbusTraffic, names: StringTable | None = None) -> Rows:
     return table.drain()
 
 
-_NOTES = st.lists(
+_REQUESTS = st.lists(
     st.tuples(
         st.binary(min_size=1, max_size=12) | st.sampled_from([READ, WRITE]),
         st.integers(0, 2**60),
@@ -32,17 +32,17 @@ _NOTES = st.lists(
 )
 
 
-@given(_NOTES)
-def test_what_was_noted_is_what_is_read_in_its_order(notes: list[tuple[bytes, int, int, int, str]]) -> None:
+@given(_REQUESTS)
+def test_recorded_requests_are_read_in_order(requests: list[tuple[bytes, int, int, int, str]]) -> None:
     log = RequestLog("rig1")
-    for pdu, arrived_ns, took_ns, exception, controller in notes:
+    for pdu, arrived_ns, took_ns, exception, controller in requests:
         log.record(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
-    assert log.count == len(notes)
+    assert log.count == len(requests)
     names = StringTable()
     rows = rows_of(log.drain(5_000, 7_000), names)
     assert log.count == 0
-    assert len(rows) == len(notes)
-    for row, (pdu, arrived_ns, took_ns, exception, controller) in zip(rows, notes, strict=True):
+    assert len(rows) == len(requests)
+    for row, (pdu, arrived_ns, took_ns, exception, controller) in zip(rows, requests, strict=True):
         assert (row["function"], row["exception"], names[row["controller"]]) == (pdu[0], exception, controller)
         assert (row["arrived_ns"], row["answered_ns"]) == (arrived_ns, arrived_ns + took_ns)
         assert row["wall_ns"] == arrived_ns + 2_000
@@ -69,7 +69,7 @@ def test_address_and_count_are_those_of_the_request(pdu: str, address: int, coun
     assert (row["address"], row["count"]) == (address, count)
 
 
-def test_who_asks_the_same_again_is_a_number_and_two_times() -> None:
+def test_repeated_requests_share_a_kind() -> None:
     log = RequestLog("rig1")
     for number in range(100):
         log.record(READ, number, number, 0, "10.0.0.1:1")
@@ -79,7 +79,7 @@ def test_who_asks_the_same_again_is_a_number_and_two_times() -> None:
     assert list(message.kind_indexes) == [0, 1] * 100
 
 
-def test_a_recording_of_before_has_a_record_a_request() -> None:
+def test_old_recordings_have_one_record_per_request() -> None:
     one = ModbusRequest(function=16, address=1, count=2, arrived_ns=50, answered_ns=60, exception=6, controller="a:1")
     names = StringTable()
     [row] = rows_of(ModbusTraffic(wall_ns=1_000, closed_ns=100, requests=[one]), names)
@@ -90,9 +90,7 @@ def test_a_recording_of_before_has_a_record_a_request() -> None:
 @pytest.mark.parametrize(
     ("indexes", "arrived", "after"), [([0, 0], [1], [1, 1]), ([1], [1], [1]), ([0], [1], [2**64 - 1])]
 )
-def test_columns_that_do_not_fit_together_are_no_record(
-    indexes: list[int], arrived: list[int], after: list[int]
-) -> None:
+def test_inconsistent_columns_are_rejected(indexes: list[int], arrived: list[int], after: list[int]) -> None:
     message = ModbusTraffic(
         kinds=[ModbusKind(function=3)], kind_indexes=indexes, arrived_ns=arrived, answered_after_ns=after
     )
@@ -100,7 +98,7 @@ def test_columns_that_do_not_fit_together_are_no_record(
         rows_of(message)
 
 
-def test_a_batch_of_a_flood_is_small() -> None:
+def test_batch_of_many_requests_is_small() -> None:
     log = RequestLog("rig1")
     for now_ns in np.arange(10**15, 10**15 + 256 * 20_000, 20_000).tolist():
         log.record(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigBatch
 
@@ -61,7 +61,7 @@ class CommandScheduler:
         self,
         source: str,
         put: Callable[[bytes], None],
-        newest_state: Callable[[str], Arrival | None],
+        newest_state: Callable[[str], TimestampedPayload | None],
         step_ns: int,
         clock: Clock,
         call_at: Callable[[float, Callable[[], None]], TimerHandle],

@@ -15,7 +15,7 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import RigSettings, read_rig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest
 
@@ -44,7 +44,7 @@ def serve_on_loop(bus: Bus, key: str, loop: asyncio.AbstractEventLoop, handler: 
         loop.call_soon_threadsafe(_set_result, done, partial(handler, payload))
         return done.result(REPLY_TIMEOUT_S)
 
-    return bus.serve(key, ask)
+    return bus.declare_queryable(key, ask)
 
 
 def handle_lease_query(device: Device, payload: bytes) -> bytes:
@@ -67,8 +67,8 @@ def handle_impairment_query(device: Device, payload: bytes) -> bytes:
         try:
             device.impairment.set(ImpairmentConfig.model_validate_json(request.set_json))
         except ValidationError as error:
-            raise InputError("; ".join(mistakes_in(error))) from error
-    elif request.as_lab:
+            raise InputError("; ".join(format_validation_error(error))) from error
+    elif request.restore_lab:
         device.impairment.set(None)
     return device.impairment.status().SerializeToString()
 

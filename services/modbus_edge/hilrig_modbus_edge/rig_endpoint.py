@@ -16,7 +16,7 @@ from hilrig_modbus_edge.server.listener import RigServer, bind
 from hilrig_modbus_edge.server.tls import TlsPolicy
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings
-from hilrig_runtime.messaging.endpoints import Arrival, LatestOfBatches
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, RigReport, topics
 
@@ -40,9 +40,9 @@ class BusOutput:
         check: Callable[[], int | None],
         send_due: Callable[[], None],
     ) -> None:
-        sender = service.sender(topics.COMMAND, rig, first=partial(commands.send, rig))
-        self.send_command = sender.send
-        self.repeat_command = sender.repeat
+        sender = service.rig_publisher(topics.COMMAND, rig, control_path=partial(commands.send, rig))
+        self.send_command = sender.publish
+        self.repeat_command = sender.republish
         self.emit: Callable[[Event], None] = service.emit
         self.sessions_changed = sessions_changed
         self._check = check
@@ -68,7 +68,7 @@ class BusOutput:
             self._send_ns = deadline_ns
             asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """See `DeviceOutput.follow_states`."""
         if self._states is not None:
             self._states.close()
@@ -76,7 +76,7 @@ class BusOutput:
         if arrive is not None:
             monotonic_ns = self._monotonic_ns
             self._states = self._bus.subscribe(
-                self._state_key, lambda _, payload: arrive(Arrival(payload, monotonic_ns()))
+                self._state_key, lambda _, payload: arrive(TimestampedPayload(payload, monotonic_ns()))
             )
 
     def _on_send(self) -> None:
@@ -98,7 +98,7 @@ class RigEndpoint:
         self,
         rig: RigSettings,
         service: Service,
-        states: LatestOfBatches,
+        states: LatestValueCache,
         commands: CommandScheduler,
         sessions_changed: Callable[[], None],
     ) -> None:
@@ -121,7 +121,7 @@ class RigEndpoint:
         """Resources that are closed with the endpoint."""
         self.address = ""
         """Human-readable listening addresses. Stored, because a thread of the bus reads them while the edge closes."""
-        self._request_log = service.sender(topics.TRAFFIC, rig.name)
+        self._request_log = service.rig_publisher(topics.TRAFFIC, rig.name)
         self.request_log_due_ns = 0
         """Time at which the request log is published next, ns, monotonic clock."""
         self._sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
@@ -192,4 +192,4 @@ class RigEndpoint:
 
     def _publish_request_log(self) -> None:
         clock = self._clock
-        self._request_log.send(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
+        self._request_log.publish(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))

@@ -23,7 +23,7 @@ from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Tick
-from hilrig_runtime.timing.realtime import freeze_garbage
+from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_schemas import topics
 
 TICK_NS: Final = 20_000_000
@@ -55,7 +55,7 @@ class EdgeService:
     def __init__(self, service: Service, loop: asyncio.AbstractEventLoop) -> None:
         self._service = service
         self._loop = loop
-        self._states = service.latest_of_batches(topics.STATES)
+        self._states = service.latest_value_cache(topics.STATES)
         self._commands = CommandScheduler(
             service.source,
             service.publisher(topics.COMMANDS).put,
@@ -91,7 +91,7 @@ class EdgeService:
                     endpoint.bind(ports[rig], tls_ports.get(rig))
             except OperationError:
                 # The port may be used by another edge of the lab that was not connected to the bus yet.
-                service.look_for_elders()
+                service.check_instance_conflict()
                 raise
             self._announce_sessions()
             for endpoint in self._endpoints.values():
@@ -103,7 +103,7 @@ class EdgeService:
             await self._wait_for_first_states()
             for endpoint in self._endpoints.values():
                 await endpoint.listen()
-            freeze_garbage()
+            freeze_gc()
             service.ready()
             await self._run_ticks()
         finally:
@@ -199,7 +199,7 @@ class EdgeService:
         sessions = [
             session for endpoint in self._endpoints.values() if (session := endpoint.device.session) is not None
         ]
-        self._service.log.set_sessions([session.as_message() for session in sessions])
+        self._service.recording_stream.set_sessions([session.as_message() for session in sessions])
 
     # -- time
 
@@ -234,4 +234,4 @@ class EdgeService:
             endpoint.stop("edge stopped")
         self._commands.flush()
         self._announce_sessions()
-        self._service.log.flush(self._service.clock.monotonic_ns())
+        self._service.recording_stream.flush(self._service.clock.monotonic_ns())

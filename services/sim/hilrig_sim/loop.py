@@ -36,7 +36,7 @@ class Simulation:
         self._plant = Plant(parameters)
         self._warm_up()
         tls = lab.bus.tls
-        self._commands = service.latest_of_batches(topics.COMMANDS, {} if tls is None else tls.edges)
+        self._commands = service.latest_value_cache(topics.COMMANDS, {} if tls is None else tls.edges)
         self._step_ns = lab.sim.step_ns
         self._clock = service.clock
         self._counters = service.counters
@@ -49,7 +49,7 @@ class Simulation:
             self._new_encoder(index, rig.name, values, self._plant)
             for index, (rig, values) in enumerate(zip(service.rigs, parameters, strict=True))
         ]
-        self._states = service.batch_sender(topics.STATES)
+        self._states = service.batch_publisher(topics.STATES)
         for rig in self._rigs:
             service.add_to_batch(self._states, topics.STATE, rig.name)
         self._update_motion()
@@ -100,7 +100,7 @@ class Simulation:
         # Most new commands are based on the same state.
         latencies_ns = {basis: sampled_ns - (times.get(basis) or sampled_ns) for basis in {r.basis_step for r in rigs}}
         ends = {basis: encode_loop_latency(latency_ns) for basis, latency_ns in latencies_ns.items()}
-        self._states.send([common + rig.encoded + ends[rig.basis_step] for rig in rigs])
+        self._states.publish([common + rig.encoded + ends[rig.basis_step] for rig in rigs])
         self._apply_commands(latencies_ns)
         events = plant.step(self._effort, self._magnet)
         if events:

@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.arm.model import RigParameters
@@ -42,7 +42,7 @@ class StaticReply:
 class RigRegistry:
     """Registry of the simulated rigs; a context manager."""
 
-    def __init__(self, service: Service, simulation: Simulation, turns: Turns) -> None:
+    def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
         self._service = service
         self._simulation = simulation
         self._turns = turns
@@ -51,7 +51,7 @@ class RigRegistry:
             self._serve(rig.name, parameters)
             self._emit_start(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
-        self._control = service.bus.serve(key, self._handle_control)
+        self._control = service.bus.declare_queryable(key, self._handle_control)
         service.counters.rigs = len(service.rigs)
 
     def __enter__(self) -> Self:
@@ -67,7 +67,7 @@ class RigRegistry:
     def _serve(self, rig: str, parameters: RigParameters) -> None:
         reply = StaticReply(configuration(self._service, rig, parameters).SerializeToString())
         key = topics.CONFIG.key(self._service.lab.name, rig)
-        self._served[rig] = self._service.bus.serve(key, reply)
+        self._served[rig] = self._service.bus.declare_queryable(key, reply)
 
     def _emit_start(self, rig: str, parameters: RigParameters) -> None:
         """Emit that a simulation starts, with its step: an open session then records that it was replaced."""
@@ -85,7 +85,7 @@ class RigRegistry:
             raise OperationError(
                 "the control request can't be decoded: client and simulation must have the same hilrig version"
             ) from error
-        with self._turns.alone:
+        with self._turns.exclusive:
             if request.kind == Event.RIG_ADDED:
                 text = self._add(read_rig(request.configuration_data.text))
             elif request.kind == Event.RIG_REMOVED:

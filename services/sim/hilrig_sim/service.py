@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
-from hilrig_runtime.timing.realtime import freeze_garbage
+from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.rig_registry import RigRegistry
@@ -21,10 +21,10 @@ def run(service: Service) -> None:
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
-    turns = Turns()
+    turns = OwnerThreadExecutor()
     with RigRegistry(service, simulation, turns):
         rate = Rate(step_ns, service.clock)
-        freeze_garbage()
+        freeze_gc()
         service.ready()
         stopping = service.stopping
         # Non-finite numbers are detected and handled by the simulation, without warnings.
@@ -33,5 +33,5 @@ def run(service: Service) -> None:
                 simulation.pre_encode(rate.next_ns)
                 tick = rate.wait()
                 simulation.tick(tick)
-                turns.run_waiting()
+                turns.run_pending()
                 service.beat(service.clock.monotonic_ns())

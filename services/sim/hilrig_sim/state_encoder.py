@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState, PartState, RigReport
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import CommandLatch, StepTimes
@@ -70,7 +70,7 @@ class RigStateEncoder:
         self.command = CommandLatch(incarnation, command_timeout_ns)
         self.encoded = b""
         """Encoded state without timestamps and loop latency, which the tick adds; empty: not encoded yet."""
-        self.arrival: Arrival | None = None
+        self.arrival: TimestampedPayload | None = None
         """Received command that it was encoded with."""
         self.basis_step = 0
         """Step that the new command is based on; 0: no new command, or an unknown step."""
@@ -102,7 +102,7 @@ class RigStateEncoder:
         self._motion, self._limit_flags = motion, limit_flags
         self.encoded = b""
 
-    def update_command(self, arrival: Arrival | None, now_ns: int) -> None:
+    def update_command(self, arrival: TimestampedPayload | None, now_ns: int) -> None:
         """Latch the newest command for the next tick; may be called again with a newer one before the tick."""
         self.arrival = arrival
         self.encoded = b""

@@ -34,7 +34,7 @@ from hilrig_modbus_edge.registers.map import (
     RegisterTable,
     Status,
 )
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
 
@@ -53,7 +53,7 @@ class Device:
         settings: DeviceSettings,
         clock: Clock,
         output: DeviceOutput,
-        newest_state: Callable[[], Arrival | None],
+        newest_state: Callable[[], TimestampedPayload | None],
         rng: random.Random | None = None,
     ) -> None:
         self.rig = rig

@@ -13,7 +13,7 @@ from hilrig_modbus_edge.impairment.delay_line import DelayedStates
 from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_modbus_edge.impairment.schedule import ImpairmentSchedule
 from hilrig_runtime.config.impairment import ImpairmentConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, ImpairmentStatus
 
@@ -29,7 +29,7 @@ class ImpairmentController:
         output: DeviceOutput,
         commands: CommandPublisher,
         events: EventEmitter,
-        newest_state: Callable[[], Arrival | None],
+        newest_state: Callable[[], TimestampedPayload | None],
     ) -> None:
         self.newest_state = newest_state
         """Return the newest state that the state link has delivered; None: none so far."""
@@ -44,7 +44,7 @@ class ImpairmentController:
 
     def start(self) -> None:
         """Apply the setting of lab.toml."""
-        if not self._schedule.links.do_nothing:
+        if not self._schedule.links.is_inactive:
             self._apply()
 
     def start_session(self) -> None:
@@ -52,7 +52,7 @@ class ImpairmentController:
         now_ns, before = self._monotonic_ns(), self._schedule.links
         self._schedule.start_session(now_ns)
         self._schedule.check(now_ns)
-        if self._schedule.links != before or not before.do_nothing:
+        if self._schedule.links != before or not before.is_inactive:
             self._apply()
 
     def set(self, config: ImpairmentConfig | None) -> None:
@@ -77,31 +77,31 @@ class ImpairmentController:
         status = ImpairmentStatus(
             rig=self._rig,
             text=schedule.links.describe(),
-            ways_json=schedule.links.model_dump_json(),
+            links_json=schedule.links.model_dump_json(),
             seed=schedule.seed,
             source=schedule.source,
         )
         if self._delayed_states is not None:
             line = self._delayed_states.line
-            status.states, status.states_lost, status.states_overtaken = line.count, line.lost, line.superseded
+            status.states, status.states_lost, status.states_superseded = line.count, line.lost, line.superseded
         commands = self._commands.delay_line
         if commands is not None:
             status.commands, status.commands_lost = commands.count, commands.lost
-            status.commands_overtaken = commands.superseded
+            status.commands_superseded = commands.superseded
         return status
 
     def _apply(self) -> None:
         schedule = self._schedule
         links, seed = schedule.links, schedule.seed
-        if links.state.does_nothing:
+        if links.state.is_inactive:
             self._remove_state_impairment()
         else:
             self._impair_states(Impairment(links.state, link_seed(seed, self._rig, "state")))
         samples = None
-        if not links.command.does_nothing:
+        if not links.command.is_inactive:
             samples = Impairment(links.command, link_seed(seed, self._rig, "command")).samples()
         self._commands.set_impairment(samples)
-        seed_text = "" if links.do_nothing else f", seed {seed}"
+        seed_text = "" if links.is_inactive else f", seed {seed}"
         text = f"impairment of {self._rig}: {links.describe()}{seed_text} (source: {schedule.source})"
         event = self._events.event(Event.IMPAIRMENT_CHANGED, Event.INFO, text)
         event.configuration_data.text = links.model_dump_json()

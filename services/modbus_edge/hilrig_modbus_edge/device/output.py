@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, TorqueCommand
 
 
@@ -28,5 +28,5 @@ class DeviceOutput(Protocol):
     def send_at(self, deadline_ns: int) -> None:
         """Schedule a call of `Device.send_due`: a delayed command is due at the deadline; ns, monotonic clock."""
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """Call `arrive` with every received state, on any thread; None: stop calling it."""

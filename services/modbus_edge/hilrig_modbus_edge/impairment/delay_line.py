@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 T = TypeVar("T")
 ImpairmentSamples = Iterator[tuple[int, bool]]
@@ -87,14 +87,14 @@ class DelayLine(Generic[T]):
 class DelayedStates:
     """Delay line of the states of one rig; evaluated when a register is read, so it needs no timers."""
 
-    def __init__(self, samples: ImpairmentSamples, initial: Arrival | None) -> None:
-        self.line: DelayLine[Arrival] = DelayLine(samples)
+    def __init__(self, samples: ImpairmentSamples, initial: TimestampedPayload | None) -> None:
+        self.line: DelayLine[TimestampedPayload] = DelayLine(samples)
         self._newest = initial
-        self._arrivals: deque[Arrival] = deque()
+        self._arrivals: deque[TimestampedPayload] = deque()
         self.arrive = self._arrivals.append
         """Add a received state; may be called on the bus's thread."""
 
-    def newest(self, now_ns: int) -> Arrival | None:
+    def newest(self, now_ns: int) -> TimestampedPayload | None:
         """Return the newest state whose delay has passed; the same object until there is a newer one."""
         line, arrivals = self.line, self._arrivals
         while arrivals:

@@ -18,11 +18,11 @@ from hilrig_runtime.config.impairment import (
     ExponentialDelay,
     GammaDelay,
     GilbertElliottLoss,
+    LinkImpairment,
     Loss,
     NormalDelay,
     TraceDelay,
     UniformDelay,
-    WayImpairment,
 )
 
 SAMPLES_PER_BLOCK: Final = 1024
@@ -40,7 +40,7 @@ def link_seed(seed: int, rig: str, link: Literal["state", "command"]) -> np.rand
 class Impairment:
     """Sequence of delay and loss samples for the messages of one link."""
 
-    def __init__(self, config: WayImpairment, seed: int | np.random.SeedSequence) -> None:
+    def __init__(self, config: LinkImpairment, seed: int | np.random.SeedSequence) -> None:
         # Delay and loss have separate streams: a change of the loss model does not change the delays.
         root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         streams = [np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, part)) for part in range(2)]

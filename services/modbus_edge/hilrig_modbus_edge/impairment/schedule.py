@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, Ways
+from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, LinkImpairments
 
 Source = Literal["lab.toml", "schedule", "override"]
 """Origin of the active impairment; "override": set by an operator (`hilrig impair`)."""
@@ -20,9 +20,9 @@ class ImpairmentSchedule:
         self._next = 0
 
     @property
-    def links(self) -> Ways:
+    def links(self) -> LinkImpairments:
         """Active impairment of both links."""
-        return self._setting.ways
+        return self._setting.links
 
     @property
     def seed(self) -> int:

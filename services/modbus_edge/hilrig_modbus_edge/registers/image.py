@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 
 from hilrig_modbus_edge.registers import codec
 from hilrig_modbus_edge.registers.map import MAP_VERSION, Status
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState
 
 MAX_STATE_AGE_NS: Final = 1_000_000_000
@@ -30,7 +30,7 @@ class StateImage:
     """The newest state, encoded as registers."""
 
     def __init__(self) -> None:
-        self.arrival: Arrival | None = None
+        self.arrival: TimestampedPayload | None = None
         """The received state; None: none so far, and everything else is zero."""
         self.arrived_ns = 0
         self.step = 0
@@ -42,7 +42,7 @@ class StateImage:
         self._latency_us = 0
         self._floats = b""
 
-    def update(self, arrival: Arrival) -> None:
+    def update(self, arrival: TimestampedPayload) -> None:
         """Compute the image of a received state; an invalid message is ignored."""
         try:
             message = JointState.FromString(arrival.payload)

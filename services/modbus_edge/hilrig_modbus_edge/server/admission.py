@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.rate_limiter import RateLimiter
-from hilrig_runtime.process.health import Counters
+from hilrig_runtime.counters import Counters
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events about refused connections of one host and reason, ns."""

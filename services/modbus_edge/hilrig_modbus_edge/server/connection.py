@@ -17,7 +17,7 @@ from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Reque
 from hilrig_modbus_edge.protocol.pdu import exception_response, execute
 from hilrig_modbus_edge.registers.map import UNIT_IDS
 from hilrig_modbus_edge.request_log import RequestLog
-from hilrig_runtime.process.health import Counters
+from hilrig_runtime.counters import Counters
 
 BUFFER_BYTES: Final = 2048
 """Size of the receive buffer: several of the longest requests, and few enough for a short turn."""

@@ -16,8 +16,8 @@ from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.health import Counters
 from hilrig_runtime.timing.clock import Clock
 
 BACKLOG: Final = 128

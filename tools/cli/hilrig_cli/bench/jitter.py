@@ -30,7 +30,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.rate import Rate
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
 LAB_TEMPLATE: Final = """[sim]
 step_ms = {step_ms}
@@ -68,7 +68,7 @@ def measure_timing(
     Raises:
         HilrigError: the lab could not start, or it stopped responding.
     """
-    prefer_latency()
+    set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
         ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}

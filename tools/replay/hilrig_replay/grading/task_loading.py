@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import RigParameters
@@ -30,7 +30,7 @@ def recorded_task(run: Run) -> TaskConfig | None:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{run.path}: recorded lab.toml: invalid TOML: {error}") from error
     except ValidationError as error:
-        errors = "; ".join(mistakes_in(error))
+        errors = "; ".join(format_validation_error(error))
         raise InputError(f"{run.path}: recorded lab.toml: invalid task: {errors}") from error
 
 

@@ -22,7 +22,7 @@ from hilrig_replay.plots.palette import EFFORT_SYMBOLS, STAGE_NAMES
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.process.process_pool import all_cores
+from hilrig_runtime.process.process_pool import process_pool
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
@@ -169,7 +169,7 @@ def _pages(
     if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
         yield from map(_page_or_error, *tasks)
     else:
-        with all_cores(len(paths), workers) as executor:
+        with process_pool(len(paths), workers) as executor:
             yield from executor.map(_page_or_error, *tasks)
 
 

@@ -126,7 +126,7 @@ class Follower:
             self._view.update_geometry(geometry)
 
     def _query_geometry(self) -> RigGeometry | None:
-        for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
+        for answer in self._bus.query(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
             if answer.payload and not answer.error:
                 config = CONFIG.decode(answer.payload)
                 return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)
