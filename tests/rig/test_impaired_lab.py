@@ -120,7 +120,7 @@ def shown(lab_folder: Path) -> dict[str, Any]:
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
         ports = lab.lab.ports
-        assert f"{ports['constant-way']}, step 10 ms, impaired: state way none; command way constant" in lab.output()
+        assert f"{ports['constant-way']}, step 10 ms, impairment: state way none; command way constant" in lab.output()
         assert f"{ports['free']}, step 10 ms\n" in lab.output()
         controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-way": write_for_each_state}
         threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
