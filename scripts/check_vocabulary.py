@@ -27,7 +27,7 @@ FORBIDDEN: Final = {
     r"\b(has|have|had) come\b": "arrived, received",
     r"\btroubles?\b": "alert, error",
     r"\b(go|goes|going|went|gone) on\b": "continue, resume, proceed",
-    r", for (it|they|he|she|there|a|an|the|of|each|every|nobody|nothing)\b(?! (example|instance))": "because",
+    r", for (it|they|he|she|there|nobody|nothing|this|these)\b": "because",
     r"\b(is|are|was|were|be) (told|said)\b|\btold of\b|\btells? of\b|\btell(s|ing)? people\b": "is reported, logged",
     r"\banew\b": "again, re-",
     r"\bby hand\b": "manual, manually",
