@@ -70,13 +70,13 @@ def test_the_magnet_waits_for_an_arm_that_does_not_come() -> None:
     controller = example.Controller(task)
     ends = {stage.text: stage.goal for stage in list(example.plan(task, example.HOME))[:3]}
     # An arm that is where each stage ends, but 0.2 degrees beside the part.
-    ends["take red"] = ends["take red"] + [0.0035, 0.0, 0.0, 0.0]
+    ends["pick red"] = ends["pick red"] + [0.0035, 0.0, 0.0, 0.0]
     now_s = 0.0
     controller.update(now_s, example.HOME)
     while now_s < 60.0:
         now_s += 0.01
         controller.update(now_s, ends[controller.doing])
-    assert (controller.doing, controller.magnet, controller.placed) == ("take red", False, 0)
+    assert (controller.doing, controller.magnet, controller.placed) == ("pick red", False, 0)
 
 
 def test_time_that_runs_out_is_said_with_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
