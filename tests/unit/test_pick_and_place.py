@@ -90,7 +90,7 @@ def test_time_that_runs_out_is_said_with_what_is_missing(monkeypatch: pytest.Mon
     assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
     told = example.sentence({"parts": 4, **said})
     assert told.startswith(
-        f"{said['placed']} of 4 parts placed, not {', '.join(said['missing'])}: the time was over at"
+        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
     )
     assert repr(said["doing"]) in told
 
