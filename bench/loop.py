@@ -187,7 +187,7 @@ def recorder_comes_and_goes(client: Path, step_ms: float, pairs: int, seconds: f
                 without = turn() if pair % 2 == 0 else None
                 with Supervisor(config, say, recorder) as supervisor:
                     supervisor.start()
-                    while not bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.5):
+                    while not bus.get_liveliness(alive_key(lab.name, "recorder", "*"), timeout_s=0.5):
                         supervisor.poll()
                     # What it missed before it came it has fetched by then.
                     time.sleep(1.0)

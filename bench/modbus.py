@@ -41,9 +41,9 @@ from stolen import StolenTime
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.server.admission import Limits
-from hilrig_modbus_edge.server.listener import Connection as ModbusConnection
+from hilrig_modbus_edge.server.connection import Connection as ModbusConnection
 from hilrig_modbus_edge.server.listener import RigServer
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import JointState, topics
 
@@ -174,11 +174,11 @@ WRITE = bytes.fromhex("0002 0000 000f 01 10 0000 0004 08 0001 0002 0003 0004")
 def own_code_us(frame: bytes, times: int = 30_000) -> float:
     """Processor time of one request from the bytes that came to the bytes that go, without sockets, µs."""
     with Service("edge", lab_of(1, 1), NowhereBus()) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
+        service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
         state = JointState(rig="rig1", step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-        arrival = Arrival(state.SerializeToString(), service.clock.monotonic_ns())
-        outlet = Mock(send_command=service.sender(topics.COMMAND, "rig1").send)
-        device = Device("rig1", DeviceSettings(), service.clock, outlet, lambda: arrival)
+        arrival = TimestampedPayload(state.SerializeToString(), service.clock.monotonic_ns())
+        output = Mock(send_command=service.rig_publisher(topics.COMMAND, "rig1").publish)
+        device = Device("rig1", DeviceSettings(), service.clock, output, lambda: arrival)
         server = RigServer(device, Limits(), service.clock, service.counters)
         transport = Mock(write=lambda _: None)
         connection = ModbusConnection(server, transport, device.connect("127.0.0.1", 1))
@@ -189,7 +189,7 @@ def own_code_us(frame: bytes, times: int = 30_000) -> float:
                 connection.get_buffer(-1)[: len(frame)] = frame
                 connection.buffer_updated(len(frame))
                 if number % 256 == 0:
-                    server.traffic.take(0, 0)
+                    server.request_log.drain(0, 0)
             used = time.thread_time() - begin
     return 1e6 * used / times
 

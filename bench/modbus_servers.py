@@ -24,12 +24,12 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from hilrig_cli.local.demo import free_ports
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.service import run as run_edge
-from hilrig_runtime.bus.api import KEPT, Publisher
+from hilrig_runtime.bus.api import CACHE_DEPTH, Publisher
 from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
+from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, set_short_slice
 from hilrig_schemas import JointState, RigBatch, TorqueCommand, topics
 
 Server = tuple[int, int, int]
@@ -105,7 +105,7 @@ def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG
 class NowhereBus(MemoryBus):
     """A bus that carries states and nothing else: what is published goes nowhere, and costs nothing."""
 
-    def publisher(self, key: str, traffic: topics.Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
+    def publisher(self, key: str, traffic: topics.Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:  # noqa: ARG002
         return _Nowhere()
 
 
@@ -119,17 +119,17 @@ class _Nowhere(Publisher):
 
 def serve_alone(port: int, rigs: int, control: Connection) -> None:
     """The edge with a bus that leads nowhere; nothing is kept for a recorder, and no policy but the ordinary one."""
-    prefer_latency()
+    set_short_slice()
     lab = lab_of(port, rigs)
     bus = NowhereBus()
     with Service("edge", lab, bus) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
+        service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
         serve_ours(service, bus.hub.deliver, control)
 
 
 def serve_whole(port: int, rigs: int, control: Connection) -> None:
     """The edge as `hilrig edge` runs it; another process takes the simulation's place and hears every command."""
-    prefer_latency()
+    set_short_slice()
     go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
     with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
@@ -141,7 +141,7 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
     alive = topics.alive_key(lab.name, "edge", "*")
 
     def watch() -> None:
-        while not service.bus.alive(alive):
+        while not service.bus.get_liveliness(alive):
             if deliver is not None:
                 for rig in lab.rigs:
                     state = JointState(rig=rig.name, step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
@@ -169,7 +169,7 @@ def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
     names = [rig.name for rig in lab.rigs]
     key = topics.COMMAND.key(lab.name, names[0])
     with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
-        states = service.latest_of_batches(topics.STATES)
+        states = service.latest_value_cache(topics.STATES)
         put = service.publisher(topics.COMMANDS).put
         command = TorqueCommand(rig=names[0], effort=[0.1] * 4, session="a" * 24, controller="127.0.0.1:50000")
         for field in ("seq", "basis_incarnation", "basis_step", "state_arrived_ns", "state_served_ns", "sent_ns"):
@@ -189,7 +189,9 @@ def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
             put(departure)
             wait_until(state.arrived_ns + lab.sim.step_ns - DEADLINE_MARGIN_NS)
             put(departure)
-            service.log.extend([(key, number, time.time_ns(), encoded) for number in range(COMMANDS_A_TICK)])
+            service.recording_stream.extend(
+                [(key, number, time.time_ns(), encoded) for number in range(COMMANDS_A_TICK)]
+            )
             service.beat(time.monotonic_ns())
 
 
@@ -201,10 +203,10 @@ def send_states(lab: LabConfig, control: Connection) -> None:
     """In the simulation's place: states at 50 Hz, and every command received."""
     go_realtime(REALTIME_PRIORITIES["sim"])
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
-        states = service.batch_sender(topics.STATES)
+        states = service.batch_publisher(topics.STATES)
         for rig in lab.rigs:
             service.add_to_batch(states, topics.STATE, rig.name)
-        service.latest_of_batches(topics.COMMANDS)
+        service.latest_value_cache(topics.COMMANDS)
         control.send(1)
         step = 0
         while not control.poll(0.02):
@@ -213,7 +215,7 @@ def send_states(lab: LabConfig, control: Connection) -> None:
                 JointState(rig=rig.name, step=step, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
                 for rig in lab.rigs
             ]
-            states.send([state.SerializeToString() for state in made])
+            states.publish([state.SerializeToString() for state in made])
             service.beat(service.clock.monotonic_ns())
 
 

@@ -55,7 +55,7 @@ def plant_us(rig: RigParameters, count: int, seconds: float, *, on_the_table: bo
     if not on_the_table:
         efforts[:, 2] -= rig.arm.masses[2] * GRAVITY
         for index in range(count):
-            plant.place(index, (0.3, 0.8, 0.05, 0.0), (0.0, 0.0, 0.0, 0.0))
+            plant.set_state(index, (0.3, 0.8, 0.05, 0.0), (0.0, 0.0, 0.0, 0.0))
     for turn in range(40):
         plant.step(efforts[turn], magnet)
 

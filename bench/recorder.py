@@ -126,10 +126,10 @@ def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
         else:
             wait_for(service, lab)
         sessions = [OpenSession(rig=rig, session=f"20260101T000000Z-{rig}-abcd") for rig in rigs]
-        service.log.set_sessions(sessions)
+        service.recording_stream.set_sessions(sessions)
         emit(service, sessions, Event.SESSION_START)
         rate = Rate(round(1e9 / HZ))
-        append, wall_ns = service.log.append, SYSTEM_CLOCK.wall_ns
+        append, wall_ns = service.recording_stream.append, SYSTEM_CLOCK.wall_ns
         ticks = round(seconds * HZ)
         begin_ns = SYSTEM_CLOCK.monotonic_ns()
         for tick in range(1, ticks + 1):
@@ -138,30 +138,30 @@ def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
             variant = tick % VARIANTS
             for key, encoded in pool:
                 append(key, tick, stamp, encoded[variant])
-            service.log.flush(SYSTEM_CLOCK.monotonic_ns())
+            service.recording_stream.flush(SYSTEM_CLOCK.monotonic_ns())
             service.health.report_if_due(SYSTEM_CLOCK.monotonic_ns())
             if stopping.is_set():
                 ticks = tick
                 break
         emit(service, sessions, Event.SESSION_END)
-        service.log.set_sessions([])
+        service.recording_stream.set_sessions([])
         wall_s = (SYSTEM_CLOCK.monotonic_ns() - begin_ns) * 1e-9
         print(json.dumps({"sent": ticks * len(rigs), "wall_s": wall_s}), flush=True)
         # The cache is here: what the recorder still asks for must be answered.
         for _ in range(100):
             rate.wait()
-            service.log.flush_if_due(SYSTEM_CLOCK.monotonic_ns())
+            service.recording_stream.flush_if_due(SYSTEM_CLOCK.monotonic_ns())
 
 
 def wait_for(service: Service, lab: LabConfig) -> None:
-    while not service.bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.2):
+    while not service.bus.get_liveliness(alive_key(lab.name, "recorder", "*"), timeout_s=0.2):
         time.sleep(0.05)
 
 
 def emit(service: Service, sessions: list[OpenSession], kind: Event.Kind) -> None:
     for session in sessions:
         service.emit(Event(rig=session.rig, session=session.session, kind=kind))
-    service.log.flush(SYSTEM_CLOCK.monotonic_ns())
+    service.recording_stream.flush(SYSTEM_CLOCK.monotonic_ns())
 
 
 # -- the measurement ------------------------------------------------------------------------------------------------

@@ -251,7 +251,7 @@ def measure(minutes: float, report: Report, quick: bool) -> None:
 
 def troubles(log: Path) -> Iterator[str]:
     """What the services warned of, rubbish that was meant as such apart; not all of it."""
-    expected = (": INFO: ", "sent no Modbus")
+    expected = (": INFO: ", "did not send Modbus TCP")
     lines = [
         line for line in log.read_text(errors="replace").splitlines() if not any(word in line for word in expected)
     ]

@@ -42,8 +42,8 @@ LARGEST_EFFORT = 32.767  # range of the registers
 SPEED = np.array([4.5, 4.5, 0.70, 9.0])
 ACCELERATION = np.array([20.0, 20.0, 9.0, 50.0])
 
-# Feedback: with stiffness w(B + wM) and damping 2wM, an error decays at the rates w and w + friction/inertia. The larger
-# the latency, the smaller w must be.
+# Feedback: with stiffness w(B + wM) and damping 2wM, an error decays at the rates w and w + friction/inertia. A larger
+# latency requires a smaller w.
 LARGEST_RATE = 6.0
 RATE_TIMES_LATENCY = 0.22
 ERROR_FILTER_S = 0.03

@@ -92,15 +92,15 @@ def receivers_not_ahead() -> None:
     """zenoh's receiving threads have the priority of the thread that opened the bus."""
     from hilrig_runtime.bus import zenoh_bus
 
-    zenoh_bus.one_ahead = contextlib.nullcontext
+    zenoh_bus.raise_priority = contextlib.nullcontext
 
 
 def no_log_batch() -> None:
     """Every recorded message is sent to the recorder at once."""
-    from hilrig_runtime.messaging.recording_stream import LogStream
+    from hilrig_runtime.messaging.recording_stream import RecordingStream
     from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
-    append, extend = LogStream.append, LogStream.extend
+    append, extend = RecordingStream.append, RecordingStream.extend
 
     def append_and_flush(self: Any, *entry: Any) -> None:
         append(self, *entry)
@@ -111,15 +111,15 @@ def no_log_batch() -> None:
             extend(self, [entry])
             self.flush(SYSTEM_CLOCK.monotonic_ns())
 
-    LogStream.append, LogStream.extend = append_and_flush, extend_and_flush
+    RecordingStream.append, RecordingStream.extend = append_and_flush, extend_and_flush
 
 
 def no_state_batch() -> None:
     """The states of a tick go to the edge in a message each."""
-    from hilrig_runtime.messaging.rig_batch import BatchSender
+    from hilrig_runtime.messaging.rig_batch import BatchPublisher
     from hilrig_schemas import RigBatch
 
-    send = BatchSender.send
+    send = BatchPublisher.send
 
     def send_each(self: Any, payloads: Any) -> None:
         put = self._put_together
@@ -129,7 +129,7 @@ def no_state_batch() -> None:
         send(self, payloads)
         self._put_together = put
 
-    BatchSender.send = send_each
+    BatchPublisher.send = send_each
 
 
 VARIANTS: dict[str, tuple[Callable[[], None], ...]] = {

@@ -337,7 +337,7 @@ def test_browser_shows_changing_values(running_lab: ConsoleWithLab, tmp_path: Pa
             assert browser.run("document.documentElement.scrollWidth") <= width
             eventually(lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2)
         assert browser.errors == []
-        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", asked).partition("?")[0] for asked in browser.requests} <= {
+        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", url).partition("?")[0] for url in browser.requests} <= {
             "",
             "console.css",
             "console.js",
@@ -395,8 +395,8 @@ def answers(address: ListenAddress, tls: TlsFiles | None) -> bool:
 
 
 def test_reports_occupied_port(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        listen = f"127.0.0.1:{taken.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        listen = f"127.0.0.1:{occupied.getsockname()[1]}"
         done = hilrig("console", "--config", write_lab(tmp_path), "--listen", listen)
     assert done.returncode == 3
     (line,) = done.stderr.splitlines()

@@ -4,12 +4,12 @@ import pytest
 
 from hilrig_cli import client
 from hilrig_cli.client import check_rig
-from hilrig_runtime.bus.api import Answer
+from hilrig_runtime.bus.api import Reply
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import Roster
-from hilrig_schemas.topics import ROSTER
+from hilrig_schemas import ServiceInfo
+from hilrig_schemas.topics import SERVICE_INFO
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 
@@ -17,30 +17,30 @@ LAB = parse_lab("[rigs]\ncount = 3\n")
 class CountingBus(MemoryBus):
     """Bus that counts its queries; the services of `late` appear before the second query."""
 
-    def __init__(self, *early: Roster, late: tuple[Roster, ...] = ()) -> None:
+    def __init__(self, *early: ServiceInfo, late: tuple[ServiceInfo, ...] = ()) -> None:
         super().__init__(MemoryHub())
         self.queries = 0
         self._late = late
         self._serve(early)
 
-    def _serve(self, rosters: tuple[Roster, ...]) -> None:
-        for one in rosters:
+    def _serve(self, list_services: tuple[ServiceInfo, ...]) -> None:
+        for one in list_services:
             reply = one.SerializeToString()
-            self.serve(ROSTER.key(LAB.name, one.service, one.instance), lambda _, reply=reply: reply)
+            self.declare_queryable(SERVICE_INFO.key(LAB.name, one.service, one.instance), lambda _, reply=reply: reply)
 
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         self.queries += 1
         if self.queries == 2:
             self._serve(self._late)
-        return super().ask(key_expr, payload, timeout_s=timeout_s)
+        return super().query(key_expr, payload, timeout_s=timeout_s)
 
 
-def roster(service: str, instance: str, *rigs: str) -> Roster:
-    return Roster(service=service, instance=instance, rigs=rigs)
+def info(service: str, instance: str, *rigs: str) -> ServiceInfo:
+    return ServiceInfo(service=service, instance=instance, rigs=rigs)
 
 
-SIM = roster("sim", "1", "rig1", "rig2", "rig3", "guest")
-FIRST, SECOND = roster("edge", "1", "rig1", "rig2"), roster("edge", "2", "rig3", "guest")
+SIM = info("sim", "1", "rig1", "rig2", "rig3", "guest")
+FIRST, SECOND = info("edge", "1", "rig1", "rig2"), info("edge", "2", "rig3", "guest")
 
 
 def test_rig_of_the_file_needs_no_query() -> None:
@@ -64,9 +64,9 @@ def test_unknown_rig_is_rejected_once_all_services_reply(capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("missing", [SIM, SECOND], ids=["sim", "edge"])
-def test_waits_for_services_that_are_not_linked_yet(missing: Roster) -> None:
-    linked = [one for one in (roster("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
-    bus = CountingBus(*linked, late=(missing, roster("edge", "3", "late")))
+def test_waits_for_services_that_are_not_linked_yet(missing: ServiceInfo) -> None:
+    linked = [one for one in (info("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
+    bus = CountingBus(*linked, late=(missing, info("edge", "3", "late")))
     check_rig(bus, LAB, "late")
     assert bus.queries == 2
 
@@ -86,6 +86,6 @@ def test_prints_a_message_while_waiting_for_a_service(
 def test_error_lists_some_of_many_rigs() -> None:
     lab = parse_lab("[rigs]\ncount = 128\n")
     rigs = [rig.name for rig in lab.rigs]
-    bus = CountingBus(roster("sim", "1", *rigs), roster("edge", "1", *rigs))
+    bus = CountingBus(info("sim", "1", *rigs), info("edge", "1", *rigs))
     with pytest.raises(InputError, match=r"rig1, .* and 112 more \(hilrig rig list\)$"):
         check_rig(bus, lab, "rig129")

@@ -11,7 +11,7 @@ import pytest
 from hilrig_cli.doctor import CheckResult, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
 from hilrig_runtime.config.lab import LabConfig, parse_lab
-from hilrig_runtime.security.x509 import Identity, issue_client, issue_peer, issue_server, load, make_authority
+from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health
 from support.bus_certificates import HOSTS, NOW, make_bus_folder, write
@@ -42,7 +42,7 @@ def secured(folder: Path, more: str = "") -> LabConfig:
     return parse_lab(f'{more}\n[bus.tls]\nfolder = "{folder}"\n')
 
 
-def reissue(folder: Path, name: str, days: int, begin: datetime = NOW, signed: Identity | None = None) -> None:
+def reissue(folder: Path, name: str, days: int, begin: datetime = NOW, signed: Credential | None = None) -> None:
     authority = signed or load((folder / "ca.pem").read_bytes(), (folder / "ca.key").read_bytes())
     write(folder, name, issue_peer(authority, name, HOSTS, begin, days))
 
@@ -212,7 +212,7 @@ def test_missing_silent_or_alerting_service_is_an_error() -> None:
     del silent.healths["edge/1"]
     assert "edge/1: alive, but sends no health reports" in only_error(services.check_services(lab, silent))
     alerting = snapshot(*ALL_SERVICES)
-    alerting.healths["recorder/1"][0].trouble = "the disk is full"
+    alerting.healths["recorder/1"][0].alert = "the disk is full"
     assert "recorder/1: the disk is full" in only_error(services.check_services(lab, alerting))
     assert by_level(services.check_services(lab, snapshot()))[Level.WARNING] == ["no service of lab 'lab' is running"]
 

@@ -87,7 +87,7 @@ def test_silent_service_raises_an_alert_and_stops_serving() -> None:
 
 def test_alert_of_a_service_is_listed() -> None:
     made = LabView()
-    made.update(Health(service="recorder", instance="1", host="lab-pc", trouble="the disk is full"), 1.0)
+    made.update(Health(service="recorder", instance="1", host="lab-pc", alert="the disk is full"), 1.0)
     assert made.alerts(1.0) == ["recorder/1 on lab-pc: the disk is full"]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.security.x509 import Identity, load, make_authority, names_in
+from hilrig_runtime.security.x509 import Credential, load, make_authority, names_in
 
 AUTHORITY_NAME: Final = "ca"
 RENEWAL_PERIOD: Final = timedelta(days=30)
@@ -34,7 +34,7 @@ class CertificateStore:
         except OSError as error:
             raise OperationError(f"{folder}: can't be created: {error.strerror}") from error
 
-    def authority(self, name: str) -> Identity:
+    def authority(self, name: str) -> Credential:
         """Return the folder's authority; create one with the common name `name` if it is missing.
 
         Raises:
@@ -73,7 +73,7 @@ class CertificateStore:
         existing = names_in(identity.certificate) if identity is not None else set()
         return [*hosts, *sorted(existing - set(hosts))]
 
-    def write(self, name: str, identity: Identity) -> None:
+    def write(self, name: str, identity: Credential) -> None:
         """Write a certificate and its key; the key is readable by its owner only."""
         for suffix, data, mode in ((".pem", identity.certificate_pem, 0o644), (".key", identity.key_pem, 0o600)):
             path = self._folder / f"{name}{suffix}"
@@ -84,7 +84,7 @@ class CertificateStore:
                 raise OperationError(f"{path}: can't be written: {error.strerror}") from error
             self.written.append(path)
 
-    def _read(self, name: str) -> Identity | None:
+    def _read(self, name: str) -> Credential | None:
         files = [self._folder / f"{name}{suffix}" for suffix in (".pem", ".key")]
         if not all(path.exists() for path in files):
             return None

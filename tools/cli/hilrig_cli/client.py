@@ -12,8 +12,8 @@ from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.discovery import rosters
-from hilrig_schemas import Roster
+from hilrig_runtime.process.discovery import list_services
+from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -41,7 +41,7 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
         else:
             # Without a link to every edge, the reply of the first edge would be taken for that of all.
             discover_services(bus, lab, {"edge"})
-        while not (replies := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
+        while not (replies := bus.query(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
             time.sleep(0.05)
     for reply in replies:
         if reply.error:
@@ -54,14 +54,14 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
     return [topic.decode(by_rig[rig]) for rig in order]
 
 
-def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[Roster]:
+def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[ServiceInfo]:
     """Discover the services of a lab; wait up to `QUERY_TIMEOUT_S` until each required kind of service is found."""
     deadline_s = time.monotonic() + QUERY_TIMEOUT_S
-    found: list[Roster] = []
+    found: list[ServiceInfo] = []
     # Links are set up one after the other: discovery is complete when two successive queries return the same number.
     while time.monotonic() < deadline_s:
-        before, found = found, rosters(bus, lab.name)
-        if required <= {roster.service for roster in found} and len(found) == len(before):
+        before, found = found, list_services(bus, lab.name)
+        if required <= {info.service for info in found} and len(found) == len(before):
             break
         time.sleep(0.05)
     return found
@@ -78,12 +78,12 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         return
     start_s, message_printed = time.monotonic(), False
     while True:
-        found = rosters(bus, lab.name)
-        if any(rig in roster.rigs for roster in found):
+        found = list_services(bus, lab.name)
+        if any(rig in info.rigs for info in found):
             return
         waited_s = time.monotonic() - start_s
         if _all_responded(found, in_file) or waited_s > QUERY_TIMEOUT_S:
-            added = {name for roster in found if roster.service in RIG_SERVICES for name in roster.rigs}
+            added = {name for info in found if info.service in RIG_SERVICES for name in info.rigs}
             raise lab.no_such_rig(rig, sorted(added))
         if waited_s > WAIT_MESSAGE_AFTER_S and not message_printed:
             message_printed = True
@@ -95,7 +95,7 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         time.sleep(0.05)
 
 
-def _all_responded(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
+def _all_responded(found: Sequence[ServiceInfo], in_file: Sequence[str]) -> bool:
     """Whether every service that can have a rig has responded.
 
     Each simulation and each edge starts with rigs of the lab's file, and no two of a kind have the same rig: once all
@@ -103,6 +103,6 @@ def _all_responded(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
     kind of service.)
     """
     return all(
-        set(in_file) <= {rig for roster in found if roster.service == service for rig in roster.rigs}
+        set(in_file) <= {rig for info in found if info.service == service for rig in info.rigs}
         for service in RIG_SERVICES
     )

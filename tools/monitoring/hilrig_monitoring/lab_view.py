@@ -142,8 +142,8 @@ class LabView:
             health = service.health
             if self.is_silent(service, now_s):
                 found.append(f"{service.name} on {health.host}: silent for {now_s - service.reported_s:.0f} s")
-            elif health.trouble:
-                found.append(f"{service.name} on {health.host}: {health.trouble}")
+            elif health.alert:
+                found.append(f"{service.name} on {health.host}: {health.alert}")
         return found
 
     def as_dict(self, now_s: float) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _service_row(service: ServiceStatus, silent: bool) -> dict[str, Any]:
         "clock_offset_ms": health.clock_offset_ns / 1e6,
         "clock_uncertainty_ms": health.clock_uncertainty_ns / 1e6,
         "clock_peer": health.clock_peer,
-        "alert": health.trouble,
+        "alert": health.alert,
     }
 
 

@@ -11,7 +11,7 @@ from hilrig_monitoring.lab_view import LabView
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.discovery import rosters
+from hilrig_runtime.process.discovery import list_services
 from hilrig_schemas.topics import HEALTH
 
 FIRST_REPORTS_TIMEOUT_S: Final = 3.0
@@ -37,7 +37,7 @@ class LabWatch:
         """
         deadline_s = time.monotonic() + FIRST_REPORTS_TIMEOUT_S
         while time.monotonic() < deadline_s:
-            expected = {f"{roster.service}/{roster.instance}" for roster in rosters(self._bus, self.lab.name)}
+            expected = {f"{info.service}/{info.instance}" for info in list_services(self._bus, self.lab.name)}
             with self.lock:
                 if expected and all(self._report_counts.get(name, 0) > 1 for name in expected):
                     return

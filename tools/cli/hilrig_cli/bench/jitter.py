@@ -22,7 +22,7 @@ from hilrig_cli.bench.cpu_stress import cpu_stress
 from hilrig_cli.bench.timing_benchmark import TimingResult
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_replay.analysis.data_quality import behind_ns
+from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.records import Records
@@ -30,7 +30,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.rate import Rate
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
 LAB_TEMPLATE: Final = """[sim]
 step_ms = {step_ms}
@@ -68,7 +68,7 @@ def measure_timing(
     Raises:
         HilrigError: the lab could not start, or it stopped responding.
     """
-    prefer_latency()
+    set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
         ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}
@@ -98,7 +98,7 @@ def _evaluate(
     def count(block: Records) -> None:
         nonlocal ticks, overruns, missed
         ticks += len(block.states)
-        overruns += int((behind_ns(block.states, run.step_ns) > run.step_ns).sum())
+        overruns += int((tick_lateness_ns(block.states, run.step_ns) > run.step_ns).sum())
         missed += int(block.states["missed_steps"].sum())
 
     report = measure(run, count)

@@ -49,8 +49,8 @@ def console(
     from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
-    from hilrig_runtime.timing.realtime import yield_to_others
+    from hilrig_runtime.process.shutdown import force_exit_after, stop_on_signals, wait_for
+    from hilrig_runtime.timing.realtime import lower_priority
 
     if (certificate is None) != (key is None):
         raise InputError("--certificate and --key must be given together")
@@ -66,10 +66,10 @@ def console(
         password = secrets.token_urlsafe(12)
     names = normalize_host_names([platform.node(), address.host, *(name or [])])
     server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
-    yield_to_others()
+    lower_priority()
     stopping = threading.Event()
     stop_on_signals(stopping)
-    end_when_closing_hangs(stopping, 8.0)
+    force_exit_after(stopping, 8.0)
     with server:
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if generated:

@@ -113,8 +113,8 @@ def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[Check
         return [CheckResult.ok(service, "running")]
     for name, (health, _) in snapshot.healths.items():
         if matches(name, wanted):
-            if health.trouble:
-                return [CheckResult.error(service, health.trouble, "see the service's log")]
+            if health.alert:
+                return [CheckResult.error(service, health.alert, "see the service's log")]
             return [CheckResult.ok(service, f"{name}: running for {health.uptime_ns / 1e9:.0f} s")]
     return [CheckResult.error(service, f"no health report from {wanted}", "see the service's log, or restart it")]
 

@@ -65,7 +65,7 @@ def impair(
         raise InputError("a rig is required to set an impairment: hilrig impair RIG …")
     if trace is not None and command:
         raise InputError("--trace and --command both set the delay of the command link: use one of them")
-    request = ImpairmentRequest(as_lab=lab)
+    request = ImpairmentRequest(restore_lab=lab)
     if setting or off:
         request.set_json = _impairment(preset, state, command, loss, trace, seed).model_dump_json()
     statuses = query_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
@@ -85,36 +85,36 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     from pydantic import ValidationError
 
     from hilrig_runtime.config.impairment import ImpairmentConfig
-    from hilrig_runtime.config.validation import mistakes_in
+    from hilrig_runtime.config.validation import format_validation_error
     from hilrig_runtime.errors import InputError
 
     try:
-        ways = ImpairmentConfig(preset=preset or "none").ways
+        base = ImpairmentConfig(preset=preset or "none").links
         delays = {
-            "state": state or ways.state.delay,
-            "command": command or ways.command.delay,
+            "state": state or base.state.delay,
+            "command": command or base.command.delay,
         }
         if trace is not None:
             from hilrig_replay.export.delay_trace import delay_trace
             from hilrig_replay.io.run import open_run
 
             delays["command"] = delay_trace(open_run(trace))
-        losses = {"state": loss or ways.state.loss, "command": loss or ways.command.loss}
+        losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
         links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
         return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **links})
     except ValidationError as error:
-        raise InputError("\n".join(mistakes_in(error))) from error
+        raise InputError("\n".join(format_validation_error(error))) from error
 
 
 def _row(status: "ImpairmentStatus") -> dict[str, object]:
     return {
         "rig": status.rig,
         "impairment": status.text,
-        "ways": json.loads(status.ways_json),
+        "ways": json.loads(status.links_json),
         "seed": status.seed,
         "set_by": status.source,
-        "states": {"count": status.states, "lost": status.states_lost, "overtaken": status.states_overtaken},
-        "commands": {"count": status.commands, "lost": status.commands_lost, "overtaken": status.commands_overtaken},
+        "states": {"count": status.states, "lost": status.states_lost, "overtaken": status.states_superseded},
+        "commands": {"count": status.commands, "lost": status.commands_lost, "overtaken": status.commands_superseded},
     }
 
 
@@ -123,17 +123,17 @@ def _print_table(statuses: "list[ImpairmentStatus]") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_runtime.config.impairment import Ways
+    from hilrig_runtime.config.impairment import LinkImpairments
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("rig", "link", "impairment", "messages", "lost", "superseded"):
         numeric = column in ("messages", "lost", "superseded")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")
     for status in statuses:
-        ways = Ways.model_validate_json(status.ways_json)
-        states = (status.states, status.states_lost, status.states_overtaken)
-        commands = (status.commands, status.commands_lost, status.commands_overtaken)
-        table.add_row(status.rig, "state", ways.state.describe(), *map(str, states))
+        links = LinkImpairments.model_validate_json(status.links_json)
+        states = (status.states, status.states_lost, status.states_superseded)
+        commands = (status.commands, status.commands_lost, status.commands_superseded)
+        table.add_row(status.rig, "state", links.state.describe(), *map(str, states))
         origin = f"({status.source}, seed {status.seed})"
-        table.add_row(origin, "command", ways.command.describe(), *map(str, commands), end_section=True)
+        table.add_row(origin, "command", links.command.describe(), *map(str, commands), end_section=True)
     Console().print(table)

@@ -41,7 +41,7 @@ def play(
     stopping = threading.Event()
     stop_on_signals(stopping)
     with _bus(lab, name) as bus:
-        bus.serve(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
+        bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
         played = publish_recording(
             bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name
         )
@@ -63,7 +63,7 @@ def _bus(lab: "LabConfig", rig: str) -> "Bus":
                 "--config with another bus.first_port"
             ) from error
     with ZenohBus(lab.bus, "tool") as probe:
-        if probe.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
+        if probe.query(CONFIG.key(lab.name, rig), timeout_s=0.5):
             raise OperationError(f"rig {rig!r} is running in lab {lab.name!r}: choose another name with --rig")
     # On a secured bus only the simulation's certificate may publish states.
     return ZenohBus(lab.bus, "sim")

@@ -59,7 +59,7 @@ def _request(config: "Path | None", request: "Event") -> "Event":
         owner = next((one for one in recorders if request.rig in one.rigs), None)
         owner = owner or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
         key = CONTROL.key(lab.name, owner.service, owner.instance)
-        for reply in bus.ask(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S):
+        for reply in bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S):
             if reply.error:
                 # The recorder also knows removed rigs, so it is queried first and an unknown name reported after that.
                 check_rig(bus, lab, request.rig)

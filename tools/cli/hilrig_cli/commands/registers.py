@@ -14,16 +14,16 @@ def registers(
     as_json: AsJson = False,
 ) -> None:
     """Print the register map: every register and coil of a rig with its type, unit, scale and meaning."""
-    from hilrig_modbus_edge.registers import export as register_tables
+    from hilrig_modbus_edge.registers import export
 
     if as_csv:
-        print(register_tables.as_csv(), end="")
+        print(export.as_csv(), end="")
     elif as_markdown:
-        print(register_tables.as_markdown(), end="")
+        print(export.as_markdown(), end="")
     elif as_json:
-        print(json.dumps(register_tables.as_rows()))
+        print(json.dumps(export.as_rows()))
     else:
-        _print_table(register_tables.as_rows())
+        _print_table(export.as_rows())
 
 
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:

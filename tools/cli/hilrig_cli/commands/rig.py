@@ -11,7 +11,7 @@ from hilrig_cli.options import AsJson, Config, config_for_commands
 if TYPE_CHECKING:
     from hilrig_runtime.bus.api import Bus
     from hilrig_runtime.config.lab import LabConfig, RigSettings
-    from hilrig_schemas import Event, Roster
+    from hilrig_schemas import Event, ServiceInfo
 
 app = typer.Typer(
     help="List, add, remove or reset rigs of a running lab.",
@@ -102,13 +102,13 @@ def remove(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        owners = [roster for roster in _discover(bus, lab) if rig in roster.rigs and roster.service in RIG_SERVICES]
+        owners = [info for info in _discover(bus, lab) if rig in info.rigs and info.service in RIG_SERVICES]
         if not owners:
             check_rig(bus, lab, rig)
             raise OperationError(f"no running service has rig {rig!r}; hilrig rig list shows the existing rigs")
         # The edge first: its last command is zero torque.
-        for roster in sorted(owners, key=lambda roster: STOP_ORDER.index(roster.service)):
-            print(_request(bus, lab, roster, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
+        for info in sorted(owners, key=lambda info: STOP_ORDER.index(info.service)):
+            print(_request(bus, lab, info, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
 
 
 @app.command()
@@ -122,15 +122,15 @@ def reset(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        for roster in _discover(bus, lab):
-            if roster.service == "edge" and rig in roster.rigs:
-                print(_request(bus, lab, roster, Event(kind=Event.RESET, rig=rig)).text)
+        for info in _discover(bus, lab):
+            if info.service == "edge" and rig in info.rigs:
+                print(_request(bus, lab, info, Event(kind=Event.RESET, rig=rig)).text)
                 return
         check_rig(bus, lab, rig)
     raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
 
 
-def _discover(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
+def _discover(bus: "Bus", lab: "LabConfig") -> "list[ServiceInfo]":
     from hilrig_cli.client import discover_services
     from hilrig_cli.service_kinds import RIG_SERVICES
     from hilrig_runtime.errors import OperationError
@@ -141,27 +141,27 @@ def _discover(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
     return found
 
 
-def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
+def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
     in_file = [rig.name for rig in lab.rigs]
-    names = dict.fromkeys([*in_file, *(rig for roster in rosters if roster.service == "edge" for rig in roster.rigs)])
+    names = dict.fromkeys([*in_file, *(rig for info in infos if info.service == "edge" for rig in info.rigs)])
     rows = []
     for name in names:
         row: dict[str, Any] = {"rig": name, "in_file": name in in_file, "address": "", "sim": "", "edge": ""}
-        for roster in rosters:
-            if name in roster.rigs and roster.service in row:
-                row[roster.service] = f"{roster.instance} on {roster.host}"
-                row["address"] = row["address"] or roster.addresses[list(roster.rigs).index(name)]
+        for info in infos:
+            if name in info.rigs and info.service in row:
+                row[info.service] = f"{info.instance} on {info.host}"
+                row["address"] = row["address"] or info.addresses[list(info.rigs).index(name)]
         rows.append(row)
     return rows
 
 
-def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
+def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
     import tomllib
 
     from hilrig_runtime.config.lab import read_lab_text, read_rig
     from hilrig_runtime.errors import InputError
 
-    if any(rig in roster.rigs for roster in rosters if roster.service in ("sim", "edge")):
+    if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
         raise InputError(f"rig {rig!r} already exists in the lab: choose another name")
     try:
         values = {} if settings is None else tomllib.loads(read_lab_text(settings))
@@ -172,26 +172,26 @@ def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Pat
     return read_rig(json.dumps(values | {"name": rig}))
 
 
-def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "Roster":
+def _least_loaded(infos: "list[ServiceInfo]", service: str, lab: "LabConfig") -> "ServiceInfo":
     from hilrig_runtime.errors import OperationError
 
-    candidates = [roster for roster in rosters if roster.service == service]
+    candidates = [info for info in infos if info.service == service]
     if not candidates:
         raise OperationError(f"no {service} service of lab {lab.name!r} found: is it running?")
-    return min(candidates, key=lambda roster: len(roster.rigs))
+    return min(candidates, key=lambda info: len(info.rigs))
 
 
-def _request(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
+def _request(bus: "Bus", lab: "LabConfig", info: "ServiceInfo", request: "Event") -> "Event":
     from hilrig_cli.client import QUERY_TIMEOUT_S
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import Event, topics
 
-    key = topics.CONTROL.key(lab.name, roster.service, roster.instance)
-    replies = bus.ask(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S)
+    key = topics.CONTROL.key(lab.name, info.service, info.instance)
+    replies = bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S)
     if not replies:
         raise OperationError(
-            f"{roster.service}/{roster.instance} on {roster.host} does not reply within {QUERY_TIMEOUT_S:g} s"
+            f"{info.service}/{info.instance} on {info.host} does not reply within {QUERY_TIMEOUT_S:g} s"
         )
     if replies[0].error:
-        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} refused: {replies[0].error}")
+        raise OperationError(f"{info.service}/{info.instance} on {info.host} refused: {replies[0].error}")
     return Event.FromString(replies[0].payload)

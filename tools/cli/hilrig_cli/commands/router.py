@@ -24,9 +24,9 @@ def router(
     stop_with_parent: StopWithParent = False,
 ) -> None:
     """Run the zenoh router of a lab; with \\[bus.tls], with access control by certificate."""
-    from hilrig_runtime.bus.router import router_endpoint, run_router
     from hilrig_runtime.bus.zenoh_config import router_config
     from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.process.router import router_endpoint, run_router
 
     lab = load_lab(config)
     if print_only:

@@ -14,7 +14,7 @@ from typing import Final
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_cli.local.local_lab import bind_error
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
 RESERVED_HANDLES: Final = 200
 """File handles that a service needs besides its connections."""
@@ -88,7 +88,7 @@ def check_open_files(lab: LabConfig) -> Iterator[CheckResult]:
 
 def check_timer_accuracy(lab: LabConfig) -> Iterator[CheckResult]:
     """Check that short sleeps end on time; a quick test only, `hilrig jitter` measures in detail."""
-    prefer_latency()
+    set_short_slice()
     lateness_ns = []
     for _ in range(SLEEP_COUNT):
         deadline_ns = time.monotonic_ns() + 1_000_000

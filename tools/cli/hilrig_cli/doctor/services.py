@@ -76,7 +76,7 @@ def collect(
     with (
         ZenohBus(lab.bus, identity) as bus,
         bus.subscribe(HEALTH.key(lab.name, "*", "*"), on_health),
-        bus.watch(alive_key(lab.name, "*", "*"), on_alive),
+        bus.subscribe_liveliness(alive_key(lab.name, "*", "*"), on_alive),
     ):
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
@@ -125,8 +125,8 @@ def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResul
     if not missing and not silent:
         yield CheckResult.ok("services", f"running: {', '.join(sorted(snapshot.alive))}")
     for name, (health, _) in sorted(snapshot.healths.items()):
-        if health.trouble:
-            yield CheckResult.error("services", f"{name}: {health.trouble}", "see the service's log")
+        if health.alert:
+            yield CheckResult.error("services", f"{name}: {health.alert}", "see the service's log")
         if health.lost_transport or health.lost_recorder:
             lost = health.lost_transport + health.lost_recorder
             text = f"{name}: {lost} messages lost since its start"

@@ -87,7 +87,9 @@ def _wait_until_ready(
     missing = {alive_key(lab.name, spec.service, spec.instance) for spec in processes}
     deadline_s = time.monotonic() + READY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
-        bus.watch(alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None)
+        bus.subscribe_liveliness(
+            alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None
+        )
         while missing and not stopping.is_set():
             supervisor.poll()
             if time.monotonic() > deadline_s:
