@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
