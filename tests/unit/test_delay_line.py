@@ -134,7 +134,7 @@ def test_schedule_restarts_with_each_session() -> None:
         assert not schedule.check(start_ns + 501 * MS)
         # A late check applies the entry that is active by then.
         assert schedule.check(start_ns + 3_100 * MS)
-        assert schedule.links.describe() == "state way constant delay 7 ms; command way none"
+        assert schedule.links.describe() == "state link constant delay 7 ms; command link none"
 
 
 def test_override_is_active_until_cleared() -> None:

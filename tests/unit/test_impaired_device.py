@@ -276,7 +276,7 @@ def test_every_change_is_reported_with_its_setting() -> None:
     bench.device.impairment.set(ImpairmentConfig.model_validate({"preset": "vpn", "seed": 5}))
     bench.device.impairment.set(ImpairmentConfig())
     texts = [event for event in bench.events if event.kind == Event.IMPAIRMENT_CHANGED]
-    assert texts[0].text.startswith("impairment of rig1: state way gamma mean 3 ms")
+    assert texts[0].text.startswith("impairment of rig1: state link gamma mean 3 ms")
     assert texts[0].text.endswith("seed 5 (source: override)")
     assert json.loads(texts[0].configuration_data.text)["command"]["delay"]["offset_ms"] == 15
     assert texts[0].session == bench.device.session.id

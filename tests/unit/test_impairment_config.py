@@ -50,7 +50,7 @@ def test_text_and_table_say_the_same() -> None:
     assert as_text.impairment == as_table.impairment
     assert as_text.impairment.links.command.loss == GilbertElliottLoss(to_bad=0.01, to_good=0.2)
     assert as_text.impairment.links.describe() == (
-        "state way none; command way gamma mean 20 ms, std 8 ms, loss gilbert to bad 0.01, to good 0.2"
+        "state link none; command link gamma mean 20 ms, std 8 ms, loss gilbert to bad 0.01, to good 0.2"
     )
 
 
@@ -73,8 +73,8 @@ def test_a_lab_says_in_words_what_is_done_to_its_loops() -> None:
         {"command": "constant:5", "schedule": [{"at_s": 2.5, "state": "uniform:1,2"}, {"at_s": 9}]}
     )
     assert config.describe() == (
-        "state way none; command way constant delay 5 ms, then at 2.5 s state way uniform low 1 ms, high 2 ms; "
-        "command way none, then at 9 s none"
+        "state link none; command link constant delay 5 ms, then at 2.5 s state link uniform low 1 ms, high 2 ms; "
+        "command link none, then at 9 s none"
     )
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.grading.placement import placed_parts
+from hilrig_replay.grading.placement import evaluate_placement
 from hilrig_schemas import JointState, PartState
 from hilrig_sim.arm.dynamics import forward_dynamics
 from hilrig_sim.arm.model import ArmParameters, RigParameters
@@ -21,7 +21,7 @@ def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     with VirtualRig() as rig:
         done_s = work(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert result.placed == len(PARAMETERS.scene.parts) == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
@@ -38,7 +38,7 @@ def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch
         monkeypatch.setattr(example, "time", remote)
         said = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert said["placed"] == result.placed == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
@@ -55,7 +55,7 @@ def test_stalls_delay_the_task_but_do_not_spoil_it(
         monkeypatch.setattr(example, "time", remote)
         said = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert said["placed"] == result.placed == 4
     assert said["missing"] == []
     assert result.largest_error_mm is not None
@@ -68,13 +68,13 @@ def test_magnet_waits_until_the_arm_is_at_the_part() -> None:
     controller = example.Controller(task)
     ends = {stage.text: stage.goal for stage in list(example.plan(task, example.HOME))[:3]}
     # The arm is at the end of each stage, but 0.2° beside the part.
-    ends["take red"] = ends["take red"] + [0.0035, 0.0, 0.0, 0.0]
+    ends["pick red"] = ends["pick red"] + [0.0035, 0.0, 0.0, 0.0]
     now_s = 0.0
     controller.update(now_s, example.HOME)
     while now_s < 60.0:
         now_s += 0.01
         controller.update(now_s, ends[controller.doing])
-    assert (controller.doing, controller.magnet, controller.placed) == ("take red", False, 0)
+    assert (controller.doing, controller.magnet, controller.placed) == ("pick red", False, 0)
 
 
 def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +88,7 @@ def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPa
     assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
     told = example.sentence({"parts": 4, **said})
     assert told.startswith(
-        f"{said['placed']} of 4 parts placed, not {', '.join(said['missing'])}: the time was over at"
+        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
     )
     assert repr(said["doing"]) in told
 
@@ -123,16 +123,16 @@ def test_part_on_magnet_or_beside_its_place_is_not_placed() -> None:
         return PartState(name=part.name, x=x + dx, y=y, z=z + part.size[2] / 2 + dz)
 
     poses = [standing(0, 0, dx=0.001), standing(1, 1, dx=0.030), standing(2, 2, dz=0.01), standing(3, 3)]
-    result = placed_parts(scene, poses, held=scene.parts[3].name)
+    result = evaluate_placement(scene, poses, held=scene.parts[3].name)
     assert [part.place for part in result.parts] == [0, None, None, None]
-    assert placed_parts(scene, [standing(2, 2, dz=-0.008)]).placed == 0
+    assert evaluate_placement(scene, [standing(2, 2, dz=-0.008)]).placed == 0
     assert result.placed == 1
     assert result.parts[0].error_mm == pytest.approx(1.0)
-    assert placed_parts(RigParameters().scene, []).largest_error_mm is None
+    assert evaluate_placement(RigParameters().scene, []).largest_error_mm is None
 
 
 def test_two_parts_cannot_be_placed_on_one_place() -> None:
     scene = PARAMETERS.scene
     x, y, z = scene.trays[0].places[0]
     poses = [PartState(name=part.name, x=x, y=y, z=z + part.size[2] / 2) for part in scene.parts[:2]]
-    assert placed_parts(scene, poses).placed == 1
+    assert evaluate_placement(scene, poses).placed == 1

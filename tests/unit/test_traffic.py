@@ -7,17 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilrig_modbus_edge.request_log import RequestLog
-from hilrig_replay.io.columns import TRAFFIC, Names, Rows, Table
+from hilrig_replay.io.columns import TRAFFIC_DTYPE, RowBuffer, Rows, StringTable
 from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
 READ, WRITE = bytes.fromhex("03 0004 0004"), bytes.fromhex("10 0000 0004 08 0001 0002 0003 0004")
 
 
-def rows_of(message: ModbusTraffic, names: Names | None = None) -> Rows:
-    table = Table(TRAFFIC)
-    traffic_decoder(table, names or Names())(message.SerializeToString(), 1, 0)
-    return table.take()
+def rows_of(message: ModbusTraffic, names: StringTable | None = None) -> Rows:
+    table = RowBuffer(TRAFFIC_DTYPE)
+    traffic_decoder(table, names or StringTable())(message.SerializeToString(), 1, 0)
+    return table.drain()
 
 
 _REQUESTS = st.lists(
@@ -38,7 +38,7 @@ def test_recorded_requests_are_read_in_order(requests: list[tuple[bytes, int, in
     for pdu, arrived_ns, took_ns, exception, controller in requests:
         log.record(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
     assert log.count == len(requests)
-    names = Names()
+    names = StringTable()
     rows = rows_of(log.drain(5_000, 7_000), names)
     assert log.count == 0
     assert len(rows) == len(requests)
@@ -81,7 +81,7 @@ def test_repeated_requests_share_a_kind() -> None:
 
 def test_old_recordings_have_one_record_per_request() -> None:
     one = ModbusRequest(function=16, address=1, count=2, arrived_ns=50, answered_ns=60, exception=6, controller="a:1")
-    names = Names()
+    names = StringTable()
     [row] = rows_of(ModbusTraffic(wall_ns=1_000, closed_ns=100, requests=[one]), names)
     assert [row[name] for name in ("function", "address", "count", "exception")] == [16, 1, 2, 6]
     assert (row["wall_ns"], row["arrived_ns"], row["answered_ns"], names[row["controller"]]) == (950, 50, 60, "a:1")
@@ -94,7 +94,7 @@ def test_inconsistent_columns_are_rejected(indexes: list[int], arrived: list[int
     message = ModbusTraffic(
         kinds=[ModbusKind(function=3)], kind_indexes=indexes, arrived_ns=arrived, answered_after_ns=after
     )
-    with pytest.raises(DecodeError, match="do not fit together"):
+    with pytest.raises(DecodeError, match="inconsistent request columns"):
         rows_of(message)
 
 

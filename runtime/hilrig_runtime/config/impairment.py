@@ -241,7 +241,7 @@ class LinkImpairments(Section):
         """In words, for people."""
         if self.is_inactive:
             return "none"
-        return f"state way {self.state.describe()}; command way {self.command.describe()}"
+        return f"state link {self.state.describe()}; command link {self.command.describe()}"
 
 
 def _both(delay: Delay, loss: Loss = NoLoss()) -> LinkImpairments:  # noqa: B008
