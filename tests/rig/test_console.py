@@ -221,7 +221,7 @@ def test_recordings_are_listed_served_and_reported(running_lab: ConsoleWithLab) 
 
     with Watcher(running_lab.console.port):
         runs = eventually(listed, every_s=0.2)
-    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["trouble"]
+    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["error"]
     status, headers, body = running_lab.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert (status, body) == (200, good.read_bytes())
     assert headers["content-disposition"].startswith("attachment")

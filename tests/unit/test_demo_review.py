@@ -12,7 +12,7 @@ from hilrig_replay.analysis.verify import Verification
 from hilrig_replay.grading.placement import PartPlacement, PlacementReport
 
 DONE = {"done_s": 12.1, "duration_s": 20.0, "doing": "", "missing": []}
-LATE = {"done_s": None, "duration_s": 12.0, "doing": "take blue", "missing": ["blue", "green"]}
+LATE = {"done_s": None, "duration_s": 12.0, "doing": "pick blue", "missing": ["blue", "green"]}
 FAILED: dict[str, Any] = {}
 
 
@@ -39,7 +39,7 @@ PLACED = "placed: 3 of 3 parts are in the tray, position error at most 0.25 mm"
             ("red",),
             True,
             "placed: 1 of 3 parts are in the tray, position error at most 0.25 mm; missing blue, green: "
-            "the controller's 12 s ended during 'take blue'",
+            "the controller's 12 s ended during 'pick blue'",
         ),
         (
             DONE,
@@ -55,7 +55,7 @@ PLACED = "placed: 3 of 3 parts are in the tray, position error at most 0.25 mm"
             (),
             False,
             "placed: 0 of 3 parts are in the tray; missing red, blue, green: "
-            "the controller's 12 s ended during 'take blue'; the controller reported red as placed",
+            "the controller's 12 s ended during 'pick blue'; the controller reported red as placed",
         ),
     ],
 )

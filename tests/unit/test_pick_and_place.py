@@ -68,13 +68,13 @@ def test_magnet_waits_until_the_arm_is_at_the_part() -> None:
     controller = example.Controller(task)
     ends = {stage.text: stage.goal for stage in list(example.plan(task, example.HOME))[:3]}
     # The arm is at the end of each stage, but 0.2° beside the part.
-    ends["take red"] = ends["take red"] + [0.0035, 0.0, 0.0, 0.0]
+    ends["pick red"] = ends["pick red"] + [0.0035, 0.0, 0.0, 0.0]
     now_s = 0.0
     controller.update(now_s, example.HOME)
     while now_s < 60.0:
         now_s += 0.01
         controller.update(now_s, ends[controller.doing])
-    assert (controller.doing, controller.magnet, controller.placed) == ("take red", False, 0)
+    assert (controller.doing, controller.magnet, controller.placed) == ("pick red", False, 0)
 
 
 def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +88,7 @@ def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPa
     assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
     told = example.sentence({"parts": 4, **said})
     assert told.startswith(
-        f"{said['placed']} of 4 parts placed, not {', '.join(said['missing'])}: the time was over at"
+        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
     )
     assert repr(said["doing"]) in told
 

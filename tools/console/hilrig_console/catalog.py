@@ -180,5 +180,6 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
+    row["error"] = row.pop("trouble")
     row["open"] = entry.ended == IN_PROGRESS
     return row

@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
@@ -324,16 +324,16 @@ function showRuns(list) {
   setText(byId("runs-count"), list.error || (list.found === list.total ? `${list.total}${more}` : `${list.found} of ${list.total}${more}`));
   table.tBodies[0].replaceChildren(...list.runs.map((run) => {
     const start = run.start_ms ? new Date(run.start_ms).toLocaleString() : run.name;
-    const row = html("tr", run.trouble ? {"data-level": "bad"} : {}, html("th", {scope: "row", title: run.path}, start),
+    const row = html("tr", run.error ? {"data-level": "bad"} : {}, html("th", {scope: "row", title: run.path}, start),
       html("td", {}, run.rig));
     const links = html("td");
-    if (!run.open && !run.trouble) {
+    if (!run.open && !run.error) {
       links.append(html("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
         "aria-label": `Report of ${run.name}`}, "Report"));
     }
     if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
-    if (run.trouble) {
-      row.append(html("td", {class: "long", colspan: "8"}, run.trouble), links);
+    if (run.error) {
+      row.append(html("td", {class: "long", colspan: "8"}, run.error), links);
       return row;
     }
     const lost = run.lost_transport + run.lost_recorder + run.lost_file;
