@@ -31,7 +31,7 @@ def _times(byte: str, count: int) -> str:
 RULES: tuple[Rule, ...] = (
     # Read Coils
     Rule("AP 6.1", "01 reads a coil, the first in the least significant bit", "01 00 00 00 01", "01 01 00"),
-    Rule("AP 6.1", "01 reads back what was written", "01 00 00 00 01", "01 01 01", ("05 00 00 FF 00",)),
+    Rule("AP 6.1", "01 reads back a written coil", "01 00 00 00 01", "01 01 01", ("05 00 00 FF 00",)),
     Rule("AP 6.1", "01 with quantity 0 is an illegal value", "01 00 00 00 00", "81 03"),
     Rule("AP 6.1", "01 with quantity 2001 is an illegal value", "01 00 00 07 D1", "81 03"),
     Rule("AP 6.1", "01 with quantity 2000 is legal; the address is illegal", "01 00 00 07 D0", "81 02"),
@@ -162,7 +162,7 @@ RULES: tuple[Rule, ...] = (
         ("06 00 00 12 34", "16 00 00 00 00 AB CD"),
     ),
     # Read/Write Multiple Registers
-    Rule("AP 6.17", "23 reads what it wrote", "17 00 00 00 01 00 00 00 01 02 00 2A", "17 02 00 2A"),
+    Rule("AP 6.17", "23 reads back the written registers", "17 00 00 00 01 00 00 00 01 02 00 2A", "17 02 00 2A"),
     Rule("AP 6.17", "23 reading 0 registers is an illegal value", "17 00 00 00 00 00 00 00 01 02 00 2A", "97 03"),
     Rule("AP 6.17", "23 reading 126 registers is an illegal value", "17 00 00 00 7E 00 00 00 01 02 00 2A", "97 03"),
     Rule(

@@ -33,7 +33,7 @@ def error_line(stderr: str) -> str:
         (lambda _: None, "no such file"),
         (lambda path: path.mkdir(), "folder"),
         (lambda path: path.write_bytes(b""), "empty"),
-        (lambda path: path.write_text("hello, I am a text file and no recording\n" * 5), "no MCAP"),
+        (lambda path: path.write_text("hello, I am a text file and no recording\n" * 5), "not an MCAP file"),
     ],
     ids=["missing", "folder", "empty", "text"],
 )
@@ -56,7 +56,7 @@ def test_empty_recording(tmp_path: Path, command: tuple[str, ...]) -> None:
         writer.finish()
     done = hilrig(*(argument.format(file=file, folder=tmp_path) for argument in command))
     assert done.returncode == 2
-    assert f"{file}: an empty recording" in error_line(done.stderr)
+    assert f"{file}: empty recording: " in error_line(done.stderr)
 
 
 def test_plot_in_a_missing_folder(tmp_path: Path) -> None:

@@ -221,7 +221,7 @@ def test_recordings_are_listed_served_and_reported(running_lab: ConsoleWithLab) 
 
     with Watcher(running_lab.console.port):
         runs = eventually(listed, every_s=0.2)
-    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["trouble"]
+    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["error"]
     status, headers, body = running_lab.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert (status, body) == (200, good.read_bytes())
     assert headers["content-disposition"].startswith("attachment")
@@ -337,7 +337,7 @@ def test_browser_shows_changing_values(running_lab: ConsoleWithLab, tmp_path: Pa
             assert browser.run("document.documentElement.scrollWidth") <= width
             eventually(lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2)
         assert browser.errors == []
-        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", asked).partition("?")[0] for asked in browser.requests} <= {
+        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", url).partition("?")[0] for url in browser.requests} <= {
             "",
             "console.css",
             "console.js",
@@ -395,8 +395,8 @@ def answers(address: ListenAddress, tls: TlsFiles | None) -> bool:
 
 
 def test_reports_occupied_port(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        listen = f"127.0.0.1:{taken.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        listen = f"127.0.0.1:{occupied.getsockname()[1]}"
         done = hilrig("console", "--config", write_lab(tmp_path), "--listen", listen)
     assert done.returncode == 3
     (line,) = done.stderr.splitlines()

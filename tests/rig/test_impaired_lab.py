@@ -38,9 +38,9 @@ DISTRIBUTIONS: dict[str, Any] = {
     "gamma:12,3,5": stats.gamma(16, loc=5, scale=9 / 12),
     "exponential:3,10": stats.expon(10, 3),
 }
-COMMAND_RIGS = {f"{text.partition(':')[0]}-way": text for text in DISTRIBUTIONS}
-STATE_WAY = "uniform:1,6"
-RIGS = ("free", *COMMAND_RIGS, "trace", "state-way", "lossy", "scheduled")
+COMMAND_RIGS = {f"{text.partition(':')[0]}-link": text for text in DISTRIBUTIONS}
+STATE_DELAY = "uniform:1,6"
+RIGS = ("free", *COMMAND_RIGS, "trace", "state-link", "lossy", "scheduled")
 
 
 @dataclass
@@ -62,17 +62,17 @@ class Session:
 def write_impaired_lab(folder: Path) -> Path:
     trace = folder / "trace.txt"
     trace.write_text("".join(f"{delay}\n" for delay in TRACE_MS))
-    ways = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
-    ways["trace"] = f"command = 'trace:{trace}'"
-    ways["state-way"] = f"state = '{STATE_WAY}'"
-    ways["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
-    ways["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
+    impairments = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
+    impairments["trace"] = f"command = 'trace:{trace}'"
+    impairments["state-link"] = f"state = '{STATE_DELAY}'"
+    impairments["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
+    impairments["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
     text = f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {free_ports(len(RIGS))}\nsession_grace_ms = 0\n"
     text += f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n"
     for rig in RIGS:
         text += f"[[rigs]]\nname = '{rig}'\n"
-        if rig in ways:
-            text += f"[rigs.impairment]\nseed = {SEED}\n{ways[rig]}\n"
+        if rig in impairments:
+            text += f"[rigs.impairment]\nseed = {SEED}\n{impairments[rig]}\n"
     path = folder / "lab.toml"
     path.write_text(text)
     return path
@@ -120,9 +120,10 @@ def shown(lab_folder: Path) -> dict[str, Any]:
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
         ports = lab.lab.ports
-        assert f"{ports['constant-way']}, step 10 ms, impaired: state link none; command link constant" in lab.output()
+        text = "step 10 ms, impairment: state link none; command link constant"
+        assert f"{ports['constant-link']}, {text}" in lab.output()
         assert f"{ports['free']}, step 10 ms\n" in lab.output()
-        controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-way": write_for_each_state}
+        controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-link": write_for_each_state}
         threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
         for thread in threads:
             thread.start()
@@ -163,8 +164,8 @@ def test_injected_delay_has_configured_distribution(sessions: dict[str, Session]
 def test_each_command_has_the_delay_of_its_seed(sessions: dict[str, Session], rig: str) -> None:
     commands = sessions[rig].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
-    way = LinkImpairment.model_validate(COMMAND_RIGS[rig])
-    sampled, _ = Impairment(way, link_seed(SEED, rig, "command")).draw(2000)
+    link = LinkImpairment.model_validate(COMMAND_RIGS[rig])
+    sampled, _ = Impairment(link, link_seed(SEED, rig, "command")).draw(2000)
     expected = sampled[(commands["seq"] - commands["seq"][0]).astype(int)]
     assert commands["command_injected_ns"].tolist() == expected.tolist()
 
@@ -187,11 +188,12 @@ def test_injected_state_delay_is_that_of_its_seed(sessions: dict[str, Session]) 
     next one and gets no response, more often one with a long delay. The delays restart with a session while some states
     are in flight: the first and last ones are excluded.
     """
-    session = sessions["state-way"]
+    session = sessions["state-link"]
     assert_stages_add_up(session)
     assert session.report.samples > 250
     table = session.report.table[5:-5]
-    sampled, _ = Impairment(LinkImpairment.model_validate(STATE_WAY), link_seed(SEED, "state-way", "state")).draw(3000)
+    link = LinkImpairment.model_validate(STATE_DELAY)
+    sampled, _ = Impairment(link, link_seed(SEED, "state-link", "state")).draw(3000)
     (first,) = np.flatnonzero(sampled == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
     assert table["injected"].tolist() == sampled[first + after].tolist()
@@ -249,7 +251,7 @@ def test_impaired_run_is_verified_bit_exactly(sessions: dict[str, Session]) -> N
 def test_recording_can_be_used_as_delay_trace(sessions: dict[str, Session], lab_folder: Path) -> None:
     from hilrig_replay.export.delay_trace import delay_trace
 
-    session = sessions["normal-way"]
+    session = sessions["normal-link"]
     trace = delay_trace(session.run)
     table = session.report.table
     assert trace.delays_ms == tuple(((table["controller"] + table["injected"]) / 1e6).tolist())
@@ -259,7 +261,7 @@ def test_recording_can_be_used_as_delay_trace(sessions: dict[str, Session], lab_
 
 
 def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict[str, Session]) -> None:
-    recording = sessions["gamma-way"].run.path
+    recording = sessions["gamma-link"].run.path
     config = write_lab(tmp_path)
     with RunningLab(config) as lab, RawClient("127.0.0.1", lab.port) as client:
         client.write(0, 1)
@@ -271,11 +273,11 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
             return decoded
 
         assert row()["impairment"] == "none"
-        told = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
-        assert told["ways"]["state"]["delay"]["offset_ms"] == 15
-        assert told["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
-        assert (told["seed"], told["set_by"]) == (7, "override")
-        assert row() | {"states": 0, "commands": 0} == told | {"states": 0, "commands": 0}
+        status = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
+        assert status["ways"]["state"]["delay"]["offset_ms"] == 15
+        assert status["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
+        assert (status["seed"], status["set_by"]) == (7, "override")
+        assert row() | {"states": 0, "commands": 0} == status | {"states": 0, "commands": 0}
         assert row("--trace", recording)["ways"]["command"]["delay"]["kind"] == "trace"
         assert row("--off")["impairment"] == "none"
         assert row("--lab")["set_by"] == "lab.toml"

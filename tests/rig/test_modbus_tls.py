@@ -521,7 +521,7 @@ def test_invalid_certificate_files_are_reported(tmp_path: Path) -> None:
     (folder / "bus/ca.key").write_text("no key")
     done = hilrig("certs", folder)
     assert done.returncode == 2
-    assert "bus/ca.pem and ca.key are no certificate and key" in done.stderr
+    assert "bus/ca.pem, ca.key: not a valid certificate with its key" in done.stderr
     assert "Traceback" not in done.stderr
 
 

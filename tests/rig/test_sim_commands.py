@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.io.index import read_verdict
+from hilrig_replay.analysis.index import read_verdict
 from hilrig_schemas import JointState
 from support.labs import hilrig
 from support.recordings import Made, write

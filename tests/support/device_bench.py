@@ -1,4 +1,4 @@
-"""A Modbus device on a bench: a clock and a simulation that the test owns, and everything that the device says kept."""
+"""Test bench of a Modbus device: manual clock, states of the test, and a record of all its output."""
 
 import random
 import struct
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 class Bench:
-    """A device on a bench: what it says is kept."""
+    """A device and its recorded output."""
 
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock()
@@ -68,8 +68,8 @@ class Bench:
         if self.arrive is not None:
             self.arrive(self.arrival)
 
-    def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
-        return self.device.connect(host, port, **rights)
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **permissions: bool) -> Client:
+        return self.device.connect(host, port, **permissions)
 
     def read(
         self, client: Client, address: int, count: int, table: RegisterTable = RegisterTable.HOLDING_REGISTER

@@ -9,19 +9,19 @@ import pytest
 from hilrig_cli.local.demo import DemoRun, Review
 from hilrig_replay.analysis.latency import LatencyReport
 from hilrig_replay.analysis.verify import Verification
-from hilrig_replay.grading.placement import PlacedPart, TaskResult
+from hilrig_replay.grading.placement import PartPlacement, PlacementReport
 
 DONE = {"done_s": 12.1, "duration_s": 20.0, "doing": "", "missing": []}
-LATE = {"done_s": None, "duration_s": 12.0, "doing": "take blue", "missing": ["blue", "green"]}
+LATE = {"done_s": None, "duration_s": 12.0, "doing": "pick blue", "missing": ["blue", "green"]}
 FAILED: dict[str, Any] = {}
 
 
 def review(controller: dict[str, Any], *in_tray: str) -> Review:
-    parts = [PlacedPart(name, 0, 0.25) if name in in_tray else PlacedPart(name, None, None) for name in SCENE]
+    parts = [PartPlacement(name, 0, 0.25) if name in in_tray else PartPlacement(name, None, None) for name in SCENE]
     exact = Verification(100, 0, 0, True, 0.0, (0, 0, 0, 0), (0, 0, 0, 0), 0.0, None, "here")
     latency = cast(LatencyReport, SimpleNamespace(samples=100))
     run = DemoRun(Path("run.mcap"), controller)
-    return Review(run, latency, exact, TaskResult(tuple(parts)), Path("latency.png"), Path("run.rrd"))
+    return Review(run, latency, exact, PlacementReport(tuple(parts)), Path("latency.png"), Path("run.rrd"))
 
 
 SCENE = ("red", "blue", "green")
@@ -39,7 +39,7 @@ PLACED = "placed: 3 of 3 parts are in the tray, position error at most 0.25 mm"
             ("red",),
             True,
             "placed: 1 of 3 parts are in the tray, position error at most 0.25 mm; missing blue, green: "
-            "the controller's 12 s ended during 'take blue'",
+            "the controller's 12 s ended during 'pick blue'",
         ),
         (
             DONE,
@@ -55,7 +55,7 @@ PLACED = "placed: 3 of 3 parts are in the tray, position error at most 0.25 mm"
             (),
             False,
             "placed: 0 of 3 parts are in the tray; missing red, blue, green: "
-            "the controller's 12 s ended during 'take blue'; the controller reported red as placed",
+            "the controller's 12 s ended during 'pick blue'; the controller reported red as placed",
         ),
     ],
 )

@@ -9,7 +9,7 @@ from hilrig_sim.arm import kinematics
 from hilrig_sim.arm.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
 from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG, PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.plant.static_geometry import GROUND_BELOW_TABLE
+from hilrig_sim.plant.static_geometry import TABLE_ABOVE_GROUND_M
 from hilrig_sim.plant.world import NO_PART
 
 ARM = ArmParameters()
@@ -227,7 +227,7 @@ def test_part_released_beside_the_table_lies_on_the_floor() -> None:
     plant.position[:, 0] = kinematics.inverse(ARM, (0.1, 0.5, 0.1, 0.0))[0]
     move_up(plant, 0.0)
     steps(plant, 60, hold(plant), OFF)
-    assert plant.world.z[0, 0] == pytest.approx(TABLE - GROUND_BELOW_TABLE + 0.015, abs=1e-9)
+    assert plant.world.z[0, 0] == pytest.approx(TABLE - TABLE_ABOVE_GROUND_M + 0.015, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 The simulation latches only the newest command of each rig at its tick, so an older one can be dropped and the commands
 of several rigs can share a message. Each message costs the sender, threads of the bus on both sides and the simulation
 a wake-up (0.1 ms of processor time in all), which on a small machine is taken from the requests in progress. At 128
-rigs, a message a command leaves 63 % of the loops within one step; this schedule leaves 98 % (`bench/ablation.py`).
+rigs, one message per command keeps 63 % of the loops within one step, this schedule 98 % (`bench/ablation.py`).
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigBatch
 
 COALESCE_WINDOW_NS: Final = 2_000_000
-"""Shortest time between two messages, ns, while there is time until the deadline: at most ten a step of 20 ms."""
+"""Shortest time between two messages before the deadline, ns: at most ten messages per step of 20 ms."""
 DEADLINE_MARGIN_NS: Final = 1_500_000
 """Time before the estimated tick at which no command is delayed any further, ns.
 
@@ -42,11 +42,11 @@ class _StateWrites:
 
 
 class CommandScheduler:
-    """Sends the commands of an edge's rigs, on the edge's event loop.
+    """Sends the commands of an edge's rigs; runs on the event loop of the edge.
 
     A command is sent at once, unless a message was sent within `COALESCE_WINDOW_NS`: then it waits for the rest of the
-    window, but never beyond the deadline before the next tick. A rig's further commands on the same state replace one
-    another until that deadline: a controller that polls as fast as it can sends one message a step instead of hundreds.
+    window, but never beyond the deadline before the next tick. Further commands of a rig on the same state
+    replace one another until that deadline: a busy-polling client causes one message per step instead of hundreds.
 
     Args:
         source: name of the edge, put into the messages.
@@ -114,7 +114,7 @@ class CommandScheduler:
         writes.count += 1
         tick_ns = state_ns + self._step_ns
         if now_ns > tick_ns + self._step_ns:
-            # No states from the simulation: there is no tick to be in time for.
+            # The simulation publishes no states: there is no tick to estimate.
             return window_end_ns
         deadline_ns = tick_ns - DEADLINE_MARGIN_NS
         if writes.count <= SEPARATE_WRITES:

@@ -32,8 +32,8 @@ FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
 """Time that the first clients wait for the first state, ns; afterwards they get exception 04."""
 
 RIGS_PER_TURN: Final = 16
-"""Rigs that one turn of the event loop maintains in a tick, so that no request waits for all of them: with all of 128
-rigs in one turn the 99th percentile of a read is 60 % higher (`bench/ablation.py`)."""
+"""Number of rigs per turn of the event loop in an edge tick, so that no request waits for the work of all rigs. With
+128 rigs in one turn, the 99th percentile of a read is 60 % higher (`bench/ablation.py`)."""
 MAX_PORTS_TRIED: Final = 100
 """Number of ports that are tried for a rig that is added without one."""
 

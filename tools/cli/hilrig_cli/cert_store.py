@@ -35,7 +35,7 @@ class CertificateStore:
             raise OperationError(f"{folder}: can't be created: {error.strerror}") from error
 
     def authority(self, name: str) -> Credential:
-        """Return the folder's authority; create one with the common name `name` if there is none.
+        """Return the folder's authority; create one with the common name `name` if it is missing.
 
         Raises:
             InputError: the existing authority is not valid.

@@ -21,7 +21,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 QUERY_TIMEOUT_S: Final = 3.0
 """Timeout of a query, including the time to set up the link to the service."""
 WAIT_MESSAGE_AFTER_S: Final = 0.5
-"""Waiting time after which a message says what the command waits for."""
+"""Waiting time after which a message is printed."""
 
 
 def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Message) -> list[MessageT]:

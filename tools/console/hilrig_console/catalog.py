@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from hilrig_console.worker import Worker
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
-from hilrig_replay.io.index import RECORDING, RunEntry, RunIndex
+from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
 LIST_PERIOD_S: Final = 2.0
@@ -180,5 +180,6 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
-    row["open"] = entry.ended == RECORDING
+    row["error"] = row.pop("trouble")
+    row["open"] = entry.ended == IN_PROGRESS
     return row

@@ -146,10 +146,10 @@ class LabSubscriber:
 
 
 def _config(bus: Bus, lab: str, rig: str) -> RigConfig | None:
-    for answer in bus.query(CONFIG.key(lab, rig), timeout_s=0.5):
-        if answer.payload and not answer.error:
+    for reply in bus.query(CONFIG.key(lab, rig), timeout_s=0.5):
+        if reply.payload and not reply.error:
             try:
-                return CONFIG.decode(answer.payload)
+                return CONFIG.decode(reply.payload)
             except DecodeError:
                 continue
     return None

@@ -90,7 +90,12 @@ class ViewModel:
         for rig in values["rigs"]:
             rig["address"] = self._addresses.get(rig["rig"], "")
         # The time changes the message every second: a page without messages reports a lost connection.
-        return {"lab": self._lab, "at_s": now_s, "link": self._bus_error, "scenes": len(self.poses.scenes)} | values
+        return {
+            "lab": self._lab,
+            "at_s": now_s,
+            "bus_error": self._bus_error,
+            "scenes": len(self.poses.scenes),
+        } | values
 
 
 def _json(value: Any) -> str:

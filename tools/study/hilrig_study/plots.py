@@ -131,11 +131,11 @@ def plane_figure(
         (True, "#7CFC00", "live: as predicted"),
         (False, "#ff4d4d", "live: not as predicted"),
     ):
-        mine = [marker for marker in markers if marker.as_predicted is as_predicted]
-        if mine:
+        rows = [marker for marker in markers if marker.as_predicted is as_predicted]
+        if rows:
             axes.scatter(
-                [marker.x for marker in mine],
-                [marker.y for marker in mine],
+                [marker.x for marker in rows],
+                [marker.y for marker in rows],
                 c=color,
                 edgecolors="black",
                 s=46,

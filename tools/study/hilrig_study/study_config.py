@@ -321,7 +321,7 @@ def load_study(path: Path) -> StudyConfig:
     try:
         study = StudyConfig.model_validate(values)
     except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {mistake}" for mistake in format_validation_error(error))) from error
+        raise InputError("\n".join(f"{path}: {message}" for message in format_validation_error(error))) from error
     study.linear_plant()
     study.loop.timing()
     return study

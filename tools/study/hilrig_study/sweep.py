@@ -76,11 +76,11 @@ class SweepResult:
 
     def plane(self, study: StudyConfig, controller: int, values: NDArray[np.generic]) -> Floats:
         """Return the mean over the runs of each cell, (len(y), len(x)), of one value per run, (R,)."""
-        mine = self.cells["controller"] == controller
+        rows = self.cells["controller"] == controller
         shape = (len(study.y.points), len(study.x.points))
         total, count = np.zeros(shape), np.zeros(shape)
-        where = (self.cells["iy"][mine], self.cells["ix"][mine])
-        np.add.at(total, where, values[mine].astype(np.float64))
+        where = (self.cells["iy"][rows], self.cells["ix"][rows])
+        np.add.at(total, where, values[rows].astype(np.float64))
         np.add.at(count, where, 1.0)
         return total / count
 
@@ -159,22 +159,22 @@ def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDAr
     axes = {"x": {"what": study.x.what, "values": (x,)}, "y": {"what": study.y.what, "values": (y,)}}
     plane = {"x": AxisConfig.model_validate(axes["x"]), "y": AxisConfig.model_validate(axes["y"]), "runs": 1}
     cells = all_cells(study.model_copy(update=plane))
-    mine: NDArray[np.void] = cells[cells["controller"] == controller]
-    return mine
+    rows: NDArray[np.void] = cells[cells["controller"] == controller]
+    return rows
 
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
     """Return the timeline of each run, all of one controller; runs with equal timing share one object."""
     links = study.link_impairments(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
-    known: dict[tuple[float, ...], Timeline] = {}
+    cache: dict[tuple[float, ...], Timeline] = {}
     lines = []
     for cell in cells:
         delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
         random = jitter_ms > 0 or loss > 0 or not links.is_inactive
         # The draws depend only on the study's seed and the run number: all cells use common random numbers.
         key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
-        if key not in known:
+        if key not in cache:
             seed = np.random.SeedSequence(study.seed, spawn_key=(int(cell["run"]),))
             states, commands, added = (np.random.SeedSequence(s.entropy, spawn_key=s.spawn_key) for s in seed.spawn(3))
             more = LinkImpairment(
@@ -184,10 +184,10 @@ def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, t
             state_ns, state_lost = Impairment(links.state, states).draw(ticks)
             command_ns, command_lost = Impairment(links.command, commands).draw(polls)
             more_ns, more_lost = Impairment(more, added).draw(polls)
-            known[key] = timeline(
+            cache[key] = timeline(
                 timing, ticks, state_ns, command_ns + more_ns + delay_ns, state_lost, command_lost | more_lost
             )
-        lines.append(known[key])
+        lines.append(cache[key])
     return lines
 
 
@@ -237,14 +237,14 @@ def sweep(
             done += 1
             progress(done / total)
         for theory_future, row in theories.items():
-            answer = theory_future.result()
-            if answer is None:
+            result = theory_future.result()
+            if result is None:
                 continue
-            found.append(answer[0])
+            found.append(result[0])
             controller, gain, step_ms, poll_ms = row
-            mine = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
-            mine &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
-            radius[mine] = [answer[1][delay] for delay in cells["delay_ms"][mine].tolist()]
+            rows = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
+            rows &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
+            radius[rows] = [result[1][delay] for delay in cells["delay_ms"][rows].tolist()]
     return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - start_s)
 
 

@@ -14,7 +14,7 @@ from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 
-MARGIN: Final = 0.2
+STABILITY_MARGIN: Final = 0.2
 """Required safety margin, as a fraction of the limit."""
 
 
@@ -34,7 +34,7 @@ def fastest_mode(arm: ArmParameters, theta2: float | None = None, payload: float
 def largest_safe_step(arm: ArmParameters, integrator: str) -> float:
     """Return the longest integration step with the margin, s; infinity without a decaying mode."""
     rate = fastest_mode(arm)
-    return math.inf if rate == 0 else (1 - MARGIN) * TABLEAUS[integrator].negative_real_limit() / rate
+    return math.inf if rate == 0 else (1 - STABILITY_MARGIN) * TABLEAUS[integrator].negative_real_limit() / rate
 
 
 def check_stable(parameters: RigParameters) -> None:
@@ -51,5 +51,5 @@ def check_stable(parameters: RigParameters) -> None:
         raise InputError(
             f"the step of {sim.step * 1e3:g} ms{each} would be unstable with {sim.integrator}: the arm's fastest mode "
             f"is {fastest_mode(parameters.arm):.1f} 1/s, so the largest safe step is {safe * 1e3:.1f} ms "
-            f"({MARGIN:.0%} margin); set sim.substeps = {math.ceil(sim.step / safe)} or a shorter sim.step_ms"
+            f"({STABILITY_MARGIN:.0%} margin); set sim.substeps = {math.ceil(sim.step / safe)} or a shorter sim.step_ms"
         )

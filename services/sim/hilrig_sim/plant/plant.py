@@ -19,7 +19,7 @@ from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import crossing, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
-from hilrig_sim.plant.static_geometry import TOUCHING
+from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M
 from hilrig_sim.plant.world import ALL_RIGS, NO_PART, World
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,7 @@ _FALSE: Final = b"\x00"
 
 
 class Plant:
-    """N rigs that step together; they fraction step length, sub-steps and integrator, and have their own parameters."""
+    """N rigs that step together; they have one step length, number of sub-steps and integrator."""
 
     def __init__(self, rigs: Sequence[RigParameters]) -> None:
         """Initialize every rig at its start pose.
@@ -331,7 +331,7 @@ class Plant:
         self._upper[2] = self._stop[2]
         np.subtract(self._l1, self.world.held_height, out=self._free3)
         np.subtract(self._free3, self.world.highest, out=self._free3)
-        np.subtract(self._free3, TOUCHING, out=self._free3)
+        np.subtract(self._free3, CONTACT_TOLERANCE_M, out=self._free3)
 
 
 def _sides(position: Floats, lower: Floats, upper: Floats) -> Floats:

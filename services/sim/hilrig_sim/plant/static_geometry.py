@@ -12,11 +12,11 @@ Floats = NDArray[np.float64]
 Rigs = NDArray[np.int64] | slice
 """Indices of rigs, or a slice of all rigs."""
 
-FAR_AWAY: Final = 1e9
+FAR_AWAY_M: Final = 1e9
 """Coordinate of the unused parts and trays of a rig, m."""
-TOUCHING: Final = 1e-9
+CONTACT_TOLERANCE_M: Final = 1e-9
 """Largest distance of two surfaces that touch, m."""
-GROUND_BELOW_TABLE: Final = 0.75
+TABLE_ABOVE_GROUND_M: Final = 0.75
 """Height of the table top above the ground, m."""
 
 
@@ -34,7 +34,7 @@ class StaticGeometry:
         """Whether no tool and no part can be beside a table."""
         rows = max(len(scene.trays) for scene in scenes)
         self._tray = np.zeros((5, rows, count))
-        self._tray[0] = FAR_AWAY
+        self._tray[0] = FAR_AWAY_M
         self._half = np.zeros((2, rows, count))
         for rig, scene in enumerate(scenes):
             for row, tray in enumerate(scene.trays):
@@ -52,7 +52,7 @@ class StaticGeometry:
             half_x, half_y = self._table_half[:, rigs]
             center_x, center_y = self._table_center[:, rigs]
             beside = (np.abs(x - center_x) > half_x + radius) | (np.abs(y - center_y) > half_y + radius)
-            height = np.where(beside | (table > bottom + TOUCHING), table - GROUND_BELOW_TABLE, table)
+            height = np.where(beside | (table > bottom + CONTACT_TOLERANCE_M), table - TABLE_ABOVE_GROUND_M, table)
         if not self._rows:
             return height
         tray_x, tray_y, c, s, top = self._tray[:, :, rigs]
@@ -60,5 +60,5 @@ class StaticGeometry:
         dx, dy = x - tray_x, y - tray_y
         u = np.maximum(np.abs(c * dx + s * dy) - half_u, 0.0)
         v = np.maximum(np.abs(c * dy - s * dx) - half_v, 0.0)
-        under = (u * u + v * v <= radius * radius) & (top <= bottom + TOUCHING)
+        under = (u * u + v * v <= radius * radius) & (top <= bottom + CONTACT_TOLERANCE_M)
         return np.asarray(np.maximum(height, np.where(under, top, -np.inf).max(axis=0)))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_sim.arm.model import GRAVITY, SceneParameters
-from hilrig_sim.plant.static_geometry import FAR_AWAY, TOUCHING, Rigs, StaticGeometry
+from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M, FAR_AWAY_M, Rigs, StaticGeometry
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -36,8 +36,8 @@ class World:
         self.part_names = tuple(tuple(part.name for part in scene.parts) for scene in scenes)
         rows = max(len(scene.parts) for scene in scenes)
         self._row_numbers = np.arange(rows)[:, np.newaxis]
-        self.x = np.full((rows, count), FAR_AWAY)
-        self.y = np.full((rows, count), FAR_AWAY)
+        self.x = np.full((rows, count), FAR_AWAY_M)
+        self.y = np.full((rows, count), FAR_AWAY_M)
         self.z = np.zeros((rows, count))
         """Centers of the parts, world, m, (P, N)."""
         self.yaw = np.zeros((rows, count))
@@ -121,7 +121,7 @@ class World:
     def at_rest(self, rig: int) -> bool:
         """Return whether each part of a rig is held or lies on a surface."""
         rows = [row for row in range(len(self.part_names[rig])) if row != self.held[rig]]
-        return all(abs(self._bottom(row, rig) - self._support_of(row, rig)) <= TOUCHING for row in rows)
+        return all(abs(self._bottom(row, rig) - self._support_of(row, rig)) <= CONTACT_TOLERANCE_M for row in rows)
 
     def release(self, rigs: Ints) -> None:
         """Switch off the magnets of these rigs, which hold parts: the parts fall from rest."""
@@ -147,7 +147,7 @@ class World:
         squared = dx * dx + dy * dy
         top = self.z[:, rigs] + self.half_height[:, rigs]
         # The tolerance prevents that rounding decides at the limit of the gap.
-        near = np.abs(top - z) <= self._gap[rigs] + TOUCHING
+        near = np.abs(top - z) <= self._gap[rigs] + CONTACT_TOLERANCE_M
         near &= self._attracted[:, rigs] & (squared <= self._reach[rigs] * self._reach[rigs])
         picking = near.any(axis=0)
         if not picking.any():
@@ -282,7 +282,7 @@ class World:
         dx, dy = self.x[:, rigs] - x, self.y[:, rigs] - y
         together = self._radius[:, rigs] + radius
         top = self.z[:, rigs] + self.half_height[:, rigs]
-        under = (dx * dx + dy * dy < together * together) & (top <= bottom + TOUCHING)
+        under = (dx * dx + dy * dy < together * together) & (top <= bottom + CONTACT_TOLERANCE_M)
         # A held part is no support for other parts.
         under &= self._row_numbers != ignored
         if self.holding:

@@ -22,7 +22,7 @@ from hilrig_cli.bench.cpu_stress import cpu_stress
 from hilrig_cli.bench.timing_benchmark import TimingResult
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_replay.analysis.data_quality import behind_ns
+from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.records import Records
@@ -98,7 +98,7 @@ def _evaluate(
     def count(block: Records) -> None:
         nonlocal ticks, overruns, missed
         ticks += len(block.states)
-        overruns += int((behind_ns(block.states, run.step_ns) > run.step_ns).sum())
+        overruns += int((tick_lateness_ns(block.states, run.step_ns) > run.step_ns).sum())
         missed += int(block.states["missed_steps"].sum())
 
     report = measure(run, count)

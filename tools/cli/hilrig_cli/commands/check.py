@@ -23,7 +23,7 @@ def check(
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_replay.grading.task_loading import check_task
+    from hilrig_replay.grading.task_loading import validate_task
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
     from hilrig_runtime.errors import InputError
@@ -37,7 +37,7 @@ def check(
         for rig in lab.rigs:
             parameters = rig_parameters(lab, rig)
             if lab.task is not None:
-                check_task(lab.task, parameters)
+                validate_task(lab.task, parameters)
     except InputError as error:
         raise InputError(f"{file or 'defaults'}: {error}") from error
     if as_json:

@@ -35,11 +35,11 @@ def latency(
     Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
     from hilrig_replay.analysis.latency import measure
-    from hilrig_replay.io.paths import names_of, recordings
+    from hilrig_replay.io.paths import display_names, find_recordings
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
-    paths = recordings(runs)
+    paths = find_recordings(runs)
     if plot is not None:
         from hilrig_replay.plots.latency_plot import save_plot
         from hilrig_replay.plots.output import check_plot_path
@@ -68,7 +68,7 @@ def latency(
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:
-        names = names_of(paths)
+        names = display_names(paths)
         print_overview({names[path]: each for path, each in reports})
         for bad in unreadable:
             print(bad["reason"], file=sys.stderr)

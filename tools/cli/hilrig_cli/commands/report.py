@@ -37,8 +37,8 @@ def report(
     from rich.console import Console
     from rich.progress import Progress
 
-    from hilrig_replay.grading.task_loading import read_task
-    from hilrig_replay.io.paths import recordings
+    from hilrig_replay.grading.task_loading import load_task
+    from hilrig_replay.io.paths import find_recordings
     from hilrig_replay.io.recording_file import refuse_recording
     from hilrig_replay.report.report import build_report
     from hilrig_runtime.errors import InputError, OperationError
@@ -46,12 +46,12 @@ def report(
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: the folder {out.parent} does not exist")
     refuse_recording(out)
-    graded_by = None if task is None else read_task(task)
+    graded_by = None if task is None else load_task(task)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
         result = build_report(
-            recordings(runs),
+            find_recordings(runs),
             verified=verify,
             task=graded_by,
             on_progress=lambda share: progress.update(bar, completed=share),

@@ -13,7 +13,7 @@ from hilrig_cli.options import AsJson, Config
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hilrig_replay.io.index import RunEntry
+    from hilrig_replay.analysis.index import RunEntry
 
 
 ABNORMAL_ENDINGS = ("disk full", "write failed", "keeper lost")
@@ -61,7 +61,7 @@ def runs(
     as_json: AsJson = False,
 ) -> None:
     """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason."""
-    from hilrig_replay.io.index import RunIndex
+    from hilrig_replay.analysis.index import RunIndex
     from hilrig_runtime.config.lab import load_lab
 
     since_ns, until_ns = _wall_ns("--since", since), _wall_ns("--until", until)

@@ -33,13 +33,13 @@ def verify(
     from rich.console import Console
     from rich.text import Text
 
+    from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
-    from hilrig_replay.io.index import write_verdict
-    from hilrig_replay.io.paths import recordings
+    from hilrig_replay.io.paths import find_recordings
 
     console = Console()
     verifications = []
-    for path in recordings(runs):
+    for path in find_recordings(runs):
         verification = resimulate(path, tolerance)
         # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
         with suppress(OSError):

@@ -16,7 +16,7 @@ from hilrig_cli.local.local_lab import POLL_S, bind_error, running_lab
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.verify import Verification, verify
-from hilrig_replay.grading.placement import TaskResult, placed_parts
+from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_replay.rerun_view.view import save_rrd
@@ -170,7 +170,7 @@ class Review:
     run: DemoRun
     latency: LatencyReport
     verification: Verification
-    task: TaskResult
+    task: PlacementReport
     plot: Path
     rrd: Path
 
@@ -247,7 +247,7 @@ def review(demo: DemoRun, out: Path) -> Review:
     return Review(demo, latency, verify(demo.recording), check_placement(run), plot, rrd)
 
 
-def check_placement(run: Run) -> TaskResult:
+def check_placement(run: Run) -> PlacementReport:
     """Check which parts are in the tray at the end of a run.
 
     Raises:
@@ -257,4 +257,4 @@ def check_placement(run: Run) -> TaskResult:
     last = parts[parts["step"] == parts["step"][-1]] if len(parts) else parts
     poses = [PartState(name=run.names[row["part"]], x=row["x"], y=row["y"], z=row["z"], yaw=row["yaw"]) for row in last]
     held = run.names[run.states["held_part"][-1]]
-    return placed_parts(RigParameters.from_json(run.parameters_json).scene, poses, held=held)
+    return evaluate_placement(RigParameters.from_json(run.parameters_json).scene, poses, held=held)

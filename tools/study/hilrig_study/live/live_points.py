@@ -73,13 +73,13 @@ def run_live_points(
     recordings = out / "recordings"
     shutil.rmtree(recordings, ignore_errors=True)
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
-        mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
+        indices = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        rigs = {f"point{i + 1}": _point_impairments(study, cells[i]) for i in mine}
+        rigs = {f"point{i + 1}": _point_impairments(study, cells[i]) for i in indices}
         _write_lab(config, study, step_ms, rigs, recordings, find_ports)
         lab = load_lab(config)
         with start_lab(lab, config) as check_processes:
-            for index in mine:
+            for index in indices:
                 point, number = points[index]
                 report(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
                 run = _run_point(study, folder, lab, f"point{index + 1}", cells[index], check_processes)
