@@ -1,12 +1,12 @@
 #!/bin/sh
-# System parts that tests and benchmarks use: foreign Modbus clients, a screen without a screen, network namespaces.
-# Installs what is missing as root on Debian; elsewhere it says what is missing and goes on: a test that needs a
-# missing part says so when it is skipped.
+# System packages for tests and benchmarks: other Modbus clients, a virtual screen, network namespaces.
+# Installs missing packages as root on Debian; elsewhere it prints them and continues: a test that needs a missing
+# package is skipped with a reason.
 set -eu
 packages="gcc libc6-dev pkg-config libmodbus-dev mbpoll iproute2 openssl docker-compose xvfb xauth libvulkan1 mesa-vulkan-drivers chromium"
-# What the viewer loads by itself when it opens a window.
+# Libraries that the viewer loads when it opens a window.
 packages="$packages libxkbcommon-x11-0 libxcursor1 libxi6"
-# Node.js may have come another way than by apt.
+# Node.js may be installed without apt.
 command -v npm >/dev/null 2>&1 || packages="$packages nodejs npm"
 
 command -v dpkg-query >/dev/null 2>&1 || { echo "not a Debian system: tests may miss $packages" >&2; exit 0; }

@@ -99,9 +99,9 @@ CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
 SERVICE_INFO: Final = ServiceTopic("service_info", ServiceInfo, Traffic.QUERY)
 """Identity, host and rigs of a running service."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
-"""The states of a tick in one batch, for the edges; monitoring of one rig uses its `STATE`."""
+"""The states of a tick in one batch for the edges; monitoring of one rig uses its `STATE`."""
 COMMANDS: Final = ServiceTopic("commands", RigBatch, Traffic.CONTROL)
-"""Commands of an edge in batches, for the simulation; monitoring of one rig uses its `COMMAND`."""
+"""Commands of an edge in batches for the simulation; monitoring of one rig uses its `COMMAND`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
 SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, SERVICE_INFO, STATES, COMMANDS)  # type: ignore[assignment]

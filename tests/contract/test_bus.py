@@ -1,4 +1,4 @@
-"""One contract, two transports: what a service may expect of the bus."""
+"""The contract of the bus interface, checked on both transports."""
 
 import queue
 import socket
@@ -19,7 +19,7 @@ OpenBus = Callable[[str], Bus]
 
 
 def free_ports(count: int) -> int:
-    """First of `count` neighbouring free ports on loopback."""
+    """First of `count` adjacent free ports on loopback."""
     while True:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
@@ -49,7 +49,7 @@ def open_bus(request: pytest.FixtureRequest) -> Iterator[OpenBus]:
         bus.close()
 
 
-def test_a_message_reaches_who_subscribed_and_no_one_else(open_bus: OpenBus) -> None:
+def test_message_reaches_matching_subscribers_only(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     states: queue.Queue[tuple[str, bytes]] = queue.Queue()
     others: queue.Queue[tuple[str, bytes]] = queue.Queue()
@@ -61,7 +61,7 @@ def test_a_message_reaches_who_subscribed_and_no_one_else(open_bus: OpenBus) -> 
     assert others.empty()
 
 
-def test_control_arrives_in_the_order_of_sending(open_bus: OpenBus) -> None:
+def test_control_messages_arrive_in_order(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[int] = []
     edge.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(int(payload)))
@@ -74,7 +74,7 @@ def test_control_arrives_in_the_order_of_sending(open_bus: OpenBus) -> None:
     assert got == sorted(got)
 
 
-def test_a_reader_that_was_held_up_goes_on_with_the_newest(open_bus: OpenBus, request: pytest.FixtureRequest) -> None:
+def test_delayed_reader_continues_with_newest_messages(open_bus: OpenBus, request: pytest.FixtureRequest) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[int] = []
     entered, go_on = threading.Event(), threading.Event()
@@ -104,7 +104,7 @@ def test_a_reader_that_was_held_up_goes_on_with_the_newest(open_bus: OpenBus, re
     subscription.close()
 
 
-def test_a_recording_stream_gives_a_late_subscriber_what_went_before(open_bus: OpenBus) -> None:
+def test_late_subscriber_receives_cached_recording(open_bus: OpenBus) -> None:
     sim, recorder = open_bus("sim"), open_bus("recorder")
     publisher = sim.publisher("hil/lab/log/sim/1", Traffic.RECORDING)
     for number in range(50):
@@ -119,7 +119,7 @@ def test_a_recording_stream_gives_a_late_subscriber_what_went_before(open_bus: O
     assert lost == []
 
 
-def test_a_question_is_answered_by_everyone_who_serves_it(open_bus: OpenBus) -> None:
+def test_query_is_answered_by_all_queryables(open_bus: OpenBus) -> None:
     sim, tool = open_bus("sim"), open_bus("tool")
 
     def refuse(_: bytes) -> bytes:
@@ -132,11 +132,11 @@ def test_a_question_is_answered_by_everyone_who_serves_it(open_bus: OpenBus) -> 
     assert by_error == [("", b"one:?"), ("not now", b"")]
 
 
-def test_a_question_without_a_server_gets_no_answer(open_bus: OpenBus) -> None:
+def test_query_without_queryable_has_no_reply(open_bus: OpenBus) -> None:
     assert open_bus("tool").query("hil/lab/nobody/config", timeout_s=0.2) == []
 
 
-def test_liveliness_shows_who_is_there_and_who_went(open_bus: OpenBus) -> None:
+def test_liveliness_tokens_appear_and_disappear(open_bus: OpenBus) -> None:
     sim, tool = open_bus("sim"), open_bus("tool")
     token = sim.declare_token("hil/lab/alive/sim/1")
     eventually(lambda: tool.get_liveliness("hil/lab/alive/*/*") == ["hil/lab/alive/sim/1"])
@@ -147,7 +147,7 @@ def test_liveliness_shows_who_is_there_and_who_went(open_bus: OpenBus) -> None:
     eventually(lambda: changes[-1] == ("hil/lab/alive/sim/1", False))
 
 
-def test_what_was_closed_is_silent_and_closing_twice_is_fine(open_bus: OpenBus) -> None:
+def test_closed_handles_are_inactive_and_close_is_idempotent(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[bytes] = []
     subscription = edge.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(payload))
@@ -163,7 +163,7 @@ def test_what_was_closed_is_silent_and_closing_twice_is_fine(open_bus: OpenBus) 
     edge.close()
 
 
-def test_services_find_each_other_in_any_order_and_again_after_a_restart() -> None:
+def test_services_connect_in_any_order_and_after_a_restart() -> None:
     config = BusConfig(first_port=free_ports(3))
     got: list[bytes] = []
     with ZenohBus(config, "recorder") as recorder, ZenohBus(config, "edge") as edge:
@@ -175,7 +175,7 @@ def test_services_find_each_other_in_any_order_and_again_after_a_restart() -> No
                 eventually(lambda life=life, publisher=publisher: publisher.put(life) or got.count(life) >= 2)
 
 
-def test_a_taken_bus_port_is_said_in_one_line() -> None:
+def test_bus_port_in_use_is_reported_in_one_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

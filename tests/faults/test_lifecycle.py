@@ -62,7 +62,7 @@ def start(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
+def test_first_signal_stops_gracefully(tmp_path: Path, number: signal.Signals) -> None:
     process = start(tmp_path, "orderly")
     process.send_signal(number)
     output, _ = process.communicate(timeout=10)
@@ -70,7 +70,7 @@ def test_the_first_signal_ends_in_order(tmp_path: Path, number: signal.Signals) 
     assert process.returncode == 0
 
 
-def test_the_second_signal_forces(tmp_path: Path) -> None:
+def test_second_signal_ends_at_once(tmp_path: Path) -> None:
     process = start(tmp_path, "stubborn", timeout=60)
     process.terminate()
     eventually(lambda: process.poll() is not None or process.terminate())
@@ -94,12 +94,12 @@ print("ended", flush=True)
 """
 
 
-def test_a_signal_that_comes_while_the_event_is_locked_is_heard_all_the_same() -> None:
+def test_signal_while_event_is_locked_is_handled() -> None:
     done = subprocess.run([sys.executable, "-c", LOCKED], check=True, capture_output=True, text=True, timeout=PATIENT_S)
     assert done.stdout == "ended\n"
 
 
-def test_a_process_whose_closing_hangs_ends_all_the_same(tmp_path: Path) -> None:
+def test_process_exits_when_closing_hangs(tmp_path: Path) -> None:
     process = start(tmp_path, "stubborn", timeout=0.3)
     process.terminate()
     _, errors = process.communicate(timeout=10)
@@ -107,14 +107,14 @@ def test_a_process_whose_closing_hangs_ends_all_the_same(tmp_path: Path) -> None
     assert process.returncode == 3
 
 
-def test_a_service_ends_with_its_parent(tmp_path: Path) -> None:
+def test_service_stops_with_its_parent(tmp_path: Path) -> None:
     process = start(tmp_path, "orderly", parent=True)
     output, _ = process.communicate(timeout=10)
     assert output == "closing\nended\n"
     assert process.returncode == 0
 
 
-def test_a_service_does_not_run_on_without_one_of_its_threads(tmp_path: Path) -> None:
+def test_service_stops_when_a_thread_crashes(tmp_path: Path) -> None:
     process = start(tmp_path, "crippled", ready=False)
     output, errors = process.communicate(timeout=20)
     assert output == ""
@@ -124,7 +124,7 @@ def test_a_service_does_not_run_on_without_one_of_its_threads(tmp_path: Path) ->
     assert process.returncode == 3
 
 
-def test_an_error_is_one_line_and_its_exit_code(tmp_path: Path) -> None:
+def test_error_is_one_line_with_its_exit_code(tmp_path: Path) -> None:
     process = start(tmp_path, "failing", ready=False)
     output, errors = process.communicate(timeout=20)
     assert output == ""

@@ -27,7 +27,7 @@ def read(connection: socket.socket) -> bytes:
 
 @pytest.mark.rig
 @pytest.mark.skipif(os.name != "posix", reason="elsewhere a process has no such limit")
-def test_an_edge_without_a_file_left_goes_on(tmp_path: Path) -> None:
+def test_edge_at_its_file_limit_keeps_running(tmp_path: Path) -> None:
     config = write_lab(tmp_path, extra="edge.max_connections = 200\nedge.max_connections_per_host = 200")
     lab = load_lab(config)
     log = tmp_path / "edge.log"

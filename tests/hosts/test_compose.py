@@ -1,4 +1,4 @@
-"""compose.yaml: what it says is started for real, each service on a host of its own with its own certificate alone."""
+"""compose.yaml, with its commands started on real hosts, one service each, with only its own certificate."""
 
 import re
 import shutil
@@ -23,7 +23,7 @@ COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 EDGES = {"east": "rig1,rig2", "west": "rig3,rig4"}
 CERTIFICATES = {"console": "viewer"}
-"""Of what is no service of the loop: the console only looks."""
+"""Not a service of the loop: the console only reads."""
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 CONTROLLER = """
@@ -78,7 +78,7 @@ except zenoh.ZError:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_every_service_is_confined_and_looked_after(name: str) -> None:
+def test_every_container_is_confined_and_supervised(name: str) -> None:
     service = SERVICES[name]
     assert service["user"] == "10001:10001"
     assert service["read_only"] is True
@@ -95,7 +95,7 @@ def test_every_service_is_confined_and_looked_after(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
+def test_every_service_has_only_its_own_certificate(name: str) -> None:
     mounted = {source: (target, mode) for source, target, *mode in (v.split(":") for v in SERVICES[name]["volumes"])}
     certificates = {source for source in mounted if source.startswith("./certs/")}
     own = CERTIFICATES.get(name, name)
@@ -105,7 +105,7 @@ def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
     assert mounted.get("./recordings", ("", []))[1] == (["ro"] if name == "console" else [])
 
 
-def test_the_lab_and_the_compose_file_agree() -> None:
+def test_lab_and_compose_file_agree() -> None:
     lab = load_lab(LAB_FILE)
     assert lab.bus.router == "tls/router:7447"
     assert SERVICES["router"]["command"][-2:] == ["--listen", "tls/0.0.0.0:7447"]
@@ -124,7 +124,7 @@ def test_the_lab_and_the_compose_file_agree() -> None:
     assert all(service["networks"] == apart.get(name, ["bus"]) for name, service in SERVICES.items())
 
 
-def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compose_names() -> None:
+def test_image_copies_build_inputs_and_installs_used_parts() -> None:
     dockerfile = (ROOT / "Dockerfile").read_text()
     for folder in ("schemas", "runtime", "services", "tools", "examples"):
         assert f"COPY {folder} {folder}" in dockerfile
@@ -135,7 +135,7 @@ def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compo
         assert f"\n{service['build']['args']['PARTS']} = [" in pyproject
 
 
-def test_a_compose_implementation_reads_it() -> None:
+def test_compose_implementation_accepts_the_file() -> None:
     command = [*compose_command(), "--file", "compose.yaml", "config"]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -166,7 +166,7 @@ def published(service: dict[str, Any]) -> list[str]:
 
 @dataclass
 class Containers:
-    """The services of compose.yaml, each on its own host, with what the file mounts and nothing else."""
+    """The services of compose.yaml, each on its own host, with only the mounts of the file."""
 
     network: Network
     folder: Path
@@ -177,7 +177,7 @@ class Containers:
             self.processes[name] = self.network.popen(name, self.words(name, SERVICES[name]["command"]), stdout=log)
 
     def words(self, name: str, command: list[str]) -> list[str]:
-        """A command of a container's, with the paths that stand for its mounts here."""
+        """Return the command of a container, with the local paths of its mounts."""
         inside = {"hilrig": HILRIG, "/etc/hilrig/lab.toml": str(self.folder / name / "lab.toml")}
         return [inside.get(word, word) for word in command]
 
@@ -192,7 +192,7 @@ class Containers:
         (own / "lab.toml").write_text(text.replace('"/recordings"', f'"{self.folder / "recordings"}"'))
 
     def is_well(self, name: str) -> bool:
-        """What the health check of a container says."""
+        """Return the result of a container's health check."""
         command = self.words(name, SERVICES[name]["healthcheck"]["test"][1:])
         return self.network.call(name, command) == 0
 
@@ -213,7 +213,7 @@ def containers(tmp_path: Path) -> Iterator[Containers]:
 
 @pytest.mark.hosts
 @pytest.mark.timeout(300)
-def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(containers: Containers) -> None:
+def test_services_connect_by_name_and_controllers_move_the_arms(containers: Containers) -> None:
     network, folder = containers.network, containers.folder
 
     def drive(edge: str, port: int) -> tuple[int, int] | None:

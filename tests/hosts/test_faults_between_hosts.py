@@ -1,6 +1,6 @@
-"""A lab on five hosts around a router; one thing after another dies: no torque stays, and the lab goes on by itself.
+"""Faults of a lab on five hosts around a router: the torque goes to zero, and the lab recovers by itself.
 
-What is promised here stands in docs/operations.md.
+The expected behavior is documented in docs/operations.md.
 """
 
 import json
@@ -45,7 +45,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LabOfHosts]:
         yield made
 
 
-def test_the_router_dies_and_comes_back(lab: LabOfHosts) -> None:
+def test_lab_recovers_from_router_restart(lab: LabOfHosts) -> None:
     with Session(lab) as session:
         killed_ns = lab.kill("router")
         time.sleep(2.0)
@@ -73,7 +73,7 @@ def test_the_router_dies_and_comes_back(lab: LabOfHosts) -> None:
         ),
     ],
 )
-def test_the_simulations_cable_is_pulled_for_a_while(lab: LabOfHosts, cut_s: float) -> None:
+def test_lab_recovers_from_link_cut_of_simulation(lab: LabOfHosts, cut_s: float) -> None:
     with Session(lab) as session:
         lab.network.set_link("sim", False)
         cut_ns = time.monotonic_ns()
@@ -94,11 +94,11 @@ def test_the_simulations_cable_is_pulled_for_a_while(lab: LabOfHosts, cut_s: flo
         assert missing == session.stated_lost() == 0, "nothing is missing in the recording"
     else:
         reach_s = MAX_CACHE_S - 1.0
-        assert 0 < missing <= (cut_s - reach_s) / STEP_S, "what was sent in the last half minute of the cut is there"
-        assert session.stated_lost() >= missing, "the file says what is missing"
+        assert 0 < missing <= (cut_s - reach_s) / STEP_S, "messages of the last half minute of the cut are recovered"
+        assert session.stated_lost() >= missing, "the file states the loss"
 
 
-def test_the_simulations_host_dies_and_controllers_see_it(lab: LabOfHosts) -> None:
+def test_controllers_detect_failure_of_simulation_host(lab: LabOfHosts) -> None:
     with Session(lab) as session:
         killed_ns = lab.kill("sim")
         eventually(lambda: not lab.simulation_is_alive(), timeout_s=5, every_s=0.1)
@@ -112,7 +112,7 @@ def test_the_simulations_host_dies_and_controllers_see_it(lab: LabOfHosts) -> No
     assert session.answered > 50
 
 
-def test_the_edge_dies_and_the_torque_with_it(lab: LabOfHosts) -> None:
+def test_torque_is_zero_after_edge_is_killed(lab: LabOfHosts) -> None:
     with Session(lab) as session:
         killed_ns = lab.kill("edge")
         time.sleep(1.5)
@@ -124,7 +124,7 @@ def test_the_edge_dies_and_the_torque_with_it(lab: LabOfHosts) -> None:
     assert np.abs(states["effort"][states["sampled_ns"] > killed_ns + 2 * TIMEOUT_NS]).max() > 0, "it connected again"
 
 
-def test_the_recorder_dies_and_the_loop_does_not_feel_it(lab: LabOfHosts) -> None:
+def test_loop_is_unaffected_by_killed_recorder(lab: LabOfHosts) -> None:
     with Session(lab) as session:
         killed_ns = lab.kill("recorder")
         time.sleep(1.5)
@@ -134,10 +134,10 @@ def test_the_recorder_dies_and_the_loop_does_not_feel_it(lab: LabOfHosts) -> Non
     after = states[(states["sampled_ns"] > killed_ns) & (states["sampled_ns"] < session.end_ns)]
     assert len(after) > 50
     assert (np.abs(after["effort"]).max(axis=1) > 0).all(), "the torque stands while nobody records"
-    assert np.diff(states["step"].astype(np.int64)).max() == 1, "what was sent meanwhile is in the recordings"
+    assert np.diff(states["step"].astype(np.int64)).max() == 1, "the recordings are complete"
 
 
-def test_two_labs_on_one_router_do_not_see_each_other(lab: LabOfHosts) -> None:
+def test_two_labs_on_one_router_are_isolated(lab: LabOfHosts) -> None:
     other = lab.config.parent / "other.toml"
     other.write_text(lab.config.read_text().replace("[bus]", 'name = "other"\n[bus]', 1))
     simulation = lab.network.popen("sim", [HILRIG, "sim", "-c", str(other)], stdin=subprocess.PIPE)

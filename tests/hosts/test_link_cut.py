@@ -19,7 +19,7 @@ HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 
 def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]]:
-    """Record a session during which the recorder's cable is out for a while: what was sent, and the session's files."""
+    """Record a session with a cut of the recorder's link; return the sent messages and the session's files."""
     require_namespaces()
     config, lab = make_lab(folder, extra='bus.topology = "router"\nbus.router = "tcp/rig:7447"')
     sent_file = folder / "sent.pickle"
@@ -60,7 +60,7 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
 
 @pytest.mark.hosts
 @pytest.mark.rig
-def test_a_cable_pulled_for_five_seconds_loses_nothing(tmp_path: Path) -> None:
+def test_five_second_link_cut_loses_nothing(tmp_path: Path) -> None:
     sent, [path] = record_with_a_cut(tmp_path, 5.0)
     found = recorded([path])
     assert len(found) == len(set(found))
@@ -73,11 +73,11 @@ def test_a_cable_pulled_for_five_seconds_loses_nothing(tmp_path: Path) -> None:
 @pytest.mark.hosts
 @pytest.mark.rig
 @pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes more than a minute: set HILRIG_LONG=1")
-def test_of_a_longer_cut_the_file_says_exactly_what_is_missing(tmp_path: Path) -> None:
+def test_file_states_exact_loss_of_longer_link_cut(tmp_path: Path) -> None:
     sent, paths = record_with_a_cut(tmp_path, 45.0)
     missing = set(sent) - set(recorded(paths))
     assert len(missing) > 0
-    # After 30 s without a word of who keeps the session its file ends; when the link is back it goes on in a next one.
+    # After 30 s without an announcement of the session its file ends; after the cut it continues in a new segment.
     summaries = [metadata(path)["hilrig.summary"] for path in paths]
     assert [summary["ended"] for summary in summaries] == ["keeper lost", "ended"]
     lost = [int(summary["lost_transport"]) + int(summary["lost_recorder"]) for summary in summaries]

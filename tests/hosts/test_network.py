@@ -1,4 +1,4 @@
-"""The hosts that other tests stand on: they find each other by name, and a cable that is out loses without a word."""
+"""The emulated hosts of other tests: name resolution, and silent loss while a cable is disconnected."""
 
 import subprocess
 import sys
@@ -41,24 +41,24 @@ def network() -> Iterator[Network]:
 
 
 def asked(network: Network, host: str, timeout_s: float = 20.0) -> str:
-    """What a host is told that asks the server: its own address, or the kind of error."""
+    """Return the server's reply to a host: the host's address, or the type of the error."""
     command = [sys.executable, "-c", CLIENT, "server", str(timeout_s)]
     return network.run(host, command, stdout=subprocess.PIPE, text=True).stdout.strip()
 
 
-def test_hosts_find_each_other_by_name_and_see_each_others_addresses(network: Network) -> None:
+def test_hosts_resolve_names_and_see_peer_addresses(network: Network) -> None:
     for host in ("client", "gateway", "server"):
         assert asked(network, host) == network.address(host)
 
 
-def test_what_is_sent_to_a_host_whose_cable_is_out_is_lost_without_a_word(network: Network) -> None:
+def test_packets_to_disconnected_host_are_lost_silently(network: Network) -> None:
     network.set_link("server", False)
     assert asked(network, "client", 1.0) == "TimeoutError"
     network.set_link("server", True)
     assert asked(network, "client") == network.address("client")
 
 
-def test_a_host_whose_cable_is_out_reaches_itself_alone(network: Network) -> None:
+def test_disconnected_host_reaches_only_itself(network: Network) -> None:
     network.set_link("client", False)
     assert asked(network, "client", 1.0) == "TimeoutError"
     assert asked(network, "gateway") == network.address("gateway")

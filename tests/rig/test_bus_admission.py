@@ -1,4 +1,4 @@
-"""Who is let in on the secured bus at all, and a whole lab that runs on it."""
+"""Admission to the secured bus by certificate, and a whole lab that runs on it."""
 
 import shutil
 import socket
@@ -53,22 +53,20 @@ def router(lab: Lab) -> Iterator[zenoh.Session]:
         yield session
 
 
-def test_who_has_a_certificate_of_the_lab_is_let_in(lab: Lab, router: zenoh.Session) -> None:
+def test_certificate_of_the_lab_is_accepted(lab: Lab, router: zenoh.Session) -> None:
     with ZenohBus(lab.config(lab.folder), "tool") as bus:
         assert router.zid() in bus.session.info.routers_zid()
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_a_certificate_that_is_no_good_is_not_let_in(
-    lab: Lab, router: zenoh.Session, tmp_path: Path, what: str
-) -> None:
+def test_invalid_certificate_is_rejected(lab: Lab, router: zenoh.Session, tmp_path: Path, what: str) -> None:
     mine = folder_of_one(tmp_path / "mine", lab.authority, "operator", bad_identities(lab.authority)[what])
     with pytest.raises(OperationError, match=r"do not trust each other: hilrig doctor"):
         ZenohBus(lab.config(mine), "tool")
 
 
 @pytest.mark.parametrize("link", ["tls", "tcp"])
-def test_without_a_certificate_nobody_is_let_in(lab: Lab, router: zenoh.Session, link: str) -> None:
+def test_connection_without_certificate_is_rejected(lab: Lab, router: zenoh.Session, link: str) -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -80,7 +78,7 @@ def test_without_a_certificate_nobody_is_let_in(lab: Lab, router: zenoh.Session,
 
 
 @pytest.mark.parametrize("wrong", ["authority", "name"])
-def test_a_router_that_is_not_the_labs_is_not_believed(lab: Lab, tmp_path: Path, wrong: str) -> None:
+def test_router_with_foreign_certificate_is_rejected(lab: Lab, tmp_path: Path, wrong: str) -> None:
     authority = make_authority("stranger", NOW, 30) if wrong == "authority" else lab.authority
     hosts = HOSTS if wrong == "authority" else ["elsewhere"]
     theirs = folder_of_one(
@@ -91,11 +89,11 @@ def test_a_router_that_is_not_the_labs_is_not_believed(lab: Lab, tmp_path: Path,
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_a_mesh_lets_in_its_own_only(lab: Lab, tmp_path: Path, what: str) -> None:
+def test_mesh_accepts_only_its_certificates(lab: Lab, tmp_path: Path, what: str) -> None:
     mine = folder_of_one(tmp_path / "mine", lab.authority, "operator", bad_identities(lab.authority)[what])
     with (
         ZenohBus(lab.config(lab.folder, "mesh"), "sim") as sim,
-        # A peer's session opens whoever it can reach; it tries again and again.
+        # A peer's session opens without a reachable peer and retries the connection.
         ZenohBus(lab.config(mine, "mesh"), "tool") as stranger,
         ZenohBus(lab.config(lab.folder, "mesh"), "edge") as edge,
         ZenohBus(lab.config(lab.folder, "mesh"), "tool") as tool,
@@ -107,13 +105,13 @@ def test_a_mesh_lets_in_its_own_only(lab: Lab, tmp_path: Path, what: str) -> Non
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "operator.pem"])
-def test_a_file_that_is_missing_is_named(lab: Lab, missing: str) -> None:
+def test_missing_certificate_file_is_named(lab: Lab, missing: str) -> None:
     (lab.folder / missing).unlink()
     with pytest.raises(InputError, match=rf"bus\.tls\.folder: .*{missing} can't be read.*hilrig certs"):
         ZenohBus(lab.config(lab.folder), "tool")
 
 
-def test_a_host_without_a_key_for_the_service_is_told_which_it_needs(lab: Lab) -> None:
+def test_missing_service_key_is_named(lab: Lab) -> None:
     (lab.folder / "operator.key").unlink()
     with pytest.raises(InputError, match=r"does not contain operator\.key or viewer\.key"):
         ZenohBus(lab.config(lab.folder), "tool")
@@ -128,7 +126,7 @@ def secured_lab(tmp_path: Path) -> Iterator[RunningLab]:
         yield running
 
 
-def test_a_lab_runs_on_a_secured_bus_and_a_viewer_may_not_take_its_rig(secured_lab: RunningLab, tmp_path: Path) -> None:
+def test_lab_runs_on_secured_bus_and_viewer_is_read_only(secured_lab: RunningLab, tmp_path: Path) -> None:
     with ModbusTcpClient("127.0.0.1", port=secured_lab.port) as client:
         assert client.connect()
         assert not client.write_registers(0, [500, 0, 0, 0]).isError()
@@ -147,7 +145,7 @@ def test_a_lab_runs_on_a_secured_bus_and_a_viewer_may_not_take_its_rig(secured_l
     assert eventually(lambda: secured_lab.recordings)
 
 
-def test_a_lab_listens_on_loopback_only_unless_told_otherwise(tmp_path: Path) -> None:
+def test_lab_listens_on_loopback_by_default(tmp_path: Path) -> None:
     with RunningLab(write_lab(tmp_path)) as running:
         addresses = {host for pid in (running.process.pid, *running.service_pids()) for host, _ in listening(pid)}
         assert addresses == {"127.0.0.1"}

@@ -1,9 +1,10 @@
-"""The secured bus over real sockets: what each certificate may send, read, ask and answer, and nothing else.
+"""Access control of the secured bus over real sockets: which messages each certificate may publish, read and serve.
 
-One process is attacked: the router, or a service of the mesh. It subscribes to everything, publishes everything and
-answers everything. Others come to it with each certificate of the lab in turn, and try all there is; they have no
-rules of their own to hold them back. The attacked process's rules for one direction are opened meanwhile, so that those
-for the other are seen to hold alone. The tables here say what is to get through; they are not made from the rules.
+The process under test is the router, or a service of the mesh. It subscribes to everything, publishes everything and
+serves every query. Other sessions connect with each certificate of the lab in turn and try every operation, without
+access rules of their own. The rules of the process under test are opened for one direction at a time, so that those of
+the other direction are checked alone. The tables here list the permitted messages; they are not generated from the
+rules.
 """
 
 import json
@@ -91,7 +92,7 @@ MAY_ANSWER: dict[str, set[str]] = {
     "viewer": set(),
     "student": set(),
 }
-# A question to all goes out to everyone of a kind; what one answers is held by the other direction's rules.
+# A query to all reaches every service of a kind; replies are filtered by the rules of the other direction.
 MAY_BE_ASKED = MAY_ANSWER | {
     "sim": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
     **dict.fromkeys(EDGES, _OF_EDGES | _SERVICE_INFOS | _CONTROLS),
@@ -108,7 +109,7 @@ def key(name: str) -> str:
 
 @dataclass
 class Heard:
-    """What a session received: who sent it, on which key, how often."""
+    """Messages that a session received: publisher, key and count."""
 
     counts: dict[tuple[str, str], int] = field(default_factory=dict)
 
@@ -197,9 +198,7 @@ def meeting(folder: Path, topology: str, name: str, flow: str) -> Iterator[Meeti
 
 @pytest.mark.parametrize("flow", sorted(FLOWS))
 @pytest.mark.parametrize(("topology", "name"), CASES)
-def test_a_certificate_gets_through_with_what_is_its_own_and_nothing_else(
-    folder: Path, topology: str, name: str, flow: str
-) -> None:
+def test_certificate_permits_exactly_its_rules(folder: Path, topology: str, name: str, flow: str) -> None:
     with meeting(folder, topology, name, flow) as met:
         if flow == "ingress":
             assert sent_to_the_attacked(met) == MAY_SEND[name]
@@ -210,7 +209,7 @@ def test_a_certificate_gets_through_with_what_is_its_own_and_nothing_else(
 
 
 @pytest.mark.parametrize("topology", ["router", "mesh"])
-def test_with_open_rules_all_that_is_tried_gets_through(folder: Path, topology: str) -> None:
+def test_open_rules_permit_all_attempts(folder: Path, topology: str) -> None:
     with meeting(folder, topology, "student", "") as met:
         for tried, everything in (
             (sent_to_the_attacked, SENT),

@@ -34,7 +34,7 @@ def folder_of_one(folder: Path, authority: Credential, name: str, identity: Cred
 
 
 def bad_identities(authority: Credential) -> dict[str, Credential]:
-    """Certificates called `operator` that nobody may be let in with, by what is wrong with them."""
+    """Return invalid certificates named `operator`, by their defect."""
     stranger = make_authority("stranger", NOW, 30)
     return {
         "another authority": issue_peer(stranger, "operator", HOSTS, NOW, 30),

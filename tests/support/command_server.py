@@ -1,7 +1,7 @@
 """Starts `hilrig` commands without Python's start: forks itself for each, with what most commands import.
 
 Most of a short command's time is imports. Jobs come as lines of JSON on standard input, `{words, cwd, environ, out,
-err}`; of each the process id is told, then the exit code. It ends with its standard input.
+err}`; for each it prints the process id, then the exit code. It ends with its standard input.
 """
 
 import gc
@@ -22,7 +22,7 @@ IMPORTED = (
 
 
 def become(job: dict[str, Any]) -> None:
-    """Make the forked process what a shell would have started."""
+    """Set up the forked process like a process started by a shell."""
     os.chdir(job["cwd"])
     os.environ.clear()
     os.environ.update(job["environ"])
@@ -48,7 +48,7 @@ def serve() -> bool:
 if __name__ == "__main__":
     for module in IMPORTED:
         import_module(module)
-    # What is there is shared with the forks, until somebody writes to it.
+    # Existing memory is shared with the forks until it is written.
     gc.freeze()
     if serve():
         from hilrig_cli.__main__ import main

@@ -1,6 +1,6 @@
-"""A lab whose services each have a host of their own, around a router: what tests of faults between hosts stand on.
+"""A lab with one emulated host per service, around a router, for tests of faults between hosts.
 
-Monotonic time is the kernel's, so that a fault's time can be compared with what the recordings say.
+All hosts share the kernel's monotonic clock, so that the time of a fault can be compared with the recordings.
 """
 
 import subprocess
@@ -62,7 +62,7 @@ class LabOfHosts:
             self.processes[host] = self.network.popen(host, command, stdin=subprocess.PIPE, stdout=log, stderr=log)
 
     def log(self, host: str) -> Path:
-        """What a host's process said."""
+        """Return the output of a host's process."""
         return self.config.parent / f"{host}.log"
 
     def kill(self, host: str) -> int:
@@ -81,7 +81,7 @@ class LabOfHosts:
         return self.network.popen("pc", command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def status(self, rig: Rig) -> Status:
-        """What a controller reads of the rig; nothing: the edge does not answer."""
+        """Return a controller's reading of the rig; empty: the edge does not answer."""
         command = [sys.executable, "-c", _STATUS, rig.edge, str(rig.port)]
         done = self.network.run("pc", command, check=False, capture_output=True, text=True, timeout=10)
         return Status(int(done.stdout)) if done.returncode == 0 else Status(0)
@@ -163,7 +163,7 @@ def zero_after(states: np.ndarray, fault_ns: int) -> int:
     """How long after a fault the torque was zero, ns; it stays so for at least 200 ms."""
     later = states[states["sampled_ns"] > fault_ns]
     moving = np.abs(later["effort"]).max(axis=1) > 0
-    assert not moving.all(), "the torque stood for ever"
+    assert not moving.all(), "the torque was never set to zero"
     first = int(np.flatnonzero(~moving)[0])
     assert not moving[first : first + 10].any()
     return int(later["sampled_ns"][first]) - fault_ns

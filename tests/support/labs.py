@@ -21,7 +21,7 @@ HILRIG = [sys.executable, "-m", "hilrig_cli"]
 
 
 def free_ports(count: int) -> int:
-    """First of `count` neighbouring ports that are free on loopback."""
+    """First of `count` adjacent ports that are free on loopback."""
     while True:
         with closing(socket.socket()) as probe:
             probe.bind(("127.0.0.1", 0))

@@ -19,14 +19,14 @@ import pytest
 
 
 def require_namespaces() -> None:
-    """Skip a test, with the reason, where namespaces can't be had."""
+    """Skip a test, with the reason, if namespaces are unavailable."""
     if reason := _missing():
         pytest.skip(reason)
 
 
 @cache
 def _missing() -> str | None:
-    """What is missing for namespaces; tried once with all that a network needs."""
+    """Return the reason why namespaces are unavailable; tries all that a network needs, once."""
     if os.name != "posix" or os.geteuid() != 0:
         return "needs root, for network namespaces"
     if shutil.which("ip") is None:
@@ -76,7 +76,7 @@ class Network:
         return subprocess.run(words, check=False, capture_output=True).returncode
 
     def set_link(self, host: str, up: bool) -> None:
-        """Plug a host's cable in or out; senders are not told that what they send is lost."""
+        """Connect or disconnect a host's cable; the loss is silent for senders."""
         _ip("-n", self._gateway, "link", "set", self._port(host), "up" if up else "down")
 
     def __enter__(self) -> Self:

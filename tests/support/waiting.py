@@ -35,7 +35,7 @@ class Stalls:
         self._thread = threading.Thread(target=self._watch)
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Start again."""
         self.worst_s = 0.0
 
     def _watch(self) -> None:

@@ -1,4 +1,4 @@
-"""Who may do what on the bus: every topic has a rule, and the rules say what is meant."""
+"""Access control of the bus: every topic has a rule, and the rules are as intended."""
 
 from collections.abc import Iterator
 
@@ -28,11 +28,11 @@ def granted(name: str, flow: str, message: str, tls: BusTlsConfig = TLS, lab: st
     return set(keys())
 
 
-def test_every_topic_has_a_rule_and_every_rule_a_topic() -> None:
+def test_topics_and_rules_match() -> None:
     assert {topic.name for topic in all_topics()} == set(RULES)
 
 
-def test_an_edge_commands_its_own_rigs_only() -> None:
+def test_edge_commands_only_its_rigs() -> None:
     assert {key for key in granted("east", "ingress", "put") if "/commands/" in key} == {"hil/lab/commands/edge/east"}
     assert {key for key in granted("east", "ingress", "put") if key.endswith("/command")} == {
         "hil/lab/rig1/command",
@@ -41,32 +41,32 @@ def test_an_edge_commands_its_own_rigs_only() -> None:
     assert {key for key in granted("west", "ingress", "put") if key.endswith("/command")} == {"hil/lab/rig3/command"}
 
 
-def test_without_edges_of_their_own_one_edge_commands_all() -> None:
+def test_single_edge_commands_all_rigs() -> None:
     assert "hil/lab/*/command" in granted("edge", "ingress", "put", BusTlsConfig())
 
 
 @pytest.mark.parametrize("tool", ["operator", "viewer"])
-def test_tools_send_nothing(tool: str) -> None:
+def test_tools_may_not_publish(tool: str) -> None:
     assert granted(tool, "ingress", "put") == set()
     assert granted(tool, "ingress", "declare_queryable") == set()
     assert granted(tool, "ingress", "liveliness_token") == set()
 
 
-def test_nothing_is_allowed_outside_the_lab_and_nothing_by_default() -> None:
+def test_access_is_denied_by_default_and_outside_the_lab() -> None:
     section = access_control(TLS, "lab")
     assert (section["enabled"], section["default_permission"]) == (True, "deny")
     assert all(rule["permission"] == "allow" for rule in section["rules"])
     assert all(key.startswith("hil/lab/") for rule in section["rules"] for key in rule["key_exprs"])
 
 
-def test_every_rule_belongs_to_one_identity() -> None:
+def test_every_rule_has_one_identity() -> None:
     section = access_control(TLS, "lab")
     ids = [rule["id"] for rule in section["rules"]]
     assert len(ids) == len(set(ids))
     assert sorted(ids) == sorted(rule for policy in section["policies"] for rule in policy["rules"])
 
 
-def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
+def test_commands_for_rigs_of_another_edge_are_ignored() -> None:
     def heard(permitted: dict[str, tuple[str, ...]], instance: str) -> set[str]:
         commands = LatestValueCache(ManualClock(), Counters(), permitted)
         batch = RigBatch(rigs=["rig1", "rig3"], messages=[b"one", b"three"])
@@ -88,6 +88,6 @@ def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
         ('[bus.tls]\nedges = {east = ["rig9"]}', "bus.tls.edges.east: unknown rig 'rig9'"),
     ],
 )
-def test_what_does_not_fit_together_is_named(text: str, message: str) -> None:
+def test_inconsistent_bus_settings_are_reported(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse_lab(f"[bus]\n{text}\n")

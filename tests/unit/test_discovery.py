@@ -1,4 +1,4 @@
-"""One service a rig: of two the elder goes on and the other ends with the reason; hosts' clocks are compared."""
+"""Duplicate instances: the older one keeps running, the other one stops with the reason; clock offsets of hosts."""
 
 import threading
 
@@ -21,30 +21,30 @@ def info(service: str = "edge", instance: str = "1", age: int = 5, rigs: tuple[s
     return ServiceInfo(service=service, instance=instance, incarnation=100 - age, rigs=rigs, host="there")
 
 
-def test_an_elder_with_one_of_the_rigs_is_given_way_to() -> None:
+def test_younger_service_with_a_common_rig_must_stop() -> None:
     own = info(instance="2", age=1, rigs=("rig1", "rig2"))
     assert conflict(own, [info()]) == "edge/1 on there already serves rig1; each rig has one edge (--rigs)"
     many = tuple(f"rig{number}" for number in range(1, 7))
     assert "rig1, rig2, rig3 and 3 more" in conflict(info(instance="2", age=1, rigs=many), [info(rigs=many)])
 
 
-def test_an_elder_of_the_same_name_is_given_way_to() -> None:
+def test_younger_service_with_the_same_name_must_stop() -> None:
     own = info(age=1, rigs=("rig2",))
     assert conflict(own, [info()]) == "edge/1 on there has the same instance name; choose another --instance"
 
 
-def test_nobody_else_is() -> None:
+def test_other_services_do_not_conflict() -> None:
     own = info(age=3)
     others = [own, info("sim", age=9), info(instance="2", age=9, rigs=("rig2",)), info(instance="3", age=1)]
     assert conflict(own, others) == ""
 
 
-def test_of_two_of_the_same_age_exactly_one_goes_on() -> None:
+def test_one_of_two_equally_old_services_keeps_running() -> None:
     one, other = info(instance="1"), info(instance="2")
     assert bool(conflict(one, [other])) != bool(conflict(other, [one]))
 
 
-def test_the_clock_that_differs_most_is_the_one_that_is_told() -> None:
+def test_largest_clock_offset_is_reported() -> None:
     near, far = info("sim"), info("recorder")
     near.wall_ns, far.wall_ns = 1_010, 400
     assert worst_offset([near, far], 1, 1_000, 1_020) == ClockOffset("recorder/1", -610, 10)
@@ -55,7 +55,7 @@ def service(hub: MemoryHub, instance: str, rigs: tuple[str, ...], wall_ns: int) 
     return Service("edge", LAB, MemoryBus(hub), instance=instance, rigs=rigs, clock=ManualClock(wall_ns=wall_ns))
 
 
-def test_services_with_rigs_of_their_own_run_side_by_side() -> None:
+def test_services_with_distinct_rigs_do_not_conflict() -> None:
     hub = MemoryHub()
     with service(hub, "1", ("rig1", "rig2"), 1_000) as one, service(hub, "2", ("rig3",), 2_000) as other:
         one.ready()
@@ -65,7 +65,7 @@ def test_services_with_rigs_of_their_own_run_side_by_side() -> None:
         assert all(each.host and each.software_version for each in found)
 
 
-def test_the_second_of_two_refuses_before_it_is_there() -> None:
+def test_duplicate_instance_fails_before_it_is_ready() -> None:
     hub = MemoryHub()
     with service(hub, "1", ("rig1",), 1_000) as one:
         one.ready()
@@ -74,7 +74,7 @@ def test_the_second_of_two_refuses_before_it_is_there() -> None:
         assert MemoryBus(hub).get_liveliness(alive_key(LAB.name, "edge", "*")) == [alive_key(LAB.name, "edge", "1")]
 
 
-def test_an_elder_that_is_linked_a_moment_later_is_found_before_a_word_is_said() -> None:
+def test_older_service_that_is_linked_late_is_found() -> None:
     hub = MemoryHub()
     bus = MemoryBus(hub)
     bus.settle_timeout_s = 2.0
@@ -88,7 +88,7 @@ def test_an_elder_that_is_linked_a_moment_later_is_found_before_a_word_is_said()
     elders[0].close()
 
 
-def test_one_that_is_found_later_to_be_the_younger_ends_with_the_reason() -> None:
+def test_younger_service_stops_after_healed_partition() -> None:
     hub = MemoryHub()
     with service(hub, "2", ("rig1",), 2_000) as younger:
         younger.ready()
@@ -102,7 +102,7 @@ def test_one_that_is_found_later_to_be_the_younger_ends_with_the_reason() -> Non
             elder.check()
 
 
-def test_health_says_how_far_clocks_are_apart() -> None:
+def test_health_report_contains_clock_offset() -> None:
     hub, heard = MemoryHub(), []
     MemoryBus(hub).subscribe(
         HEALTH.key(LAB.name, "*", "*"), lambda _, payload: heard.append(Health.FromString(payload))
@@ -114,7 +114,7 @@ def test_health_says_how_far_clocks_are_apart() -> None:
     assert (heard[0].clock_peer, heard[0].clock_offset_ns) == ("edge/1", -700_000_000_000)
 
 
-def test_who_goes_and_comes_back_stands_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_lost_and_returned_peers_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "hilrig_runtime.process.discovery")
     hub = MemoryHub()
     with Service("recorder", LAB, MemoryBus(hub)) as recorder:
@@ -128,6 +128,6 @@ def test_who_goes_and_comes_back_stands_in_the_log(caplog: pytest.LogCaptureFixt
     assert "recorder/1" not in caplog.text
 
 
-def test_a_rig_that_the_lab_does_not_have_is_refused() -> None:
+def test_unknown_rig_is_rejected() -> None:
     with pytest.raises(InputError, match="unknown rig 'rig9'"):
         service(MemoryHub(), "1", ("rig9",), 1_000)

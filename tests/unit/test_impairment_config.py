@@ -1,4 +1,4 @@
-"""`[impairment]` as people write it: kinds as text or table, presets, schedules, and what is wrong with it."""
+"""`[impairment]` of `lab.toml`: kinds as text or table, presets, schedules, and errors."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
 
 
-def test_without_it_the_loop_is_as_it_is() -> None:
+def test_default_is_no_impairment() -> None:
     lab = parse_lab("")
     assert lab.impairment_of(lab.rigs[0]).links.is_inactive
     assert lab.impairment.links.describe() == "none"
@@ -37,11 +37,11 @@ def test_without_it_the_loop_is_as_it_is() -> None:
         ("gamma:20,8,2.5", GammaDelay(mean_ms=20, std_ms=8, offset_ms=2.5)),
     ],
 )
-def test_a_delay_is_a_kind_and_its_numbers(text: str, delay: object) -> None:
+def test_delay_text_has_kind_and_numbers(text: str, delay: object) -> None:
     assert LinkImpairment.model_validate(text).delay == delay
 
 
-def test_text_and_table_say_the_same() -> None:
+def test_text_and_table_forms_are_equal() -> None:
     as_text = parse_lab('[impairment]\ncommand = { delay = "gamma:20,8", loss = "gilbert:0.01,0.2" }\n')
     as_table = parse_lab(
         '[impairment.command.delay]\nkind = "gamma"\nmean_ms = 20\nstd_ms = 8\n'
@@ -54,20 +54,20 @@ def test_text_and_table_say_the_same() -> None:
     )
 
 
-def test_what_is_said_of_a_way_stands_before_its_preset() -> None:
+def test_setting_of_a_link_overrides_its_preset() -> None:
     links = ImpairmentConfig.model_validate({"preset": "vpn", "state": {"loss": "bernoulli:0.5"}}).links
     assert links.command == PRESETS["vpn"].command
     assert links.state == LinkImpairment(loss=BernoulliLoss(rate=0.5))
 
 
-def test_a_rig_can_have_its_own() -> None:
+def test_rig_can_have_its_own_impairment() -> None:
     lab = parse_lab(
         '[impairment]\npreset = "mobile"\n[[rigs]]\nname="a"\n[[rigs]]\nname="b"\nimpairment.preset = "none"\n'
     )
     assert [lab.impairment_of(rig).preset for rig in lab.rigs] == ["mobile", "none"]
 
 
-def test_a_lab_says_in_words_what_is_done_to_its_loops() -> None:
+def test_description_of_impairment() -> None:
     assert ImpairmentConfig().describe() == "none"
     config = ImpairmentConfig.model_validate(
         {"command": "constant:5", "schedule": [{"at_s": 2.5, "state": "uniform:1,2"}, {"at_s": 9}]}
@@ -78,7 +78,7 @@ def test_a_lab_says_in_words_what_is_done_to_its_loops() -> None:
     )
 
 
-def test_a_setting_goes_through_json_unchanged() -> None:
+def test_setting_round_trips_through_json() -> None:
     for preset in PRESETS:
         config = ImpairmentConfig.model_validate(
             {"preset": preset, "state": "constant:3", "schedule": [{"at_s": 1, "preset": "vpn"}]}
@@ -86,7 +86,7 @@ def test_a_setting_goes_through_json_unchanged() -> None:
         assert ImpairmentConfig.model_validate_json(config.model_dump_json()) == config
 
 
-def test_a_trace_is_a_file_with_a_delay_a_line(tmp_path: Path) -> None:
+def test_trace_file_has_one_delay_per_line(tmp_path: Path) -> None:
     trace = tmp_path / "trace.txt"
     trace.write_text("# delays of a session, ms\n12.5\n3\n1e1\n")
     way = LinkImpairment.model_validate(f"trace:{trace}")
@@ -105,7 +105,7 @@ def test_a_trace_is_a_file_with_a_delay_a_line(tmp_path: Path) -> None:
         (None, r"can't be read: No such file"),
     ],
 )
-def test_a_trace_with_gaps_is_refused(tmp_path: Path, lines: str | None, complaint: str) -> None:
+def test_trace_with_invalid_line_is_rejected(tmp_path: Path, lines: str | None, complaint: str) -> None:
     trace = tmp_path / "trace.txt"
     if lines is not None:
         trace.write_text(lines)
@@ -135,12 +135,12 @@ def test_a_trace_with_gaps_is_refused(tmp_path: Path, lines: str | None, complai
         ("schedule = [{ at_s = -5 }]", r"schedule\[0\]\.at_s: must be ≥ 0"),
     ],
 )
-def test_a_mistake_is_named_with_its_place(text: str, complaint: str) -> None:
+def test_invalid_value_is_reported_with_its_place(text: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         parse_lab(f"[impairment]\n{text}\n")
 
 
-def test_the_page_says_what_the_models_say() -> None:
+def test_page_agrees_with_the_models() -> None:
     page = (Path(__file__).parents[2] / "docs/studies.md").read_text()
     section = page.partition("## Delay and loss in the live loop")[2]
     example = section.partition("```toml\n")[2].partition("```")[0]

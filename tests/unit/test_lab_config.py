@@ -1,4 +1,4 @@
-"""`lab.toml`: sensible defaults, and every mistake named with its place, what was expected and what was found."""
+"""`lab.toml`: defaults, and errors with the place, the accepted value and the value found."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from hilrig_runtime.config.lab import LabConfig, load_lab, parse_lab
 from hilrig_runtime.errors import InputError
 
 
-def test_without_a_file_there_is_one_rig_on_loopback() -> None:
+def test_default_lab_has_one_rig_on_loopback() -> None:
     lab = load_lab(None)
     assert [rig.name for rig in lab.rigs] == ["rig1"]
     assert lab.ports == {"rig1": 5020}
@@ -16,12 +16,12 @@ def test_without_a_file_there_is_one_rig_on_loopback() -> None:
     assert lab.sim.step_ns == 20_000_000
 
 
-def test_ports_follow_each_other_around_those_that_are_named() -> None:
+def test_free_ports_are_assigned_in_order() -> None:
     lab = parse_lab('[[rigs]]\nname="a"\n[[rigs]]\nname="b"\nport=5021\n[[rigs]]\nname="c"\n')
     assert lab.ports == {"a": 5020, "b": 5021, "c": 5022}
 
 
-def test_a_class_of_rigs_is_one_table_and_single_ones_stand_beside_it() -> None:
+def test_group_of_rigs_and_single_rigs() -> None:
     lab = parse_lab(
         '[rigs]\ncount = 3\n[rigs.arm]\nl2_m = 0.2\n[[rigs.single]]\nname = "rig2"\nport = 6000\n'
         '[[rigs.single]]\nname = "teacher"\n'
@@ -30,12 +30,12 @@ def test_a_class_of_rigs_is_one_table_and_single_ones_stand_beside_it() -> None:
     assert [rig.arm.l2_m for rig in lab.rigs] == [0.2, 0.3, 0.2, 0.3]
 
 
-def test_a_large_lab_is_read_at_once() -> None:
+def test_large_lab_is_parsed_quickly() -> None:
     lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
     assert lab.addresses()["seat-2000"] == {"Modbus TCP": "127.0.0.1:7019"}
 
 
-def test_addresses_are_those_that_the_edge_listens_on() -> None:
+def test_addresses_match_listening_ports() -> None:
     tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
     plain, secured = "Modbus TCP", "Modbus TCP with TLS"
     assert parse_lab("").addresses()["rig1"] == {plain: "127.0.0.1:5020"}
@@ -43,7 +43,7 @@ def test_addresses_are_those_that_the_edge_listens_on() -> None:
     assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: "127.0.0.1:8020"}
 
 
-def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
+def test_lab_keeps_its_source_text(tmp_path: Path) -> None:
     file = tmp_path / "lab.toml"
     file.write_text('name = "robotics"\n')
     assert load_lab(file).source == 'name = "robotics"\n'
@@ -88,29 +88,29 @@ def test_a_lab_knows_the_text_that_it_was_read_from(tmp_path: Path) -> None:
         ("[rigs]\n[rigs.arm]\nl2_m = -1\n", r"rigs\.arm\.l2_m: must be > 0, got -1"),
     ],
 )
-def test_a_mistake_is_named_with_its_place(text: str, message: str) -> None:
+def test_invalid_value_is_reported_with_its_place(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse_lab(text)
 
 
-def test_all_mistakes_are_named_at_once() -> None:
+def test_all_errors_are_reported_at_once() -> None:
     with pytest.raises(InputError) as caught:
         parse_lab("[sim]\nstep = 1\n[edge]\nhots = 2\n")
     assert len(str(caught.value).splitlines()) == 2
 
 
-def test_a_file_that_is_not_there_is_said_in_one_line(tmp_path: Path) -> None:
+def test_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.toml: can't be read: No such file or directory"):
         load_lab(tmp_path / "none.toml")
 
 
-def test_a_file_that_is_no_text_is_said_in_one_line(tmp_path: Path) -> None:
+def test_binary_file_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "lab.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="it is not UTF-8 text"):
         load_lab(tmp_path / "lab.toml")
 
 
-def test_a_rig_that_is_not_in_the_lab_is_refused_with_those_that_are() -> None:
+def test_unknown_rig_error_lists_existing_rigs() -> None:
     with pytest.raises(InputError, match="unknown rig 'rig9'; this lab has rig1"):
         LabConfig().rig("rig9")
     with pytest.raises(InputError, match=r"this lab has rig1, (rig\d+, ){14}rig16 and 1984 more \(hilrig rig list\)$"):

@@ -1,9 +1,9 @@
-"""Who is gone is told once it lasts, and once that he is back."""
+"""Lost peers are reported after a grace time, and their return too."""
 
 from hilrig_runtime.process.liveliness import PEER_DOWN_GRACE_NS, PeerDownTracker
 
 
-def test_who_is_gone_for_long_is_told_once() -> None:
+def test_lost_peer_is_reported_once() -> None:
     tracker = PeerDownTracker()
     assert tracker.due_ns is None
     tracker.mark_down("sim/1", 1_000)
@@ -14,14 +14,14 @@ def test_who_is_gone_for_long_is_told_once() -> None:
     assert tracker.due_ns is None
 
 
-def test_who_comes_back_soon_is_not_told_at_all() -> None:
+def test_short_outage_is_not_reported() -> None:
     tracker = PeerDownTracker()
     tracker.mark_down("sim/1", 0)
     assert not tracker.mark_up("sim/1")
     assert tracker.overdue(10 * PEER_DOWN_GRACE_NS) == []
 
 
-def test_who_comes_back_after_he_was_told_is_told_again() -> None:
+def test_return_of_reported_peer_is_reported() -> None:
     tracker = PeerDownTracker()
     tracker.mark_down("sim/1", 0)
     tracker.overdue(PEER_DOWN_GRACE_NS)
@@ -29,7 +29,7 @@ def test_who_comes_back_after_he_was_told_is_told_again() -> None:
     assert not tracker.mark_up("sim/1")
 
 
-def test_those_who_go_together_are_told_together() -> None:
+def test_peers_lost_together_are_reported_together() -> None:
     tracker = PeerDownTracker()
     tracker.mark_down("sim/1", 5)
     tracker.mark_down("recorder/1", 0)

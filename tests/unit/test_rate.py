@@ -10,7 +10,7 @@ from hilrig_runtime.timing.rate import Rate
 PERIOD = 20_000_000
 
 
-def test_deadlines_lie_on_one_grid_whatever_the_work_takes() -> None:
+def test_deadlines_are_on_a_fixed_grid() -> None:
     clock = ManualClock()
     rate = Rate(PERIOD, clock)
     first = rate.wait().deadline_ns
@@ -21,7 +21,7 @@ def test_deadlines_lie_on_one_grid_whatever_the_work_takes() -> None:
         assert tick.missed_steps == 0
 
 
-def test_a_late_tick_keeps_its_deadline_and_tells_its_lateness() -> None:
+def test_late_tick_keeps_deadline_and_has_lateness() -> None:
     clock = ManualClock()
     rate = Rate(PERIOD, clock)
     first = rate.wait().deadline_ns
@@ -30,7 +30,7 @@ def test_a_late_tick_keeps_its_deadline_and_tells_its_lateness() -> None:
     assert (tick.deadline_ns, tick.lateness_ns, tick.missed_steps) == (first + PERIOD, 7_000_000, 0)
 
 
-def test_after_a_stall_whole_periods_are_given_up_and_counted() -> None:
+def test_stall_skips_and_counts_whole_periods() -> None:
     clock = ManualClock()
     rate = Rate(PERIOD, clock)
     first = rate.wait().deadline_ns
@@ -44,7 +44,7 @@ def test_after_a_stall_whole_periods_are_given_up_and_counted() -> None:
 
 
 @given(st.lists(st.integers(min_value=0, max_value=10 * PERIOD), max_size=50))
-def test_every_deadline_is_either_ticked_or_counted_as_missed(work: list[int]) -> None:
+def test_every_deadline_is_ticked_or_counted_as_missed(work: list[int]) -> None:
     clock = ManualClock()
     rate = Rate(PERIOD, clock)
     first = rate.wait().deadline_ns
@@ -58,7 +58,7 @@ def test_every_deadline_is_either_ticked_or_counted_as_missed(work: list[int]) -
         assert clock.monotonic_ns() >= tick.deadline_ns
 
 
-def test_sleeping_through_deadlines_counts_too() -> None:
+def test_deadlines_missed_in_sleep_are_counted() -> None:
     class Oversleeping(ManualClock):
         def sleep_until_ns(self, deadline_ns: int) -> None:
             super().sleep_until_ns(deadline_ns + 2 * PERIOD + 1)
@@ -67,12 +67,12 @@ def test_sleeping_through_deadlines_counts_too() -> None:
     assert (tick.missed_steps, tick.lateness_ns) == (2, 1)
 
 
-def test_a_period_must_be_positive() -> None:
+def test_period_must_be_positive() -> None:
     with pytest.raises(ValueError, match="the period must be > 0 ns, got 0"):
         Rate(0)
 
 
-def test_the_next_deadline_is_known_before_it_is_waited_for() -> None:
+def test_next_deadline_is_known_before_wait() -> None:
     clock = ManualClock()
     rate = Rate(20_000_000, clock)
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""What a process asks for its timing: granted where the system can, harmless where it can't."""
+"""Scheduling settings: applied where the system permits them, without effect elsewhere."""
 
 import multiprocessing
 import os
@@ -35,7 +35,7 @@ def _granted(connection: Connection) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has timer slack and slices")
-def test_the_thread_and_those_that_it_starts_get_short_slices_and_sharp_timers() -> None:
+def test_threads_get_short_slices_and_small_timer_slack() -> None:
     ours, theirs = multiprocessing.Pipe()
     process = multiprocessing.get_context("spawn").Process(target=_granted, args=(theirs,))
     process.start()
@@ -70,7 +70,7 @@ def _asked_without_the_right(connection: Connection) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the policy")
 @pytest.mark.parametrize("target", [_asked_for_realtime, _asked_without_the_right])
-def test_the_real_time_policy_holds_for_all_threads_where_it_is_granted(target: Callable[[Connection], None]) -> None:
+def test_realtime_policy_applies_to_all_threads(target: Callable[[Connection], None]) -> None:
     if target is _asked_without_the_right and os.geteuid() != 0:
         pytest.skip("only root can give the right away")
     ours, theirs = multiprocessing.Pipe()
@@ -108,7 +108,7 @@ def _one_ahead(connection: Connection) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the policy")
-def test_who_receives_goes_one_ahead_and_back_under_the_real_time_policy_alone() -> None:
+def test_raise_priority_only_under_realtime_policy() -> None:
     ours, theirs = multiprocessing.Pipe()
     process = multiprocessing.get_context("spawn").Process(target=_one_ahead, args=(theirs,))
     process.start()
@@ -124,7 +124,7 @@ def _stepped_back(connection: Connection) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no nice values")
-def test_what_records_steps_back_behind_what_closes_the_loop() -> None:
+def test_recorder_lowers_its_priority() -> None:
     ours, theirs = multiprocessing.Pipe()
     before = os.getpriority(os.PRIO_PROCESS, 0)
     process = multiprocessing.get_context("spawn").Process(target=_stepped_back, args=(theirs,))
@@ -134,7 +134,7 @@ def test_what_records_steps_back_behind_what_closes_the_loop() -> None:
     process.join(10)
 
 
-def test_an_unknown_machine_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_architecture_is_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "abacus")
     interval = sys.getswitchinterval()
     try:

@@ -24,7 +24,7 @@ class Collecting(Publisher):
         pass
 
 
-def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
+def test_entries_are_published_in_order_and_unchanged() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     for number in range(3):
@@ -39,7 +39,7 @@ def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
     ]
 
 
-def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
+def test_batches_are_numbered_and_empty_ones_omitted() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     log.flush(0)
@@ -49,7 +49,7 @@ def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
     assert [batch.sequence for batch in out.batches] == [1, 2]
 
 
-def test_a_flush_is_due_once_a_period() -> None:
+def test_flush_is_due_once_per_period() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     for now in (1_000, 2_000, FLUSH_PERIOD_NS - 1_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
@@ -58,7 +58,7 @@ def test_a_flush_is_due_once_a_period() -> None:
     assert [len(batch.keys) for batch in out.batches] == [1, 3]
 
 
-def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_none() -> None:
+def test_sessions_are_announced_at_once_and_repeated() -> None:
     out = Collecting()
     log = RecordingStream(out, "edge/1", incarnation=7)
     log.set_sessions([OpenSession(rig="rig1", session="s1")])
@@ -71,7 +71,7 @@ def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_n
     assert all(batch.complete_sessions for batch in out.batches)
 
 
-def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> None:
+def test_jittering_loop_flushes_every_period() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     jitter = random.Random(1)
@@ -86,7 +86,7 @@ def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> Non
     assert len(out.batches) <= 402
 
 
-def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:
+def test_cache_duration_depends_on_number_of_rigs() -> None:
     kept_ns = {rigs: batch_cache_depth(rigs, 20.0) * FLUSH_PERIOD_NS for rigs in (1, 30, 50, 100, 500)}
     assert {rigs: ns / 1e9 for rigs, ns in kept_ns.items()} == {1: 30, 30: 30, 50: 20, 100: 10, 500: 10}
     # At a step of 1 ms a rig says twenty times as much.

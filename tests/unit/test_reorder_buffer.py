@@ -1,4 +1,4 @@
-"""One publisher's messages in order, whatever way they come."""
+"""The reorder buffer delivers one publisher's messages in order."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +9,7 @@ WINDOW = 10
 
 
 class Stream:
-    """What a stream gave out: numbers, and how many were lost before each."""
+    """Output of a reorder buffer: delivered numbers, and losses with their positions."""
 
     def __init__(self, window: int = WINDOW) -> None:
         self.got: list[int] = []
@@ -34,7 +34,7 @@ def test_messages_are_delivered_in_order_and_once() -> None:
     assert not stream.messages.missing(5)
 
 
-def test_what_is_missing_is_asked_for_from_its_beginning_and_in_pieces() -> None:
+def test_missing_range_starts_at_first_gap_and_is_bounded() -> None:
     stream = Stream()
     stream.take(0, 6)
     assert stream.messages.missing(3) == range(1, 4)
@@ -45,14 +45,14 @@ def test_what_is_missing_is_asked_for_from_its_beginning_and_in_pieces() -> None
     assert stream.messages.missing(100) == range(4, 6)
 
 
-def test_a_message_that_was_announced_and_did_not_come_is_missing() -> None:
+def test_announced_message_that_did_not_arrive_is_missing() -> None:
     stream = Stream()
     stream.take(0)
     stream.messages.set_head(2)
     assert stream.messages.missing(100) == range(1, 3)
 
 
-def test_what_can_not_be_had_any_more_is_lost_and_told_before_what_follows() -> None:
+def test_loss_is_reported_before_the_next_message() -> None:
     stream = Stream()
     stream.take(0, 20)
     assert stream.messages.missing(100) == range(11, 20)
@@ -64,7 +64,7 @@ def test_what_can_not_be_had_any_more_is_lost_and_told_before_what_follows() -> 
     assert (stream.got, stream.lost) == ([0, 12, 20], [(1, 10), (1, 1), (2, 7)])
 
 
-def test_what_was_sent_before_the_first_that_could_be_had_is_no_loss() -> None:
+def test_messages_before_first_available_one_are_not_lost() -> None:
     stream = Stream()
     stream.take(30)
     assert stream.messages.missing(100) == range(21, 30)
@@ -75,7 +75,7 @@ def test_what_was_sent_before_the_first_that_could_be_had_is_no_loss() -> None:
     assert (stream.got, stream.lost) == ([25, 30], [(1, 4)])
 
 
-def test_a_number_far_away_takes_no_time() -> None:
+def test_large_jump_in_numbers_is_fast() -> None:
     stream = Stream()
     stream.take(0)
     stream.messages.set_head(2**32 - 1)
@@ -90,7 +90,7 @@ def test_a_number_far_away_takes_no_time() -> None:
         )
     )
 )
-def test_every_message_is_delivered_in_order_or_counted_as_lost(case: tuple[int, list[int], set[int]]) -> None:
+def test_messages_are_delivered_in_order_or_counted_as_lost(case: tuple[int, list[int], set[int]]) -> None:
     count, arrivals, give_ups = case
     stream = Stream()
     for at, number in enumerate(arrivals):

@@ -1,4 +1,4 @@
-"""Messages of many rigs together: recorded each under its own key, the newest kept, nobody speaks for another's rig."""
+"""Batches of messages: recorded under each rig's key, cached, and restricted to the rigs of an edge."""
 
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
@@ -13,7 +13,7 @@ LAB = parse_lab("[rigs]\ncount = 3\n")
 
 
 class Heard:
-    """What was put on a key."""
+    """Messages that were published on a key."""
 
     def __init__(self, hub: MemoryHub, key: str) -> None:
         self.payloads: list[bytes] = []
@@ -24,7 +24,7 @@ class Heard:
         return [dict(zip(batch.rigs, batch.messages, strict=True)) for batch in found]
 
 
-def test_a_batch_is_on_the_bus_and_each_message_on_its_own_key_and_on_the_record() -> None:
+def test_batch_and_single_messages_are_published_and_recorded() -> None:
     hub = MemoryHub()
     together, single = Heard(hub, STATES.key("lab", "*", "*")), Heard(hub, STATE.key("lab", "rig2"))
     log = Heard(hub, LOG.key("lab", "*", "*"))
@@ -45,7 +45,7 @@ def test_a_batch_is_on_the_bus_and_each_message_on_its_own_key_and_on_the_record
     assert list(entries) == [("rig1", 1, b"one"), ("rig2", 1, b"two"), ("rig2", 2, b"four"), ("rig3", 1, b"five")]
 
 
-def test_of_each_rig_the_newest_is_kept_and_rubbish_is_counted() -> None:
+def test_cache_keeps_newest_and_counts_malformed() -> None:
     hub = MemoryHub()
     with Service("edge", LAB, MemoryBus(hub), clock=ManualClock()) as service:
         latest = service.latest_value_cache(STATES)
@@ -61,7 +61,7 @@ def test_of_each_rig_the_newest_is_kept_and_rubbish_is_counted() -> None:
         assert (service.counters.received, service.counters.malformed) == (3, 2)
 
 
-def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
+def test_edge_may_only_publish_for_its_rigs() -> None:
     hub = MemoryHub()
     with Service("sim", LAB, MemoryBus(hub), clock=ManualClock()) as service:
         latest = service.latest_value_cache(COMMANDS, {"east": ("rig1",), "west": ("rig2",)})
@@ -74,7 +74,7 @@ def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
         assert latest.get("rig2") is None
 
 
-def test_sending_for_long_takes_no_memory() -> None:
+def test_memory_does_not_grow_while_publishing() -> None:
     with VirtualRig(parse_lab("[rigs]\ncount = 32\n")) as lab:
         lab.service.recording_stream.extend = list  # type: ignore[assignment, method-assign]
 

@@ -55,25 +55,25 @@ def parameters(text: str) -> None:
         ("[sim]\nstep_ms = 20\nintegrator = 'euler'", "unstable with euler"),
     ],
 )
-def test_a_mistake_is_named_with_its_place(text: str, says: str) -> None:
+def test_invalid_value_is_reported_with_its_place(text: str, says: str) -> None:
     with pytest.raises(InputError) as refused:
         parameters(text)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value).strip()
 
 
-def test_a_part_that_the_magnet_does_not_hold_may_be_heavy() -> None:
+def test_part_that_is_not_ferromagnetic_may_be_heavy() -> None:
     parameters(PART.format(name="vice", x=300, y=0) + "mass_kg = 20\nferromagnetic = false")
 
 
-def test_a_part_stands_on_the_tray_where_there_is_one() -> None:
+def test_part_rests_on_the_tray_below() -> None:
     lab = parse_lab(PART.format(name="a", x=320, y=-220) + PART.format(name="b", x=300, y=200))
     on_tray, on_table = rig_parameters(lab, lab.rigs[0]).scene.parts
     assert on_tray.position[2] == pytest.approx(-0.060 + 0.008 + 0.015)
     assert on_table.position[2] == pytest.approx(-0.060 + 0.015)
 
 
-def test_a_turned_tray_carries_what_is_over_any_of_it_and_its_places_are_on_its_top() -> None:
+def test_rotated_tray_supports_parts_and_places() -> None:
     tray = (
         '[[scene.trays]]\nname = "t"\nposition_mm = [300, 200]\nsize_mm = [200, 100, 12]\nyaw_deg = 45\n'
         "rows = 1\ncolumns = 1\n"
@@ -87,7 +87,7 @@ def test_a_turned_tray_carries_what_is_over_any_of_it_and_its_places_are_on_its_
     assert [place[2] for tray in scene.trays for place in tray.places] == pytest.approx([-0.048])
 
 
-def test_a_rigs_own_scene_replaces_the_labs(tmp_path: Path) -> None:
+def test_scene_of_a_rig_replaces_the_labs(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     text = '[[rigs]]\nname = "a"\n[[rigs]]\nname = "b"\n[rigs.scene]\nparts = []\n[rigs.scene.table]\nheight_mm = -80'
     path.write_text(text)
@@ -98,7 +98,7 @@ def test_a_rigs_own_scene_replaces_the_labs(tmp_path: Path) -> None:
     assert second.table_height == -0.080
 
 
-def test_every_part_and_place_of_the_default_scene_is_in_reach() -> None:
+def test_default_parts_and_places_are_reachable() -> None:
     lab = LabConfig()
     rig = rig_parameters(lab, lab.rigs[0])
     for part in rig.scene.parts:

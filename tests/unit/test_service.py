@@ -1,4 +1,4 @@
-"""A service's typed ends: what is sent is recorded byte for byte, and only the newest value is kept."""
+"""Publishers and caches of a service: published bytes are recorded unchanged, and only the newest value is cached."""
 
 import pytest
 
@@ -14,7 +14,7 @@ def make_service(hub: MemoryHub, clock: ManualClock, name: str = "sim") -> Servi
     return Service(name, LabConfig(), MemoryBus(hub), clock=clock)
 
 
-def test_what_is_sent_is_on_the_bus_and_on_the_record_with_the_same_bytes() -> None:
+def test_published_and_recorded_bytes_are_equal() -> None:
     hub, clock = MemoryHub(), ManualClock()
     seen: list[bytes] = []
     batches: list[bytes] = []
@@ -32,7 +32,7 @@ def test_what_is_sent_is_on_the_bus_and_on_the_record_with_the_same_bytes() -> N
     assert set(batch.publish_wall_ns) == {clock.wall_ns()}
 
 
-def test_a_repetition_is_heard_but_not_recorded() -> None:
+def test_republished_message_is_not_recorded() -> None:
     hub = MemoryHub()
     seen: list[bytes] = []
     MemoryBus(hub).subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
@@ -42,7 +42,7 @@ def test_a_repetition_is_heard_but_not_recorded() -> None:
     assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).keys]
 
 
-def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:
+def test_cache_keeps_newest_value_and_arrival_time() -> None:
     hub, clock = MemoryHub(), ManualClock()
     with make_service(hub, clock, "edge") as edge, make_service(hub, clock, "sim") as sim:
         latest = edge.latest_value_cache(STATES)
@@ -59,7 +59,7 @@ def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:
         assert edge.counters.received == 2
 
 
-def test_an_event_carries_its_source_and_time() -> None:
+def test_event_has_source_and_time() -> None:
     hub, clock = MemoryHub(), ManualClock()
     seen: list[Event] = []
     MemoryBus(hub).subscribe(EVENT.key("lab", "rig1"), lambda _, payload: seen.append(EVENT.decode(payload)))
@@ -68,7 +68,7 @@ def test_an_event_carries_its_source_and_time() -> None:
     assert (seen[0].source, seen[0].wall_ns, seen[0].text) == ("sim/1", clock.wall_ns(), "late")
 
 
-def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> None:
+def test_service_token_exists_from_ready_to_close() -> None:
     hub = MemoryHub()
     witness = MemoryBus(hub)
     service = make_service(hub, ManualClock())
@@ -86,7 +86,7 @@ def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> N
     assert hub.subscribers == []
 
 
-def test_health_comes_once_a_second_with_what_was_counted() -> None:
+def test_health_report_is_published_once_a_second() -> None:
     hub, clock = MemoryHub(), ManualClock()
     seen: list[Health] = []
     MemoryBus(hub).subscribe(HEALTH.key("lab", "*", "*"), lambda _, payload: seen.append(HEALTH.decode(payload)))

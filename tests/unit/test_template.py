@@ -1,4 +1,4 @@
-"""The explained `lab.toml` and the page made of it say what the models say."""
+"""The template of `lab.toml` and the generated page agree with the models."""
 
 import tomllib
 from pathlib import Path
@@ -11,11 +11,11 @@ from hilrig_runtime.config.types import Section
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def test_the_template_is_a_lab_with_the_defaults() -> None:
+def test_template_is_the_default_lab() -> None:
     assert parse_lab(lab_template()).model_dump() == LabConfig().model_dump()
 
 
-def test_every_key_stands_in_it() -> None:
+def test_template_contains_every_key() -> None:
     keys = {line.removeprefix("# ").partition(" =")[0] for line in lab_template().splitlines() if " =" in line}
 
     def check(section: Section) -> None:
@@ -31,7 +31,7 @@ def test_every_key_stands_in_it() -> None:
     check(LabConfig())
 
 
-def test_the_page_is_fresh_and_its_examples_are_labs() -> None:
+def test_page_is_up_to_date_and_examples_are_valid() -> None:
     text = (DOCS / "configuration.md").read_text()
     assert text == generate_configuration.page(), "run `make gen` and commit the result"
     examples = [block.partition("```")[0] for block in text.split("```toml\n")[1:]]

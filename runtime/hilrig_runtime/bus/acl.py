@@ -2,7 +2,7 @@
 
 A certificate's common name is an identity, and each identity has a role. zenoh silently denies whatever no rule allows.
 The rules describe the identity at the other end of a link, so that a router and every service of a mesh use the same
-ones: ingress rules are what it may publish, egress rules what it may receive.
+ones: ingress rules permit its publications, egress rules its receptions.
 """
 
 from collections.abc import Iterable, Sequence

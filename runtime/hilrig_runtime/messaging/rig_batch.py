@@ -1,7 +1,7 @@
 """Publishes one message of each of many rigs together: one message on the bus instead of one per rig.
 
 At 50 steps a second of 128 rigs, sending and receiving a small message and waking a thread for it cost more than its
-content. So a simulation first publishes the states of a tick as one batch, for the edges, and only then each state on
+content. So a simulation first publishes the states of a tick as one batch to the edges, and only then each state on
 its rig's own key, which costs little without a subscriber. Each message is recorded under its rig's key.
 """
 

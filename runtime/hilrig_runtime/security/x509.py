@@ -1,7 +1,7 @@
-"""Certificates: an authority of the lab's own, and what it issues for Modbus/TCP Security and for the bus.
+"""X.509 certificates: the lab's authorities, and the certificates they issue for Modbus/TCP Security and the bus.
 
 The Modbus specification puts a client's role into its certificate, as a UTF-8 string in the extension `ROLE_OID`.
-Elliptic keys on P-256, for they are small and every TLS library has them.
+Keys are on the elliptic curve P-256: they are small, and every TLS library supports them.
 """
 
 import ipaddress
@@ -17,7 +17,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 ROLE_OID: Final = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.1")
 _UTF8_STRING: Final = 0x0C
-_BOTH_WAYS: Final = (ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH)
+_CLIENT_AND_SERVER: Final = (ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH)
 _CLOCK_SKEW: Final = timedelta(minutes=5)
 
 
@@ -42,19 +42,19 @@ class Credential:
 
 
 def load(certificate_pem: bytes, key_pem: bytes) -> Credential:
-    """An identity that was written before.
+    """Load a certificate and its key.
 
     Raises:
-        ValueError: this is no certificate, or no key of the kind that is made here.
+        ValueError: not a certificate, or not an elliptic-curve key.
     """
     key = serialization.load_pem_private_key(key_pem, password=None)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise ValueError("not an elliptic key")
+        raise ValueError("not an elliptic-curve key")
     return Credential(x509.load_pem_x509_certificate(certificate_pem), key)
 
 
 def make_authority(name: str, now: datetime, days: int) -> Credential:
-    """A self-signed authority that signs nothing but leaves."""
+    """Create a self-signed authority that signs only end-entity certificates."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = _name(name)
     builder = (
@@ -66,23 +66,23 @@ def make_authority(name: str, now: datetime, days: int) -> Credential:
 
 
 def issue_server(authority: Credential, hosts: Sequence[str], now: datetime, days: int) -> Credential:
-    """A certificate for the edge; `hosts` are the names and addresses by which clients reach it."""
+    """Issue a certificate for the edge; `hosts` are the names and addresses under which clients connect."""
     return _issue(authority, hosts[0], [ExtendedKeyUsageOID.SERVER_AUTH], _alternative_names(hosts), now, days)
 
 
 def issue_peer(authority: Credential, name: str, hosts: Sequence[str], now: datetime, days: int) -> Credential:
-    """A certificate for who connects and is connected to, as on the bus; `name` is what access control knows it by."""
-    return _issue(authority, name, _BOTH_WAYS, _alternative_names(hosts), now, days)
+    """Issue a certificate for both client and server use, as on the bus; access control uses its `name`."""
+    return _issue(authority, name, _CLIENT_AND_SERVER, _alternative_names(hosts), now, days)
 
 
 def issue_client(authority: Credential, name: str, role: str, now: datetime, days: int) -> Credential:
-    """A certificate for a controller; an empty role is left out."""
+    """Issue a certificate for a controller; an empty role is omitted."""
     extension = x509.UnrecognizedExtension(ROLE_OID, _utf8_string(role)) if role else None
     return _issue(authority, name, [ExtendedKeyUsageOID.CLIENT_AUTH], extension, now, days)
 
 
 def names_in(certificate: x509.Certificate) -> set[str]:
-    """The names and addresses that a certificate is good for; none: it is no server's."""
+    """Return the names and addresses in a certificate; empty: not a server certificate."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
@@ -91,12 +91,12 @@ def names_in(certificate: x509.Certificate) -> set[str]:
 
 
 def role_of(certificate_der: bytes) -> str:
-    """The role in a client's certificate; empty: it names none that can be read, or more than one."""
+    """Return the role in a client's certificate; empty: no readable role, or more than one."""
     try:
         extensions = x509.load_der_x509_certificate(certificate_der).extensions
         value = extensions.get_extension_for_oid(ROLE_OID).value
     except (x509.ExtensionNotFound, x509.DuplicateExtension, ValueError):
-        # The TLS library let it pass, for it does not look into what it does not know.
+        # The TLS library accepts certificates with unknown extensions without parsing them.
         return ""
     return _text_of(value.value) if isinstance(value, x509.UnrecognizedExtension) else ""
 
@@ -170,7 +170,7 @@ def _general_name(host: str) -> x509.GeneralName:
 def _utf8_string(text: str) -> bytes:
     data = text.encode()
     if len(data) > 127:
-        raise ValueError(f"a role has at most 127 bytes, found {len(data)}")
+        raise ValueError(f"a role must have at most 127 bytes, got {len(data)}")
     return bytes((_UTF8_STRING, len(data))) + data
 
 
