@@ -1,4 +1,4 @@
-"""What versions promise each other: nothing of it is broken, and each way of breaking it is found."""
+"""Compatibility contract between versions: it is not violated, and each kind of violation is found."""
 
 from collections.abc import Callable
 
@@ -18,25 +18,27 @@ def field(message: DescriptorProto, name: str) -> FieldDescriptorProto:
     return next(field for field in message.field if field.name == name)
 
 
-def test_every_promise_holds() -> None:
-    assert wire_contract.broken(wire_contract.promised(), wire_contract.current()) == []
+def test_contract_is_not_violated() -> None:
+    assert wire_contract.violations(wire_contract.committed_lines(), wire_contract.current_contract()) == []
 
 
-def test_all_that_is_sent_is_promised() -> None:
-    assert wire_contract.current().lines - wire_contract.promised() == set(), "run `make gen` and commit the result"
+def test_contract_lists_everything_sent() -> None:
+    assert wire_contract.current_contract().lines - wire_contract.committed_lines() == set(), (
+        "run `make gen` and commit the result"
+    )
 
 
-def take_away(message: DescriptorProto) -> None:
+def remove_a_field(message: DescriptorProto) -> None:
     message.field.remove(field(message, "magnet"))
 
 
-def take_away_in_order(message: DescriptorProto) -> None:
-    take_away(message)
+def remove_and_reserve_a_field(message: DescriptorProto) -> None:
+    remove_a_field(message)
     message.reserved_range.add(start=15, end=16)
     message.reserved_name.append("magnet")
 
 
-def use_a_number_again(message: DescriptorProto) -> None:
+def reuse_a_number(message: DescriptorProto) -> None:
     field(message, "magnet").name = "gripper"
 
 
@@ -44,7 +46,7 @@ def change_a_type(message: DescriptorProto) -> None:
     field(message, "step").type = FieldDescriptorProto.TYPE_SFIXED64
 
 
-def make_many_of_one(message: DescriptorProto) -> None:
+def make_a_field_repeated(message: DescriptorProto) -> None:
     field(message, "session").label = FieldDescriptorProto.LABEL_REPEATED
 
 
@@ -60,36 +62,36 @@ def add_a_field(message: DescriptorProto) -> None:
     ("change", "found"),
     [
         (add_a_field, []),
-        (take_away_in_order, []),
-        (take_away, [f'field {STATE} 15 magnet bool: gone: reserve 15 and "magnet"']),
-        (use_a_number_again, [f"field {STATE} 15 magnet bool: is now field {STATE} 15 gripper bool"]),
+        (remove_and_reserve_a_field, []),
+        (remove_a_field, [f'field {STATE} 15 magnet bool: removed: reserve 15 and "magnet"']),
+        (reuse_a_number, [f"field {STATE} 15 magnet bool: is now field {STATE} 15 gripper bool"]),
         (change_a_type, [f"field {STATE} 4 step uint64: is now field {STATE} 4 step sfixed64"]),
-        (make_many_of_one, [f"field {STATE} 2 session string: is now field {STATE} 2 session repeated string"]),
-        (change_a_number, [f'field {STATE} 20 safe bool: gone: reserve 20 and "safe"']),
+        (make_a_field_repeated, [f"field {STATE} 2 session string: is now field {STATE} 2 session repeated string"]),
+        (change_a_number, [f'field {STATE} 20 safe bool: removed: reserve 20 and "safe"']),
     ],
 )
-def test_a_broken_promise_is_named(change: Callable[[DescriptorProto], None], found: list[str]) -> None:
+def test_violation_is_reported(change: Callable[[DescriptorProto], None], found: list[str]) -> None:
     files = wire_contract.files()
     before = wire_contract.contract(files)
     change(joint_state(files))
-    assert wire_contract.broken(before.lines, wire_contract.contract(files)) == found
+    assert wire_contract.violations(before.lines, wire_contract.contract(files)) == found
 
 
-def test_an_enums_value_stays() -> None:
+def test_enum_values_are_fixed() -> None:
     files = wire_contract.files()
     before = wire_contract.contract(files)
     kinds = next(enum for file in files for message in file.message_type for enum in message.enum_type)
     assert (kinds.name, kinds.value[1].name) == ("Kind", "SESSION_START")
     kinds.value[1].number = 99
-    assert wire_contract.broken(before.lines, wire_contract.contract(files)) == [
-        "enum hilrig.v1.Event.Kind 1 SESSION_START: changed or gone"
+    assert wire_contract.violations(before.lines, wire_contract.contract(files)) == [
+        "enum hilrig.v1.Event.Kind 1 SESSION_START: changed or removed"
     ]
 
 
-def test_a_topics_key_stays() -> None:
-    promised = "topic hil/<lab>/<rig>/pose hilrig.v1.JointState control"
-    assert wire_contract.broken([promised], wire_contract.current()) == [f"{promised}: changed or gone"]
+def test_topic_keys_are_fixed() -> None:
+    line = "topic hil/<lab>/<rig>/pose hilrig.v1.JointState control"
+    assert wire_contract.violations([line], wire_contract.current_contract()) == [f"{line}: changed or removed"]
 
 
-def test_what_is_gone_stays_reserved() -> None:
-    assert "field hilrig.v1.LogBatch 4 entries repeated hilrig.v1.LogEntry" in wire_contract.promised()
+def test_removed_field_stays_in_the_contract() -> None:
+    assert "field hilrig.v1.LogBatch 4 entries repeated hilrig.v1.LogEntry" in wire_contract.committed_lines()

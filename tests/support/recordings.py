@@ -1,7 +1,7 @@
-"""Recordings with known content: a rig and a controller in virtual time, written with the stock MCAP writer.
+"""Recordings with known content: a rig and a controller in simulated time, written with the MCAP library's writer.
 
-The simulation ticks on its own clock and the edge stamps with another one, years apart, as on two machines. What the
-controller does, and when, is scripted; so a test knows every stage of every loop without asking the code under test.
+The simulation and the edge use clocks with different origins, as on two machines. The actions of the controller and
+their times are scripted: a test knows every stage of every loop independently of the code under test.
 """
 
 from collections import deque
@@ -26,38 +26,38 @@ START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
 EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
 MS = 1_000_000
-SHOWN = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""From rad and m to the registers' degrees and mm."""
+REGISTER_UNITS = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""Factors from rad and m to the degrees and mm of the registers."""
 CONTROLLER = "192.0.2.7:40001"
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
 
 @dataclass(frozen=True)
 class Script:
-    """What is recorded; times in ms unless the name says otherwise."""
+    """Parameters of a scripted run; times in ms unless the name has another unit."""
 
     seconds: float = 4.0
     step_ms: float = 20.0
     poll_ms: float = 5.0
-    """From one cycle of the controller to the next; 0: as fast as it can."""
+    """Period of the controller; 0: as fast as possible."""
     delay_ms: float = 0.0
-    """What the controller takes between reading and writing."""
+    """Time of the controller between read and write."""
     order: str = "read-compute-write"
-    """Or `write-read`: each cycle writes what it computed from the previous cycle's read, then reads and waits."""
+    """Or `write-read`: each cycle writes the torques computed from the read of the previous cycle, reads, and waits."""
     network_ms: float = 0.4
-    """One way, controller to edge, and as much back."""
+    """One-way delay between controller and edge, in both directions."""
     injected_state_ms: float = 0.0
     injected_command_ms: float = 0.0
     stalls: Mapping[int, float] = field(default_factory=dict)
-    """Step at whose start the simulation stands still, and for how long."""
+    """Stalls of the simulation: step at whose start it stalls, and duration."""
     edge_stalls: Mapping[float, float] = field(default_factory=dict)
-    """Time, s, at which the edge stands still, and for how long."""
+    """Stalls of the edge: time, s, and duration."""
     law: str = "wave"
-    """What the torques are: a `wave`, or `feedback` on the positions read."""
-    behind: int = 0
-    """With feedback: how many polls ago the positions were read that it uses."""
+    """Control law of the torques: a `wave`, or `feedback` of the positions read."""
+    feedback_delay_polls: int = 0
+    """Age of the positions used by the feedback, in polls."""
     delayed_ack_ms: float = 0.0
-    """What the request that follows a write at once waits for a delayed acknowledgement."""
+    """Delay of a request that immediately follows a write, caused by a delayed TCP ACK."""
     lost_transport: int = 0
     lost_recorder: int = 0
     clock_steps: int = 0
@@ -67,31 +67,31 @@ class Script:
 
 
 def position(seconds: float) -> np.ndarray:
-    """Where the arm is: rad, rad, m, rad."""
+    """Joint positions at a time: rad, rad, m, rad."""
     t = seconds
     return np.array([0.9 * np.sin(0.7 * t), 1.1 * np.sin(0.9 * t + 0.5), 0.1 - 0.1 * np.cos(1.3 * t), 0.8 * np.sin(t)])
 
 
 @dataclass
-class Made:
-    """One message on its way into the file."""
+class TimedMessage:
+    """One message of a recording."""
 
     topic: str
     publish_wall_ns: int
     message: Message
 
 
-def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[Made]:
-    """The messages of a scripted run, in the order of publication."""
+def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[TimedMessage]:
+    """Build the messages of a scripted run, in the order of publication."""
     random = Random(script.seed)
     step_ns = round(script.step_ms * MS)
     ticks = _ticks(script, step_ns, random)
     writes = list(_cycles(script, ticks, random)) if script.controllers else []
-    made: list[Made] = []
+    made: list[TimedMessage] = []
     for write in writes:
         command = write.command
         command.rig, command.session, command.controller = rig, session, CONTROLLER
-        made.append(Made("command", command.sent_ns - EDGE_FROM_WALL_NS, command))
+        made.append(TimedMessage("command", command.sent_ns - EDGE_FROM_WALL_NS, command))
     waiting = iter(writes)
     following = next(waiting, None)
     newest: _Write | None = None
@@ -126,17 +126,18 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
         if parts and (step - 1) % 50 == 0:
             parts[held].x += 0.002
             state.parts.extend(parts)
-        made.append(Made("state", state.wall_ns, state))
+        made.append(TimedMessage("state", state.wall_ns, state))
         if missed:
             text = f"{missed} steps missed"
             event = Event(rig=rig, session=session, kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step)
             event.wall_ns, event.source = state.wall_ns, "sim/1"
             event.overrun_data.missed_steps = missed
-            made.append(Made("event", event.wall_ns, event))
-    for at_ns, kind, text in ((0, Event.SESSION_START, "took the rig"), (tick_ns, Event.SESSION_END, "left the rig")):
-        event = Event(rig=rig, session=session, kind=kind, severity=Event.INFO, text=f"{CONTROLLER} {text}")
+            made.append(TimedMessage("event", event.wall_ns, event))
+    started, ended = f"started by {CONTROLLER}", "ended: the connection was closed"
+    for at_ns, kind, text in ((0, Event.SESSION_START, started), (tick_ns, Event.SESSION_END, ended)):
+        event = Event(rig=rig, session=session, kind=kind, severity=Event.INFO, text=f"session {session} {text}")
         event.wall_ns, event.source = START_WALL_NS + at_ns, "edge/1"
-        made.append(Made("event", event.wall_ns, event))
+        made.append(TimedMessage("event", event.wall_ns, event))
     made.extend(_traffic(writes, rig))
     return sorted(made, key=lambda one: one.publish_wall_ns)
 
@@ -145,9 +146,9 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
 class _Write:
     command: TorqueCommand
     arrives_ns: int
-    """At the simulation."""
+    """Arrival at the simulation."""
     asked_ns: int
-    """Arrival of the read before it at the edge, on the edge's clock."""
+    """Arrival of the preceding read at the edge, edge clock."""
 
 
 def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int, int, int]]:
@@ -168,7 +169,7 @@ def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int,
 
 
 def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Random) -> Iterator[_Write]:
-    """The controller's life on the true time, ns from the start, stamped by the edge's clock."""
+    """Writes of the controller, computed in ns from the start, with timestamps of the edge clock."""
     network_ns, delay_ns = round(script.network_ms * MS), round(script.delay_ms * MS)
     steps = list(ticks)
     at_edge = np.array([ticks[step][0] + random.randrange(200_000, 300_000) for step in steps])
@@ -176,7 +177,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
     free_ns = 0
 
     def edge_free(at_ns: int) -> int:
-        """When the edge does what comes in at `at_ns`: later, while it stands still."""
+        """Time at which the edge processes a request that arrives at `at_ns`: after the end of a stall."""
         for start_s, stall_ms in script.edge_stalls.items():
             start_ns = round(start_s * 1e9)
             if start_ns <= at_ns < start_ns + stall_ms * MS:
@@ -188,13 +189,13 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
     begin_ns, seq = round(30 * MS), 0
     seen: tuple[int, int] | None = None
-    seen_before: deque[np.ndarray] = deque(maxlen=2 + script.behind)
+    seen_before: deque[np.ndarray] = deque(maxlen=2 + script.feedback_delay_polls)
     while begin_ns < script.seconds * 1e9 - 100 * MS:
         if script.order == "read-compute-write":
             asked_ns = max(begin_ns + network_ns, free_ns)
             read_ns = edge_free(asked_ns)
             seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
-            # A loop that reads right after it wrote waits for the acknowledgement of its write.
+            # A read immediately after a write waits for the acknowledgment of the write.
             write_ns = read_ns + 2 * network_ns + delay_ns + random.randrange(50_000)
         else:
             write_ns = begin_ns + network_ns
@@ -202,7 +203,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
         if seen is not None and seen[0] >= 0:
             seq += 1
             index, served_ns = seen
-            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * SHOWN, 2))
+            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * REGISTER_UNITS, 2))
             effort = _effort(script, seen_before, write_ns / 1e9, seq)
             command = TorqueCommand(
                 seq=seq,
@@ -230,15 +231,15 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
 
 def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int) -> np.ndarray:
-    """Torques by a law: a wave that knows nothing of the arm, or feedback on what was read some polls ago."""
-    if script.law == "wave" or len(seen) < 2 + script.behind:
+    """Torques of the control law: an open-loop wave, or feedback of the positions read some polls earlier."""
+    if script.law == "wave" or len(seen) < 2 + script.feedback_delay_polls:
         return 3 * np.sin(0.9 * seq / 50 + np.arange(4))
-    newest, older = seen[-1 - script.behind], seen[-2 - script.behind]
-    wanted = position(seconds) * SHOWN
+    newest, older = seen[-1 - script.feedback_delay_polls], seen[-2 - script.feedback_delay_polls]
+    wanted = position(seconds) * REGISTER_UNITS
     return np.array([0.5, 0.4, 0.3, 0.2]) * (wanted - newest) - 0.6 * (newest - older)
 
 
-def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
+def _traffic(writes: list[_Write], rig: str) -> Iterator[TimedMessage]:
     read = ModbusKind(function=3, address=4, count=4, controller=CONTROLLER)
     wrote = ModbusKind(function=16, address=0, count=4, controller=CONTROLLER)
     batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
@@ -250,13 +251,13 @@ def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
         if len(batch.arrived_ns) >= 20 or write is writes[-1]:
             batch.closed_ns = command.sent_ns
             batch.wall_ns = command.wall_ns
-            yield Made("traffic", batch.wall_ns, batch)
+            yield TimedMessage("traffic", batch.wall_ns, batch)
             batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
 
 
 def write(
     path: Path,
-    made: Iterable[Made],
+    made: Iterable[TimedMessage],
     *,
     script: Script = Script(),
     metadata: Mapping[str, Mapping[str, str]] | None = None,
@@ -270,10 +271,10 @@ def write(
     arrival_lag_ns: int = 0,
     lab_toml: str = "",
 ) -> Path:
-    """Write messages as the recorder does.
+    """Write messages in the format of the recorder.
 
-    Without `finish` the file has no end, as after a kill; without `configured` the rig did not say what it is.
-    `missing` leaves out messages by topic and sequence; the second half reaches the recorder `arrival_lag_ns` late.
+    Without `finish` the file is truncated, as after a kill; without `configured` it has no configuration of the rig.
+    `missing` omits messages by topic and sequence; the second half arrives at the recorder `arrival_lag_ns` later.
     """
     if arrival_lag_ns:
         made = list(made)
@@ -341,7 +342,7 @@ def write(
 
 
 def record(path: Path, script: Script = Script()) -> Path:
-    """Make a scripted run and write it."""
+    """Write the recording of a scripted run."""
     return write(path, make(script), script=script)
 
 
