@@ -1,7 +1,7 @@
-"""Compatibility contract between versions: `schemas/contract.txt`, to which `make gen` adds new lines.
+"""The compatibility contract between versions, in `schemas/contract.txt`; `make gen` adds new entries.
 
-Each line is a property that other versions depend on: number, name and type of a field, a value of an enum, key and
-message of a topic. The functions are pure functions of descriptors: tests check that each violation is found.
+An entry is a property on which a reader of another version relies: a field's number, name and type, an enum's values,
+a topic's key and message. Pure functions on descriptors, so that tests can check that each violation is detected.
 """
 
 import importlib
@@ -22,15 +22,15 @@ import hilrig_schemas.v1
 from hilrig_schemas import topics
 
 PATH = Path(__file__).parents[1] / "schemas/contract.txt"
-HEADER = """\
-# Compatibility contract between versions of hilrig. `make gen` adds new lines; a line that was in a release is never
-# changed or removed (docs/adr/0042-schema-evolution.md). The line of a removed field stays, and its number is reserved.
+HEAD = """\
+# Compatibility contract between versions of hilrig. `make gen` adds new entries; a released entry must not be changed
+# or removed (docs/adr/0042-schema-evolution.md). A removed field stays here and is reserved in its message.
 """
 
 
 @dataclass(frozen=True)
 class Contract:
-    """Contract of a set of schemas: its lines, its message types, and its reserved numbers and names."""
+    """The entries of a set of schemas, and their reserved numbers and names."""
 
     lines: frozenset[str]
     messages: frozenset[str]
@@ -68,18 +68,18 @@ def contract(schemas: Iterable[FileDescriptorProto]) -> Contract:
 
 
 def topic_lines() -> Iterator[str]:
-    """Yield the contract lines of the topic registry."""
+    """Yield the entries of the registry of topics."""
     for topic in topics.all_topics():
-        places = ("<lab>", "<rig>") if isinstance(topic, topics.RigTopic) else ("<lab>", "<service>", "<instance>")
+        parts = ("<lab>", "<rig>") if isinstance(topic, topics.RigTopic) else ("<lab>", "<service>", "<instance>")
         channel = f" in {topic.channel}" if topic.channel else ""
-        key = topic.key(*places)  # type: ignore[attr-defined]
+        key = topic.key(*parts)  # type: ignore[attr-defined]
         yield f"topic {key} {topic.message.DESCRIPTOR.full_name} {topic.traffic.value}{channel}"
     yield f"alive {topics.alive_key('<lab>', '<service>', '<instance>')}"
 
 
-def violations(committed: Iterable[str], now: Contract) -> list[str]:
-    """Return the violated lines, each with a human-readable reason."""
-    return [f"{line}: {reason}" for line in sorted(committed) if (reason := _violation(line, now))]
+def violations(entries: Iterable[str], now: Contract) -> list[str]:
+    """Return the violated entries, each with a human-readable reason."""
+    return [f"{line}: {reason}" for line in sorted(entries) if (reason := _violation(line, now))]
 
 
 def _violation(line: str, now: Contract) -> str:
@@ -89,7 +89,7 @@ def _violation(line: str, now: Contract) -> str:
     if kind != "field":
         return "changed or removed"
     if owner not in now.messages:
-        # The message type was removed and is no longer sent: lines of topics and fields cover all types that are sent.
+        # Messages that are used are covered by the entries of topics and fields.
         return ""
     number, name, *_ = rest
     changed = [other for other in now.lines if other.split(" ")[:3] == [kind, owner, number]]
@@ -99,12 +99,12 @@ def _violation(line: str, now: Contract) -> str:
     return f"removed: reserve {' and '.join(missing)}" if missing else ""
 
 
-def committed_lines() -> set[str]:
-    """Return the lines of the contract file."""
+def recorded_entries() -> set[str]:
+    """Return the entries of the file."""
     return {line for line in PATH.read_text().splitlines() if line and not line.startswith("#")}
 
 
-def current_contract() -> Contract:
+def current() -> Contract:
     """Return the contract of this version, including topics."""
     found = contract(files())
     return Contract(found.lines | frozenset(topic_lines()), found.messages, found.reserved)
@@ -134,13 +134,13 @@ def _order(line: str) -> tuple[str, str, int]:
 
 
 def main() -> int:
-    """Add new lines to the contract file; return 1 if a line is violated."""
-    old, now = committed_lines() if PATH.exists() else set(), current_contract()
+    """Add new entries to the file; exit code 1: an entry is violated."""
+    old, now = recorded_entries() if PATH.exists() else set(), current()
     violated = violations(old, now)
     for text in violated:
         print(f"{PATH.name}: {text}", file=sys.stderr)
     if not violated:
-        PATH.write_text(HEADER + "".join(f"{line}\n" for line in sorted(old | now.lines, key=_order)))
+        PATH.write_text(HEAD + "".join(f"{line}\n" for line in sorted(old | now.lines, key=_order)))
     return 1 if violated else 0
 
 

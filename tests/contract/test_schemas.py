@@ -1,4 +1,4 @@
-"""Schemas and topics: generated code is up to date, every field has a comment with its unit, keys are unique."""
+"""The schemas: generated code is up to date, every field has its unit, the registry of topics is consistent."""
 
 import re
 import subprocess
@@ -35,7 +35,7 @@ def test_generated_code_is_up_to_date(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("proto", PROTOS, ids=lambda path: path.stem)
-def test_every_field_has_a_comment_with_its_unit(proto: Path) -> None:
+def test_every_field_has_a_comment_and_numbers_a_unit(proto: Path) -> None:
     field = re.compile(r"^\s*(repeated )?(?P<type>\w+) (?P<name>\w+) = \d+;(?P<comment>.*)$")
     unit = re.compile(r"\b(rad|m|mm|degrees|N|N·m|kg|ns|s|count|bytes|bit|1/s|no unit)\b")
     numeric = {"double", "float", "int32", "int64", "uint32", "uint64"}
@@ -45,7 +45,7 @@ def test_every_field_has_a_comment_with_its_unit(proto: Path) -> None:
         if re.match(r"[a-z]", match["type"]):
             assert match["comment"].strip().startswith("//"), f"{match['name']} has no comment"
         if match["type"] in numeric:
-            assert unit.search(match["comment"]), f"{match['name']}: no unit in its comment: {match['comment']}"
+            assert unit.search(match["comment"]), f"{match['name']}: its comment names no unit: {match['comment']}"
 
 
 def test_topic_names_and_channels_are_unique() -> None:
@@ -57,12 +57,12 @@ def test_topic_names_and_channels_are_unique() -> None:
 
 
 @pytest.mark.parametrize("topic", topics.RIG_TOPICS, ids=lambda topic: topic.name)
-def test_rig_key_is_parsed(topic: RigTopic) -> None:  # type: ignore[type-arg]
+def test_rig_key_can_be_parsed(topic: RigTopic) -> None:  # type: ignore[type-arg]
     assert topics.parse_rig_key(topic.key("lab", "rig1")) == RigKey("lab", "rig1", topic)
 
 
 @pytest.mark.parametrize("topic", list(topics.all_topics()), ids=lambda topic: topic.name)
-def test_messages_of_every_topic_are_decoded(topic: topics.Topic) -> None:  # type: ignore[type-arg]
+def test_messages_of_every_topic_round_trip(topic: topics.Topic) -> None:  # type: ignore[type-arg]
     message = topic.message()
     first = message.DESCRIPTOR.fields[0]
     setattr(message, first.name, "rig1")
@@ -72,12 +72,12 @@ def test_messages_of_every_topic_are_decoded(topic: topics.Topic) -> None:  # ty
 @pytest.mark.parametrize(
     "key", ["hil/lab/rig1/none", "hil/lab/log/sim/1", "other/lab/rig1/state", "hil/lab/health/state", ""]
 )
-def test_other_keys_are_refused(key: str) -> None:
-    with pytest.raises(ValueError, match="is no key of a rig"):
+def test_invalid_rig_key_is_rejected(key: str) -> None:
+    with pytest.raises(ValueError, match="invalid key of a rig topic"):
         topics.parse_rig_key(key)
 
 
-def test_control_traffic_is_states_and_commands() -> None:
+def test_control_topics_close_the_loop() -> None:
     assert {topic.name for topic in topics.all_topics() if topic.traffic is Traffic.CONTROL} == {
         "state",
         "states",
@@ -86,7 +86,7 @@ def test_control_traffic_is_states_and_commands() -> None:
     }
 
 
-def test_no_key_literal_outside_the_registry() -> None:
+def test_keys_are_only_in_the_registry() -> None:
     sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
     offenders = [str(path) for path in sources if re.search(r"""["']hil/""", path.read_text())]
     assert offenders == []

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hilrig_runtime.config.lab import load_lab
-from hilrig_runtime.messaging.recording_stream import LONGEST_KEPT_S
+from hilrig_runtime.messaging.recording_stream import MAX_CACHE_S
 from support.multi_host_lab import (
     HILRIG,
     STEP_S,
@@ -101,7 +101,7 @@ def test_loop_recovers_after_simulation_link_cut(lab: MultiHostLab, cut_s: float
         assert time_to_zero_ns(states, cut_ns) <= TIMEOUT_NS + TOLERANCE_NS
         assert missing == session.reported_lost() == 0, "messages are missing in the recording"
     else:
-        retained_s = LONGEST_KEPT_S - 1.0
+        retained_s = MAX_CACHE_S - 1.0
         assert 0 < missing <= (cut_s - retained_s) / STEP_S, "messages of the last 30 s of the cut are missing"
         assert session.reported_lost() >= missing, "the recording reports too few lost messages"
 
@@ -160,6 +160,6 @@ def test_two_labs_on_one_router_are_isolated(lab: MultiHostLab) -> None:
     assert services(lab.config) == ["edge", "recorder", "sim"]
     second = lab.run("sim", "sim", "-c", str(lab.config), "--instance", "2")
     assert second.returncode == 3
-    assert "serves rig1 already; a rig has one sim" in second.stderr
+    assert "already serves rig1; each rig has one sim" in second.stderr
     simulation.terminate()
     assert simulation.wait(LONG_TIMEOUT_S) == 0

@@ -119,7 +119,7 @@ def test_missing_file_is_named(lab: Lab, missing: str) -> None:
 
 def test_missing_key_of_the_service_is_named(lab: Lab) -> None:
     (lab.folder / "operator.key").unlink()
-    with pytest.raises(InputError, match=r"holds no operator\.key or viewer\.key"):
+    with pytest.raises(InputError, match=r"does not contain operator\.key or viewer\.key"):
         ZenohBus(lab.config(lab.folder), "tool")
 
 

@@ -1,7 +1,7 @@
-"""Recordings with known content: a rig and a controller in simulated time, written with the MCAP library's writer.
+"""Recordings with known content: a scripted rig and controller in simulated time, written with the stock MCAP writer.
 
-The simulation and the edge use clocks with different origins, as on two machines. The actions of the controller and
-their times are scripted: a test knows every stage of every loop independently of the code under test.
+Simulation and edge use unrelated clocks, as on two machines. The actions of the controller and their times are
+scripted, so a test knows each stage of each loop independently of the code under test.
 """
 
 from collections import deque
@@ -26,38 +26,38 @@ START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
 EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
 MS = 1_000_000
-REGISTER_UNITS = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""Factors from rad and m to the degrees and mm of the registers."""
+REGISTER_SCALE = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""Conversion from rad and m to the units of the registers, degrees and mm."""
 CONTROLLER = "192.0.2.7:40001"
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
 
 @dataclass(frozen=True)
 class Script:
-    """Parameters of a scripted run; times in ms unless the name has another unit."""
+    """Script of a recorded run; times in ms unless the name has another unit."""
 
     seconds: float = 4.0
     step_ms: float = 20.0
     poll_ms: float = 5.0
-    """Period of the controller; 0: as fast as possible."""
+    """Cycle time of the controller; 0: as fast as possible."""
     delay_ms: float = 0.0
-    """Time of the controller between read and write."""
+    """Computation time of the controller between reading and writing."""
     order: str = "read-compute-write"
-    """Or `write-read`: each cycle writes the torques computed from the read of the previous cycle, reads, and waits."""
+    """Or `write-read`: each cycle writes the result of the previous cycle's read, then reads and waits."""
     network_ms: float = 0.4
-    """One-way delay between controller and edge, in both directions."""
+    """One-way network delay between controller and edge."""
     injected_state_ms: float = 0.0
     injected_command_ms: float = 0.0
     stalls: Mapping[int, float] = field(default_factory=dict)
-    """Stalls of the simulation: step at whose start it stalls, and duration."""
+    """Stalls of the simulation: step at whose start it stalls → duration."""
     edge_stalls: Mapping[float, float] = field(default_factory=dict)
-    """Stalls of the edge: time, s, and duration."""
+    """Stalls of the edge: start time, s → duration."""
     law: str = "wave"
-    """Control law of the torques: a `wave`, or `feedback` of the positions read."""
+    """Control law: a `wave`, or `feedback` from the positions that were read."""
     feedback_delay_polls: int = 0
-    """Age of the positions used by the feedback, in polls."""
+    """Age of the positions that the feedback uses, polls."""
     delayed_ack_ms: float = 0.0
-    """Delay of a request that immediately follows a write, caused by a delayed TCP ACK."""
+    """Delay of a request that directly follows a write, caused by a delayed acknowledgment."""
     lost_transport: int = 0
     lost_recorder: int = 0
     clock_steps: int = 0
@@ -67,7 +67,7 @@ class Script:
 
 
 def position(seconds: float) -> np.ndarray:
-    """Joint positions at a time: rad, rad, m, rad."""
+    """Position of the arm: rad, rad, m, rad."""
     t = seconds
     return np.array([0.9 * np.sin(0.7 * t), 1.1 * np.sin(0.9 * t + 0.5), 0.1 - 0.1 * np.cos(1.3 * t), 0.8 * np.sin(t)])
 
@@ -82,7 +82,7 @@ class TimedMessage:
 
 
 def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[TimedMessage]:
-    """Build the messages of a scripted run, in the order of publication."""
+    """The messages of a scripted run, in the order of publication."""
     random = Random(script.seed)
     step_ns = round(script.step_ms * MS)
     ticks = _ticks(script, step_ns, random)
@@ -148,7 +148,7 @@ class _Write:
     arrives_ns: int
     """Arrival at the simulation."""
     asked_ns: int
-    """Arrival of the preceding read at the edge, edge clock."""
+    """Arrival of the preceding read at the edge, on the clock of the edge."""
 
 
 def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int, int, int]]:
@@ -169,7 +169,7 @@ def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int,
 
 
 def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Random) -> Iterator[_Write]:
-    """Writes of the controller, computed in ns from the start, with timestamps of the edge clock."""
+    """Cycles of the controller; true time in ns from the start, timestamps on the clock of the edge."""
     network_ns, delay_ns = round(script.network_ms * MS), round(script.delay_ms * MS)
     steps = list(ticks)
     at_edge = np.array([ticks[step][0] + random.randrange(200_000, 300_000) for step in steps])
@@ -177,7 +177,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
     free_ns = 0
 
     def edge_free(at_ns: int) -> int:
-        """Time at which the edge processes a request that arrives at `at_ns`: after the end of a stall."""
+        """Time at which the edge processes a request that arrives at `at_ns`: later during a stall."""
         for start_s, stall_ms in script.edge_stalls.items():
             start_ns = round(start_s * 1e9)
             if start_ns <= at_ns < start_ns + stall_ms * MS:
@@ -195,7 +195,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
             asked_ns = max(begin_ns + network_ns, free_ns)
             read_ns = edge_free(asked_ns)
             seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
-            # A read immediately after a write waits for the acknowledgment of the write.
+            # A loop that reads right after writing waits for the acknowledgment of its write.
             write_ns = read_ns + 2 * network_ns + delay_ns + random.randrange(50_000)
         else:
             write_ns = begin_ns + network_ns
@@ -203,7 +203,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
         if seen is not None and seen[0] >= 0:
             seq += 1
             index, served_ns = seen
-            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * REGISTER_UNITS, 2))
+            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * REGISTER_SCALE, 2))
             effort = _effort(script, seen_before, write_ns / 1e9, seq)
             command = TorqueCommand(
                 seq=seq,
@@ -231,12 +231,12 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
 
 def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int) -> np.ndarray:
-    """Torques of the control law: an open-loop wave, or feedback of the positions read some polls earlier."""
+    """Torques of a control law: a wave that does not depend on the arm, or feedback from an earlier poll."""
     if script.law == "wave" or len(seen) < 2 + script.feedback_delay_polls:
         return 3 * np.sin(0.9 * seq / 50 + np.arange(4))
     newest, older = seen[-1 - script.feedback_delay_polls], seen[-2 - script.feedback_delay_polls]
-    wanted = position(seconds) * REGISTER_UNITS
-    return np.array([0.5, 0.4, 0.3, 0.2]) * (wanted - newest) - 0.6 * (newest - older)
+    setpoint = position(seconds) * REGISTER_SCALE
+    return np.array([0.5, 0.4, 0.3, 0.2]) * (setpoint - newest) - 0.6 * (newest - older)
 
 
 def _traffic(writes: list[_Write], rig: str) -> Iterator[TimedMessage]:
@@ -271,10 +271,22 @@ def write(
     arrival_lag_ns: int = 0,
     lab_toml: str = "",
 ) -> Path:
-    """Write messages in the format of the recorder.
+    """Write messages as the recorder does.
 
-    Without `finish` the file is truncated, as after a kill; without `configured` it has no configuration of the rig.
-    `missing` omits messages by topic and sequence; the second half arrives at the recorder `arrival_lag_ns` later.
+    Args:
+        path: the file.
+        made: the messages.
+        script: script of the run, for the metadata.
+        metadata: additional or replaced metadata records.
+        schema_version: version of the message schemas in the metadata.
+        compression: compression of the chunks.
+        session: id of the session.
+        rig: name of the rig.
+        finish: without it the file has no footer, as after a crash of the recorder.
+        configured: without it the file has no configuration and no URDF.
+        missing: sequence numbers of messages that are not written, by topic.
+        arrival_lag_ns: additional arrival delay of the second half of the messages.
+        lab_toml: content of the attached lab file.
     """
     if arrival_lag_ns:
         made = list(made)
@@ -342,7 +354,7 @@ def write(
 
 
 def record(path: Path, script: Script = Script()) -> Path:
-    """Write the recording of a scripted run."""
+    """Generate a scripted run and write it to a file."""
     return write(path, make(script), script=script)
 
 
