@@ -3,10 +3,17 @@
 Recording is complete rather than early: entries are collected as they come and leave together, at most
 `FLUSH_PERIOD_NS` later, on the service's own log topic, where the recorder alone listens. So it costs the control
 path one list entry a message.
+
+A batch has a checksum. A zenoh session that is closed while a peer reads too slowly stops in the middle of a write and
+then writes the rest of its queue: the peer gets the first part of a batch, filled up with bytes of what follows.
 """
 
+import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from typing import Final
+
+from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Publisher
 from hilrig_schemas import LogBatch, OpenSession
@@ -19,6 +26,10 @@ KEPT_MESSAGES: Final = 50_000
 """What a service keeps for a recorder that comes back, where that is more than the shortest while: some 15 MB."""
 SHORTEST_KEPT_S: Final = 10.0
 LONGEST_KEPT_S: Final = 30.0
+
+_CHECKSUM: Final = struct.Struct("<BI")
+_CHECKSUM_TAG: Final = LogBatch.CHECKSUM_FIELD_NUMBER << 3 | 5
+"""Number and wire type (fixed32) of the field `checksum`."""
 
 Entry = tuple[str, int, int, bytes]
 """Key, sequence of the sender on that key, time of publication (ns, wall clock), encoded message."""
@@ -42,6 +53,28 @@ def entries_of(batch: LogBatch) -> Iterable[Entry]:
         ValueError: while it is iterated, that the columns are not equally long.
     """
     return zip(batch.keys, batch.sequences, batch.publish_wall_ns, batch.payloads, strict=True)
+
+
+def encode_batch(batch: LogBatch) -> bytes:
+    """Encode a batch, with its checksum first: what is lost in transport is the end of a batch."""
+    body = batch.SerializeToString()
+    return _CHECKSUM.pack(_CHECKSUM_TAG, zlib.crc32(body)) + body
+
+
+def decode_batch(payload: bytes) -> LogBatch:
+    """Decode a batch.
+
+    Raises:
+        DecodeError: it is no batch, or its bytes are not those that were sent.
+    """
+    batch = LogBatch.FromString(payload)
+    if batch.HasField("checksum"):
+        body = memoryview(payload)[_CHECKSUM.size :]
+        if payload[: _CHECKSUM.size] != _CHECKSUM.pack(_CHECKSUM_TAG, zlib.crc32(body)):
+            raise DecodeError("the checksum of the batch is wrong")
+    if not batch.source:
+        raise DecodeError("the batch has no source")
+    return batch
 
 
 def batches_kept(rigs: int, step_ms: float) -> int:
@@ -102,4 +135,4 @@ class LogStream:
             self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS
             batch.sessions.extend(self._sessions)
             batch.complete_sessions = True
-        self._publisher.put(batch.SerializeToString())
+        self._publisher.put(encode_batch(batch))
