@@ -1,4 +1,4 @@
-# One image a service: `docker build --build-arg PARTS=sim .` (router, sim, edge, recorder, console, or all for every command).
+# One image per service: `docker build --build-arg PARTS=sim .` (router, sim, edge, recorder, console; all: every command).
 ARG PYTHON=3.11.11-slim-bookworm
 
 FROM python:${PYTHON} AS build
@@ -10,7 +10,7 @@ COPY runtime runtime
 COPY services services
 COPY tools tools
 COPY examples examples
-# What installs is not needed to run.
+# The installers are not needed at run time.
 RUN python -m venv /opt/hilrig \
     && /opt/hilrig/bin/pip install --no-cache-dir --constraint constraints.txt ".[${PARTS}]" \
     && /opt/hilrig/bin/pip uninstall --yes setuptools pip
@@ -18,7 +18,7 @@ RUN python -m venv /opt/hilrig \
 FROM python:${PYTHON}
 COPY --from=build /opt/hilrig /opt/hilrig
 ENV PATH=/opt/hilrig/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
-# The recorder writes to /recordings: give the folder that is mounted there to this user, and the certificates too.
+# The recorder writes to /recordings: the folder mounted there, and the certificates, must belong to this user.
 RUN useradd --create-home --uid 10001 hilrig && mkdir /recordings && chown hilrig /recordings
 USER 10001:10001
 STOPSIGNAL SIGTERM

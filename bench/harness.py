@@ -1,7 +1,7 @@
-"""What every benchmark shares: the machine, C programs built on the spot, figures and bars, a table or JSON.
+"""Common functions of the benchmarks: machine description, compilation of C programs, results, thresholds, output.
 
-A benchmark answers one question, compares with a peer in the same run and takes medians of several runs. A *bar* is
-what the project promises, as a ratio wherever it can be one.
+A benchmark answers one question, compares hilrig with a peer in the same run and reports medians of several runs. A
+threshold is the value that a result must reach; it is a ratio wherever possible.
 """
 
 import argparse
@@ -27,6 +27,8 @@ BUILD = HERE / "build"
 
 @dataclass(frozen=True, slots=True)
 class Result:
+    """One measured value."""
+
     case: str
     metric: str
     value: float
@@ -34,7 +36,9 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
-class Bar:
+class Threshold:
+    """A result that was compared with its required bound."""
+
     what: str
     value: float
     bound: str
@@ -43,40 +47,41 @@ class Bar:
 
 @dataclass
 class Report:
-    """What a benchmark found."""
+    """Results, thresholds and notes of one benchmark run."""
 
     question: str
     results: list[Result] = field(default_factory=list)
-    bars: list[Bar] = field(default_factory=list)
+    thresholds: list[Threshold] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def add(self, case: str, metric: str, value: float, unit: str) -> float:
-        """Note one figure; gives it back."""
+        """Add one result and return its value."""
         self.results.append(Result(case, metric, float(value), unit))
         return float(value)
 
-    def bar(self, what: str, value: float, relation: Literal["<=", ">="], bound: float, unit: str = "") -> bool:
-        """Hold a figure against what is promised."""
+    def require(self, what: str, value: float, relation: Literal["<=", ">="], bound: float, unit: str = "") -> bool:
+        """Compare a result with its required bound; return whether the bound holds."""
         holds = value <= bound if relation == "<=" else value >= bound
-        self.bars.append(Bar(what, float(value), f"{relation} {bound:g} {unit}".strip(), bool(holds)))
+        self.thresholds.append(Threshold(what, float(value), f"{relation} {bound:g} {unit}".strip(), bool(holds)))
         return holds
 
-    def say(self, note: str) -> None:
-        """Add a sentence that the figures need, for example what is missing on this machine."""
+    def add_note(self, note: str) -> None:
+        """Add a sentence that explains the results."""
         self.notes.append(note)
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the report as the JSON object that `--json` prints."""
         return {
             "question": self.question,
             "machine": machine(),
             "results": [asdict(result) for result in self.results],
-            "bars": [asdict(bar) for bar in self.bars],
+            "bars": [asdict(threshold) for threshold in self.thresholds],
             "notes": self.notes,
         }
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """Describe the machine on which the benchmark runs."""
     libraries = ("eclipse-zenoh", "pymodbus", "numpy", "mcap", "protobuf", "rerun-sdk")
     return {
         "system": platform.platform(),
@@ -96,26 +101,28 @@ def _processor() -> str:
     return platform.processor()
 
 
-class MissingPartError(Exception):
-    """A system part that the benchmark needs is not on this machine."""
+class MissingDependencyError(Exception):
+    """A program or library that the benchmark needs is not installed."""
 
 
 def build_c(source: str, library: str = "libmodbus") -> Path:
-    """Compile `bench/<source>` against a library, or against none; gives the program.
+    """Compile `bench/<source>`, linked with `library` unless it is empty, and return the path of the program.
 
     Raises:
-        MissingPartError: there is no C compiler or no libmodbus; the message says which package brings it.
+        MissingDependencyError: the C compiler or the library is not installed; the message names the package.
     """
     if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
-        raise MissingPartError("no C compiler: install gcc and pkg-config (Debian's packages of these names)")
+        raise MissingDependencyError("gcc or pkg-config not found: install the packages gcc and pkg-config")
     flags: list[str] = []
     if library:
-        asked = subprocess.run(
+        flags_query = subprocess.run(
             ["pkg-config", "--cflags", "--libs", library], check=False, capture_output=True, text=True
         )
-        if asked.returncode:
-            raise MissingPartError(f"no {library} to build with: install Debian's package {library}-dev")
-        flags = asked.stdout.split()
+        if flags_query.returncode:
+            raise MissingDependencyError(
+                f"the development files of {library} were not found: install the package {library}-dev"
+            )
+        flags = flags_query.stdout.split()
     BUILD.mkdir(exist_ok=True)
     program = BUILD / Path(source).stem
     path = HERE / source
@@ -139,7 +146,7 @@ def build_c(source: str, library: str = "libmodbus") -> Path:
 def write_lab(
     folder: Path, *, rigs: int = 1, step_ms: float = 20.0, session_grace_ms: float = 0.0
 ) -> tuple[LabConfig, Path, int]:
-    """A lab whose ports are free and that records into `folder`: the lab, its file there, its first rig's port."""
+    """Write a lab.toml with free ports that records into `folder`; return the lab, the file and the first port."""
     config = folder / "lab.toml"
     port, bus_port = free_ports(20_000, rigs), free_ports(7447, 8)
     config.write_text(
@@ -149,57 +156,67 @@ def write_lab(
     return load_lab(config), config, port
 
 
+def rigs_text(count: int) -> str:
+    """Return a number of rigs with the noun."""
+    return f"{count} rig{'s' if count != 1 else ''}"
+
+
 def cpu_seconds(pid: int) -> float:
-    """Processor time that a process has used, s."""
+    """Return the CPU time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def percentile(values: Sequence[float], share: float) -> float:
-    """The value below which `share` of `values` lie (nearest rank)."""
+def percentile(values: Sequence[float], fraction: float) -> float:
+    """Return the value below which `fraction` of `values` lie (nearest rank)."""
     ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, round(share * (len(ordered) - 1)))]
+    return ordered[min(len(ordered) - 1, round(fraction * (len(ordered) - 1)))]
 
 
 def progress(text: str) -> None:
-    """Say on standard error what runs now, where somebody watches."""
+    """Print the current activity on standard error if it is a terminal."""
     if sys.stderr.isatty():
         print(f"  {text}", file=sys.stderr, flush=True)
 
 
 @contextmanager
 def services_log(path: Path) -> Iterator[None]:
-    """What processes that are started meanwhile say on standard error goes into a file; what we say does not."""
+    """Redirect the standard error of child processes into a file; this process still writes to the terminal."""
     sys.stderr.flush()
-    ours = os.dup(2)
+    original_fd = os.dup(2)
     before = sys.stderr
-    with path.open("ab") as log, os.fdopen(ours, "w", buffering=1) as said:
+    with path.open("ab") as log, os.fdopen(original_fd, "w", buffering=1) as stream:
         os.dup2(log.fileno(), 2)
-        sys.stderr = said
+        sys.stderr = stream
         try:
             yield
         finally:
             sys.stderr = before
-            os.dup2(ours, 2)
+            os.dup2(original_fd, 2)
 
 
 def run(measure: Callable[[Report, bool], None], question: str) -> int:
-    """Command line of a benchmark: measure, print; exit code 1 when a bar does not hold, 3 when a part is missing."""
+    """Run a benchmark as a command: measure and print.
+
+    Exit code 1: a threshold does not hold; 3: a dependency is missing.
+    """
     parser = argparse.ArgumentParser(description=question)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs: for trying out, not for figures")
+    parser.add_argument("--json", action="store_true", help="print one JSON object only")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer and shorter runs: a test of the benchmark, not for results"
+    )
     arguments = parser.parse_args()
     report = Report(question)
     try:
         measure(report, arguments.quick)
-    except MissingPartError as error:
-        print(f"can't measure here: {error}", file=sys.stderr)
+    except MissingDependencyError as error:
+        print(f"the benchmark can't run: {error}", file=sys.stderr)
         return 3
     if arguments.json:
         print(json.dumps(report.as_dict(), indent=1))
     else:
         _print_table(report)
-    return 0 if all(bar.holds for bar in report.bars) else 1
+    return 0 if all(threshold.holds for threshold in report.thresholds) else 1
 
 
 def _print_table(report: Report) -> None:
@@ -214,9 +231,10 @@ def _print_table(report: Report) -> None:
     for result in report.results:
         table.add_row(result.case, result.metric, f"{result.value:,.4g}", result.unit)
     console.print(table)
-    bars = Table("promise", "measured", "bound", "holds")
-    for bar in report.bars:
-        bars.add_row(bar.what, f"{bar.value:,.4g}", bar.bound, "yes" if bar.holds else "[red]no[/red]")
-    console.print(bars)
+    table = Table("threshold", "measured", "bound", "holds")
+    for threshold in report.thresholds:
+        holds = "yes" if threshold.holds else "[red]no[/red]"
+        table.add_row(threshold.what, f"{threshold.value:,.4g}", threshold.bound, holds)
+    console.print(table)
     for note in report.notes:
         console.print(note)

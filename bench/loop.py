@@ -1,13 +1,13 @@
-"""How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?
+"""Measures the loop latency and the time that the rig adds to a bare zenoh and a bare Modbus round trip.
 
-A C controller on libmodbus polls as fast as it can against the whole lab (simulation, edge and recorder as
-processes, as `hilrig up` starts them), at steps of 20, 5 and 1 ms. In the same run, on the same machine: a message
-that goes from one Python process to another over zenoh and back, and the same C controller against the least Modbus
-server that libmodbus makes. Latency is what `hilrig latency` finds in the recording; what is promised is held
-against the samples near which the host of a virtual machine took nothing away.
+A C controller on libmodbus polls without pauses against a complete lab (simulation, edge and recorder as processes, as
+`hilrig up` starts them) at steps of 20, 5 and 1 ms. The peers are measured in the same run on the same machine: a
+message from one Python process to another over zenoh and back, and the same C controller against a minimal libmodbus
+server. The latency is computed from the recording as `hilrig latency` does. Thresholds are checked on the samples
+without CPU steal nearby.
 
-What recording costs is measured in one lab that runs on while its recorder comes and goes, in turns. Latency is then
-what the states themselves say, as a witness on the bus hears them.
+The cost of recording is measured in one lab that keeps running while a recorder is started and stopped in turn. There
+the latency is taken from the states that a subscriber receives from the bus.
 """
 
 import json
@@ -27,11 +27,11 @@ import harness
 import numpy as np
 from harness import Report, build_c, cpu_seconds, percentile, progress, write_lab
 from numpy.typing import NDArray
-from stolen import StolenTime
+from steal import StealMonitor
 
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_cli.local.supervisor import WHOLE_LAB, Supervisor
+from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, Supervisor
 from hilrig_replay.analysis import latency
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
@@ -39,24 +39,25 @@ from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas import JointState
 from hilrig_schemas.topics import STATE, Traffic, alive_key
 
-QUESTION = "How long is the loop, and what does the rig add to a bare zenoh and a bare Modbus round trip?"
+QUESTION = "How large is the loop latency, and what does the rig add to a bare zenoh and a bare Modbus round trip?"
 RUN_S = {20.0: 20.0, 5.0: 12.0, 1.0: 12.0}
-"""How long a run takes at each step, ms: a thousand samples or more."""
+"""Duration of a run, s, by the step, ms: at least a thousand samples."""
 WINDOW_S = {20.0: 7.0, 5.0: 5.0}
-"""How long each turn with or without a recorder takes."""
-ENOUGH = {20.0: 2_000, 5.0: 4_000, 1.0: 10_000}
-"""Samples with no stolen time near, after which no further run is made."""
-FEW, TURNS = 100, 4
-"""Such samples of a turn with or without a recorder, and how often it is made again where there are fewer."""
-PROMISED = {
+"""Duration of a measurement with or without a recorder, s, by the step, ms."""
+MIN_UNDISTURBED_SAMPLES = {20.0: 2_000, 5.0: 4_000, 1.0: 10_000}
+"""Undisturbed samples after which no further run is started, by the step, ms."""
+MIN_WINDOW_SAMPLES, MAX_WINDOW_TRIES = 100, 4
+"""Undisturbed samples that a measurement with or without a recorder needs, and how often it is tried."""
+LOOP_THRESHOLDS_STEPS = {
     20.0: {"p50": 1.005, "p99.9": 1.05},
     5.0: {"p99.9": 1.2},
     1.0: {"p50": 1.05, "p99": 2.0},
 }
-"""Most that the loop may take at each step, in steps, where nothing is taken away."""
+"""Largest loop latency without CPU steal nearby, in steps, by the step, ms."""
 
 
 def measure(report: Report, quick: bool) -> None:
+    """Measure the peers, the loop and the cost of recording."""
     client = build_c("loop_client.c")
     echo = build_c("modbus_echo_server.c")
     runs = 1 if quick else 3
@@ -71,74 +72,79 @@ def measure(report: Report, quick: bool) -> None:
     report.add("bare zenoh, 50 Hz", "round trip p99", zenoh_p99, "µs")
 
     for step_ms, seconds in RUN_S.items():
-        made: list[RigRun] = []
-        while len(made) < runs or (
-            len(made) < 2 * runs and sum(int(run.counts.sum()) for run in made) < ENOUGH[step_ms] and not quick
+        done: list[RigRun] = []
+        while len(done) < runs or (
+            not quick
+            and len(done) < 2 * runs
+            and sum(int(run.undisturbed.sum()) for run in done) < MIN_UNDISTURBED_SAMPLES[step_ms]
         ):
-            progress(f"the rig at a step of {step_ms:g} ms, run {len(made) + 1}")
-            made.append(rig_run(client, step_ms, 5.0 if quick else seconds))
-        add_loop(report, step_ms, made)
+            progress(f"the rig at a step of {step_ms:g} ms, run {len(done) + 1}")
+            done.append(rig_run(client, step_ms, 5.0 if quick else seconds))
+        add_loop(report, step_ms, done)
         if step_ms == 20:
-            ours = statistics.median(run.figures["read_us"]["p50"] for run in made)
-            report.add("rig, 20 ms", "Modbus read p50", ours, "µs")
-            report.add("rig, 20 ms", "Modbus read against bare Modbus", ours / read_p50, "ratio")
+            rig_read_p50 = statistics.median(run.figures["read_us"]["p50"] for run in done)
+            report.add("rig, 20 ms", "Modbus read p50", rig_read_p50, "µs")
+            report.add("rig, 20 ms", "Modbus read p50, ratio to bare Modbus", rig_read_p50 / read_p50, "ratio")
     for step_ms, seconds in WINDOW_S.items():
         progress(f"with and without a recorder, at a step of {step_ms:g} ms")
-        add_cost_of_recording(report, step_ms, recorder_comes_and_goes(client, step_ms, 1 if quick else 4, seconds))
+        add_recording_cost(report, step_ms, alternate_recorder(client, step_ms, 1 if quick else 4, seconds))
 
 
 @dataclass(frozen=True, slots=True)
 class RigRun:
-    """One session of the controller with the whole lab."""
+    """One session of the controller with a complete lab."""
 
     samples: NDArray[np.void]
-    """As `hilrig latency` finds them in the recording; ns."""
-    counts: NDArray[np.bool_]
-    """Of each sample, whether nothing was stolen near it."""
+    """Samples as `hilrig latency` computes them from the recording, ns."""
+    undisturbed: NDArray[np.bool_]
+    """Whether there was no CPU steal near the sample, one value per sample."""
     lost: int
     figures: dict[str, Any]
-    """The controller's own."""
-    stolen: float
-    """CPU steal time, processors."""
+    """Round-trip times that the controller measured."""
+    steal: float
+    """CPU steal, CPUs."""
     edge_us: float
-    """Processor time of the edge for one cycle of the controller, µs."""
+    """CPU time of the edge per controller cycle, µs."""
 
 
 def rig_run(client: Path, step_ms: float, seconds: float) -> RigRun:
+    """Run the controller against a lab of one rig."""
     with tempfile.TemporaryDirectory() as folder:
         lab, config, port = write_lab(Path(folder), step_ms=step_ms)
-        with running_lab(lab, config, say, threading.Event()) as supervisor, StolenTime() as stolen:
+        with running_lab(lab, config, log, threading.Event()) as supervisor, StealMonitor() as steal:
             before_s = cpu_seconds(supervisor.pids["edge"])
             figures = run_client(client, port, seconds)
             edge_s = cpu_seconds(supervisor.pids["edge"]) - before_s
         (recording,) = Path(folder).rglob("*.mcap")
         found = latency.measure(open_run(recording))
-    counts = stolen.undisturbed(found.table["wall_ns"])
+    undisturbed = steal.undisturbed(found.table["wall_ns"])
     edge_us = 1e6 * edge_s / (figures["cycles_per_s"] * seconds)
-    return RigRun(found.table, counts, found.lost.transport + found.lost.recorder, figures, stolen.share, edge_us)
+    return RigRun(
+        found.table, undisturbed, found.lost.transport + found.lost.recorder, figures, steal.mean_cpus, edge_us
+    )
 
 
 def add_loop(report: Report, step_ms: float, runs: list[RigRun]) -> None:
-    """Figures of all samples, and of those that count: a virtual machine's host takes processors away as it likes."""
+    """Add the latencies of all samples and of those without CPU steal nearby, and check the thresholds."""
     case = f"rig, {step_ms:g} ms"
     samples = np.concatenate([run.samples for run in runs])
-    counts = np.concatenate([run.counts for run in runs])
+    undisturbed = np.concatenate([run.undisturbed for run in runs])
     report.add(case, "runs", len(runs), "count")
     report.add(case, "samples", len(samples), "count")
-    report.add(case, "taken away by the host", statistics.mean(run.stolen for run in runs), "processors")
-    report.add(case, "samples with nothing taken near", 100 * float(counts.mean()), "%")
+    report.add(case, "CPU steal", statistics.mean(run.steal for run in runs), "CPUs")
+    report.add(case, "samples without CPU steal nearby", 100 * float(undisturbed.mean()), "%")
     loop: dict[str, float] = {}
-    for which, of in (("all samples", samples), ("nothing taken near", samples[counts])):
+    for selection, selected in (("all samples", samples), ("samples without CPU steal nearby", samples[undisturbed])):
         for name, quantile in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999), ("max", 1.0)):
-            loop[name] = float(np.quantile(of["loop"], quantile)) / 1e6 if len(of) else float("nan")
-            report.add(case, f"loop {name}, {which}", loop[name], "ms")
+            loop[name] = float(np.quantile(selected["loop"], quantile)) / 1e6 if len(selected) else float("nan")
+            report.add(case, f"loop {name}, {selection}", loop[name], "ms")
     for stage in latency.STAGES:
         report.add(case, f"stage {stage} p50", float(np.median(samples[stage])) / 1e6, "ms")
     report.add(case, "lost", max(run.lost for run in runs), "count")
     report.add(case, "Modbus cycles", statistics.median(run.figures["cycles_per_s"] for run in runs), "1/s")
-    report.add(case, "edge, processor time a cycle", statistics.median(run.edge_us for run in runs), "µs")
-    for name, bound in PROMISED[step_ms].items():
-        report.bar(f"{step_ms:g} ms step: loop {name} in steps", loop[name] / step_ms, "<=", bound)
+    report.add(case, "edge: CPU time per cycle", statistics.median(run.edge_us for run in runs), "µs")
+    for name, bound in LOOP_THRESHOLDS_STEPS[step_ms].items():
+        report.require(f"{step_ms:g} ms step: loop {name} in steps", loop[name] / step_ms, "<=", bound)
 
 
 def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
@@ -147,58 +153,58 @@ def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A turn of the controller."""
+    """One measurement with or without a recorder."""
 
     loop_ms: list[float]
-    """Loop latency of each command that took effect with no stolen time near; of all, if it was near nearly all."""
+    """Loop latency of the commands without CPU steal nearby; of all commands if too few are left."""
     cycles_per_s: float
-    stolen: float
-    """Taken away by the host, processors."""
+    steal: float
+    """CPU steal, CPUs."""
 
 
-def recorder_comes_and_goes(client: Path, step_ms: float, pairs: int, seconds: float) -> list[tuple[Window, Window]]:
-    """Turns without and with a recorder, in pairs, in one lab that runs on."""
+def alternate_recorder(client: Path, step_ms: float, pairs: int, seconds: float) -> list[tuple[Window, Window]]:
+    """Measure pairs without and with a recorder, in one lab that keeps running."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         lab, config, port = write_lab(Path(folder), step_ms=step_ms)
-        others = tuple(part for part in WHOLE_LAB if part.service != "recorder")
-        recorder = tuple(part for part in WHOLE_LAB if part.service == "recorder")
+        others = tuple(spec for spec in DEFAULT_PROCESSES if spec.service != "recorder")
+        recorder = tuple(spec for spec in DEFAULT_PROCESSES if spec.service == "recorder")
         with (
-            running_lab(lab, config, say, threading.Event(), others),
+            running_lab(lab, config, log, threading.Event(), others),
             ZenohBus(lab.bus, "tool") as bus,
         ):
-            heard: list[bytes] = []
-            bus.subscribe(STATE.key(lab.name, lab.rigs[0].name), lambda _, payload: heard.append(payload))
+            received: list[bytes] = []
+            bus.subscribe(STATE.key(lab.name, lab.rigs[0].name), lambda _, payload: received.append(payload))
 
-            def turn() -> Window:
-                for _ in range(TURNS):
-                    heard.clear()
-                    with StolenTime() as stolen:
+            def measure_window() -> Window:
+                for _ in range(MAX_WINDOW_TRIES):
+                    received.clear()
+                    with StealMonitor() as steal:
                         figures = run_client(client, port, seconds)
-                    states = [state for state in map(JointState.FromString, heard.copy()) if state.basis_step]
+                    states = [state for state in map(JointState.FromString, received.copy()) if state.basis_step]
                     loop_ms = np.array([state.loop_latency_ns / 1e6 for state in states])
-                    counts = stolen.undisturbed([state.wall_ns for state in states])
-                    if counts.sum() >= FEW:
-                        loop_ms = loop_ms[counts]
+                    undisturbed = steal.undisturbed([state.wall_ns for state in states])
+                    if undisturbed.sum() >= MIN_WINDOW_SAMPLES:
+                        loop_ms = loop_ms[undisturbed]
                         break
-                return Window(loop_ms.tolist(), figures["cycles_per_s"], stolen.share)
+                return Window(loop_ms.tolist(), figures["cycles_per_s"], steal.mean_cpus)
 
             for pair in range(pairs):
-                without = turn() if pair % 2 == 0 else None
-                with Supervisor(config, say, recorder) as supervisor:
+                without = measure_window() if pair % 2 == 0 else None
+                with Supervisor(config, log, recorder) as supervisor:
                     supervisor.start()
-                    while not bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.5):
+                    while not bus.get_liveliness(alive_key(lab.name, "recorder", "*"), timeout_s=0.5):
                         supervisor.poll()
-                    # What it missed before it came it has fetched by then.
+                    # After this time the recorder has recovered the messages published before its start.
                     time.sleep(1.0)
-                    recorded = turn()
-                found.append((without or turn(), recorded))
+                    recorded = measure_window()
+                found.append((without or measure_window(), recorded))
     return found
 
 
-def add_cost_of_recording(report: Report, step_ms: float, pairs: list[tuple[Window, Window]]) -> None:
+def add_recording_cost(report: Report, step_ms: float, pairs: list[tuple[Window, Window]]) -> None:
     case = f"recorder off and on, {step_ms:g} ms"
-    report.add(case, "pairs of turns", len(pairs), "count")
+    report.add(case, "pairs of measurements", len(pairs), "count")
     for number, name in enumerate(("off", "on")):
         windows = [pair[number] for pair in pairs]
         pooled = [latency for window in windows for latency in window.loop_ms]
@@ -206,21 +212,21 @@ def add_cost_of_recording(report: Report, step_ms: float, pairs: list[tuple[Wind
         report.add(case, f"loop p50, {name}", percentile(pooled, 0.5), "ms")
         report.add(case, f"loop p99, {name}", percentile(pooled, 0.99), "ms")
         report.add(case, f"Modbus cycles, {name}", statistics.median(window.cycles_per_s for window in windows), "1/s")
-        report.add(
-            case, f"taken away by the host, {name}", statistics.mean(one.stolen for one in windows), "processors"
-        )
+        report.add(case, f"CPU steal, {name}", statistics.mean(window.steal for window in windows), "CPUs")
     cycles = statistics.median(on.cycles_per_s / off.cycles_per_s for off, on in pairs)
-    report.add(case, "Modbus cycles, on over off, median of pairs", cycles, "ratio")
-    # Of each pair, as the two are neighbours in time: what else the machine does is the same then.
+    report.add(case, "Modbus cycles, ratio of on to off, median of pairs", cycles, "ratio")
+    # The ratio of each pair: the other load of the machine is similar at neighboring times.
     ratio = statistics.median(percentile(on.loop_ms, 0.99) / percentile(off.loop_ms, 0.99) for off, on in pairs)
-    report.bar(f"{step_ms:g} ms step: loop p99 with a recorder over without", ratio, "<=", 1.1)
+    report.require(f"{step_ms:g} ms step: loop p99, ratio of with to without a recorder", ratio, "<=", 1.1)
 
 
-def say(line: str) -> None:
+def log(line: str) -> None:
+    """Print a line of the supervisor on standard error."""
     print(line, file=sys.stderr)
 
 
 def run_client(client: Path, port: int, seconds: float) -> dict[str, Any]:
+    """Run the C controller and return its figures."""
     command = [str(client), "127.0.0.1", str(port), str(seconds), "0"]
     output = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=seconds + 30).stdout
     figures: dict[str, Any] = json.loads(output)
@@ -228,6 +234,7 @@ def run_client(client: Path, port: int, seconds: float) -> dict[str, Any]:
 
 
 def modbus_round_trip(client: Path, server: Path, seconds: float) -> dict[str, Any]:
+    """Run the C controller against the minimal server and return its figures."""
     port = free_ports(5920)
     with subprocess.Popen([str(server), str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -239,13 +246,13 @@ def modbus_round_trip(client: Path, server: Path, seconds: float) -> dict[str, A
 
 
 def zenoh_round_trip(rounds: int) -> tuple[float, float]:
-    """p50 and p99 of a message to another process and back over zenoh, sent every 20 ms, µs."""
+    """Return p50 and p99 of the round trip of a message over zenoh to another process, sent every 20 ms, µs."""
     config = BusConfig(first_port=free_ports(7547, 3))
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=echo_over_zenoh, args=(config, theirs), daemon=True)
+    here, there = context.Pipe()
+    process = context.Process(target=echo_over_zenoh, args=(config, there), daemon=True)
     process.start()
-    ours.recv()
+    here.recv()
     times_us = []
     with ZenohBus(config, "edge") as bus:
         back = threading.Event()
@@ -263,12 +270,13 @@ def zenoh_round_trip(rounds: int) -> tuple[float, float]:
             ping.put(payload)
             if back.wait(1.0):
                 times_us.append((time.perf_counter_ns() - begin) / 1e3)
-    ours.send(None)
+    here.send(None)
     process.join(10)
     return percentile(times_us, 0.5), percentile(times_us, 0.99)
 
 
 def echo_over_zenoh(config: BusConfig, until: multiprocessing.connection.Connection) -> None:
+    """Send each message back until the other end of the pipe sends an object."""
     with ZenohBus(config, "sim") as bus:
         pong = bus.publisher(STATE.key("bench", "pong"), Traffic.CONTROL)
         bus.subscribe(STATE.key("bench", "ping"), lambda _, payload: pong.put(payload))

@@ -1,7 +1,7 @@
-/* A controller on libmodbus that polls as fast as it can, or at a period: reads the four positions, computes a PD
- * law with gravity compensation, writes the four torques. Prints one JSON object with its own round-trip times.
+/* A controller on libmodbus that polls without pauses or with a period: it reads the four positions, computes a PD law
+ * with gravity compensation and writes the four torques. Prints one JSON object with its round-trip times.
  *
- * usage: loop_client HOST PORT SECONDS PERIOD_MS        (PERIOD_MS 0: as fast as it can)
+ * usage: loop_client HOST PORT SECONDS PERIOD_MS        (PERIOD_MS 0: without pauses)
  */
 #include <errno.h>
 #include <modbus.h>
@@ -58,7 +58,7 @@ int main(int argc, char **argv)
         int64_t t0 = now_ns();
         if (modbus_read_registers(bus, 4, 4, position) != 4) goto failed;
         int64_t t1 = now_ns();
-        /* A soft hold around the start pose; the quill's weight is 0.5 kg. The low bit makes each write differ. */
+        /* Soft position control at the start pose; the quill has a mass of 0.5 kg. The low bit makes writes differ. */
         torque[0] = limit(-0.02 * (int16_t)position[0] / 100.0 * 1000);
         torque[1] = limit(-0.01 * (int16_t)position[1] / 100.0 * 1000);
         torque[2] = limit((-4.905 + 0.05 * (50.0 - (int16_t)position[2] / 100.0)) * 1000);

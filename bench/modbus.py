@@ -1,12 +1,12 @@
-"""How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?
+"""Measures how fast the Modbus edge responds, compared with pymodbus's server and a libmodbus server in C.
 
-A client in C reads 4 positions and writes 4 torques, again and again, on 1, 2 and 16 connections. Ours is measured
-twice: the protocol alone (each write takes the lease, feeds the watchdog and is encoded, but goes nowhere), and the
-whole edge, with every write published on the bus to a subscriber, and recorded. Each connection has a rig of its own,
-for a rig has one writer. And the C server once more, while two other processes do with the bus what the simulation and
-the edge do: where there are two cores, all of it takes one from a request or the controller, whoever answers. Then
-both servers asked equally often, at rates that controllers have: 20, 10 and 5 ms from one cycle to the next. Last, what
-an idle edge costs, one at 50 Hz, and 10,000 connections one after the other.
+A client in C reads 4 positions and writes 4 torques repeatedly on 1, 2 and 16 connections. The edge is measured twice:
+protocol only (each write acquires the lease, feeds the watchdog and is encoded, but isn't published), and the full
+stack, where each write is published on the bus to a subscriber and recorded. Each connection has its own rig, because a
+rig has one writer. The C server is also measured while two other processes produce the bus load of a simulation and an
+edge: on a machine with two cores this load delays any server. Then both servers are polled at the same rates, with
+cycle periods of 20, 10 and 5 ms. Finally the CPU load and memory of an idle edge and of one at 50 Hz are measured, and
+the memory growth over 10,000 consecutive connections.
 """
 
 import json
@@ -26,105 +26,108 @@ import harness
 import numpy as np
 from harness import Report, build_c, cpu_seconds, progress
 from modbus_servers import (
-    NowhereBus,
+    DiscardingBus,
     lab_of,
-    serve_alone,
-    serve_stock,
-    serve_whole,
+    serve_full_stack,
+    serve_protocol_only,
+    serve_pymodbus,
     serving,
     serving_c,
-    serving_c_beside_the_bus,
+    serving_c_with_bus_load,
 )
 from numpy.typing import NDArray
-from stolen import StolenTime
+from steal import StealMonitor
 
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.server.admission import Limits
-from hilrig_modbus_edge.server.listener import Connection as ModbusConnection
+from hilrig_modbus_edge.server.connection import Connection as ModbusConnection
 from hilrig_modbus_edge.server.listener import RigServer
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import JointState, topics
 
-QUESTION = "How fast does the edge answer, next to pymodbus's own server and to a C server on libmodbus?"
+QUESTION = "How fast does the Modbus edge respond, compared with pymodbus's server and a libmodbus server in C?"
 CONNECTIONS = (1, 2, 16)
 RATES = (50, 100, 200)
-"""Cycles a second of a controller: PLCs poll every 10 to 20 ms where they are tuned, every 5 where they are fast."""
-MOST_TRIES = 2
-NEXT_TO_NOTHING = 0.01
-"""Taken away by the host, processors: a hundredth of the time of one is the slowest hundredth of the requests."""
-STOCK, C_SERVER, ALONE, WHOLE = "pymodbus's server", "libmodbus server in C", "ours, protocol alone", "ours, whole"
-C_BESIDE = "libmodbus server in C, the bus beside it"
+"""Cycles per second of a controller: tuned PLCs poll every 10 to 20 ms, fast ones every 5 ms."""
+MAX_TRIES = 2
+NEGLIGIBLE_STEAL_CPUS = 0.01
+"""Largest CPU steal of a run that is not repeated, CPUs: 1 % of one CPU delays at most 1 % of the requests."""
+PYMODBUS = "pymodbus server"
+LIBMODBUS = "libmodbus server in C"
+LIBMODBUS_WITH_BUS_LOAD = "libmodbus server in C, with bus load"
+PROTOCOL_ONLY = "hilrig edge, protocol only"
+FULL_STACK = "hilrig edge, full stack"
 
 Figures = dict[str, Any]
 
 
 def measure(report: Report, quick: bool) -> None:
+    """Measure all servers without pauses, at equal rates, and the resources of the edge."""
     client, c_server = build_c("modbus_client.c"), build_c("modbus_server.c")
     runs, seconds = (1, 1.0) if quick else (3, 3.0)
     servers: dict[str, Callable[[int], Any]] = {
-        STOCK: lambda connections: serving(serve_stock, connections),
-        C_SERVER: lambda _: serving_c(c_server),
-        ALONE: lambda connections: serving(serve_alone, connections),
-        WHOLE: lambda connections: serving(serve_whole, connections),
-        C_BESIDE: lambda _: serving_c_beside_the_bus(c_server),
+        PYMODBUS: lambda connections: serving(serve_pymodbus, connections),
+        LIBMODBUS: lambda _: serving_c(c_server),
+        PROTOCOL_ONLY: lambda connections: serving(serve_protocol_only, connections),
+        FULL_STACK: lambda connections: serving(serve_full_stack, connections),
+        LIBMODBUS_WITH_BUS_LOAD: lambda _: serving_c_with_bus_load(c_server),
     }
     measured: dict[tuple[str, int], list[Figures]] = {}
     for number in range(runs):
-        # The servers take turns, so that a slow moment of the machine does not fall on one of them.
+        # The servers are measured in turn, so that a slow phase of the machine affects all of them.
         for connections in CONNECTIONS:
             for name, start in servers.items():
-                if name == C_BESIDE and connections != 2:
+                if name == LIBMODBUS_WITH_BUS_LOAD and connections != 2:
                     continue
                 progress(f"{name}, {connections} connections, run {number + 1} of {runs}")
-                figures = least_disturbed(partial(one_run, start, client, connections, seconds))
+                figures = run_with_least_steal(partial(run_once, start, client, connections, seconds))
                 measured.setdefault((name, connections), []).append(figures)
     for (name, connections), figures in measured.items():
         case = f"{name}, {connections} connection{'s' if connections > 1 else ''}"
-        report.add(case, "cycles", middle(figures, "cycles_per_s"), "1/s")
-        report.add(case, "read p50", middle(figures, "read_us", "p50"), "µs")
-        report.add(case, "read p99", middle(figures, "read_us", "p99"), "µs")
-        report.add(case, "processor time a cycle", middle(figures, "cpu_us"), "µs")
-        report.add(case, "taken away by the host", middle(figures, "stolen"), "processors")
-    cpu = {name: middle(measured[name, 2], "cpu_us") for name in servers}
-    report.bar(
-        "processor time a cycle, protocol alone against libmodbus, 2 connections", cpu[ALONE] / cpu[C_SERVER], "<=", 1.7
-    )
-    report.bar(
-        "processor time a cycle, protocol alone against pymodbus, 2 connections", cpu[ALONE] / cpu[STOCK], "<=", 0.4
-    )
-    beside = middle(measured[WHOLE, 2], "read_us", "p99") / middle(measured[C_BESIDE, 2], "read_us", "p99")
-    report.add(f"{WHOLE}, 2 connections", "read p99 against libmodbus, the bus beside it", beside, "ratio")
+        report.add(case, "cycles", median_of(figures, "cycles_per_s"), "1/s")
+        report.add(case, "read p50", median_of(figures, "read_us", "p50"), "µs")
+        report.add(case, "read p99", median_of(figures, "read_us", "p99"), "µs")
+        report.add(case, "CPU time per cycle", median_of(figures, "cpu_us"), "µs")
+        report.add(case, "CPU steal", median_of(figures, "steal"), "CPUs")
+    cpu = {name: median_of(measured[name, 2], "cpu_us") for name in servers}
+    for peer, name, bound in ((LIBMODBUS, "libmodbus", 1.7), (PYMODBUS, "pymodbus", 0.4)):
+        ratio = cpu[PROTOCOL_ONLY] / cpu[peer]
+        report.require(f"CPU time per cycle, protocol only, ratio to {name}, 2 connections", ratio, "<=", bound)
+    read_p99 = {name: median_of(measured[name, 2], "read_us", "p99") for name in servers}
+    ratio = read_p99[FULL_STACK] / read_p99[LIBMODBUS_WITH_BUS_LOAD]
+    report.add(f"{FULL_STACK}, 2 connections", "read p99, ratio to libmodbus with bus load", ratio, "ratio")
     measure_at_equal_rates(report, client, servers, quick)
-    measure_own_code(report, middle(measured[ALONE, 2], "cpu_us"), middle(measured[WHOLE, 2], "cpu_us"))
+    add_breakdown(report, cpu[PROTOCOL_ONLY], cpu[FULL_STACK])
     measure_resources(report, client, quick)
 
 
-def one_run(start: Callable[[int], Any], client: Path, connections: int, seconds: float) -> Figures:
-    with start(connections) as (port, step, pid), StolenTime() as stolen:
+def run_once(start: Callable[[int], Any], client: Path, connections: int, seconds: float) -> Figures:
+    """Run the client against one server; return its figures with CPU time per cycle and CPU steal."""
+    with start(connections) as (port, step, pid), StealMonitor() as steal:
         before = cpu_seconds(pid)
-        figures = ask(client, port, step, connections, seconds)
+        figures = run_modbus_client(client, port, step, connections, seconds)
         used = cpu_seconds(pid) - before
     figures["cpu_us"] = 1e6 * used / (figures["cycles_per_s"] * seconds)
-    figures["stolen"] = stolen.share
+    figures["steal"] = steal.mean_cpus
     return figures
 
 
-def least_disturbed(run: Callable[[], Figures]) -> Figures:
-    """Of some runs the one in which the host took least; the first in which it took next to nothing is enough."""
+def run_with_least_steal(run: Callable[[], Figures]) -> Figures:
+    """Repeat a run until its CPU steal is negligible, at most `MAX_TRIES` times; return the run with least steal."""
     tries = []
-    for _ in range(MOST_TRIES):
+    for _ in range(MAX_TRIES):
         tries.append(run())
-        if tries[-1]["stolen"] <= NEXT_TO_NOTHING:
+        if tries[-1]["steal"] <= NEGLIGIBLE_STEAL_CPUS:
             break
-    return min(tries, key=lambda figures: float(figures["stolen"]))
+    return min(tries, key=lambda figures: float(figures["steal"]))
 
 
 def measure_at_equal_rates(report: Report, client: Path, servers: dict[str, Callable[[int], Any]], quick: bool) -> None:
-    """What a controller sees that asks at a rate of its own, the same of both servers.
+    """Measure the read times of controllers that poll both servers at the same rates.
 
-    Of so few reads one that the host held up is soon the slowest hundredth: those with stolen time near do not count.
+    There are few reads, so a single one delayed by CPU steal changes p99: only reads without CPU steal nearby count.
     """
     runs, seconds = (1, 2.0) if quick else (6, 4.0)
     reads: dict[tuple[str, int], list[NDArray[np.float64]]] = {}
@@ -132,96 +135,97 @@ def measure_at_equal_rates(report: Report, client: Path, servers: dict[str, Call
         samples = Path(folder) / "samples"
         for number in range(runs):
             for rate in RATES:
-                for name in (C_SERVER, WHOLE):
+                for name in (LIBMODBUS, FULL_STACK):
                     progress(f"{name}, 2 connections at {rate} Hz, run {number + 1} of {runs}")
-                    with servers[name](2) as (port, step, _), StolenTime() as stolen:
-                        ask(client, port, step, 2, seconds, rate, samples)
-                    over_wall_ns, read_ns = np.fromfile(samples, np.int64).reshape(-1, 2).T
-                    counting = read_ns[stolen.undisturbed(over_wall_ns)] * 1e-3
-                    reads.setdefault((name, rate), []).append(counting)
+                    with servers[name](2) as (port, step, _), StealMonitor() as steal:
+                        run_modbus_client(client, port, step, 2, seconds, rate, samples)
+                    end_wall_ns, read_ns = np.fromfile(samples, np.int64).reshape(-1, 2).T
+                    undisturbed = read_ns[steal.undisturbed(end_wall_ns)] * 1e-3
+                    reads.setdefault((name, rate), []).append(undisturbed)
     p99: dict[tuple[str, int], float] = {}
     for (name, rate), parts in reads.items():
         case = f"{name}, 2 connections at {rate} Hz"
-        counting = np.concatenate(parts)
-        report.add(case, "reads with no stolen time near", len(counting), "count")
-        if len(counting):
-            p50_us, p99_us = np.quantile(counting, (0.5, 0.99))
+        undisturbed = np.concatenate(parts)
+        report.add(case, "reads without CPU steal nearby", len(undisturbed), "count")
+        if len(undisturbed):
+            p50_us, p99_us = np.quantile(undisturbed, (0.5, 0.99))
             report.add(case, "read p50", float(p50_us), "µs")
             report.add(case, "read p99", float(p99_us), "µs")
             p99[name, rate] = float(p99_us)
     for rate in RATES:
         nan = float("nan")
-        added_ms = (p99.get((WHOLE, rate), nan) - p99.get((C_SERVER, rate), nan)) / 1e3
-        report.bar(
-            f"p99 of a read beyond libmodbus's, whole edge, 2 connections at {rate} Hz", added_ms, "<=", 0.3, "ms"
-        )
+        added_ms = (p99.get((FULL_STACK, rate), nan) - p99.get((LIBMODBUS, rate), nan)) / 1e3
+        report.require(f"read p99, full stack minus libmodbus, 2 connections at {rate} Hz", added_ms, "<=", 0.3, "ms")
 
 
-def measure_own_code(report: Report, alone_us: float, whole_us: float) -> None:
-    """Where the time of a cycle goes: our own code, measured without sockets, and what is left of the whole."""
-    progress("our own code")
-    read_us, write_us = own_code_us(READ), own_code_us(WRITE)
-    report.add("where it goes: our code", "a read", read_us, "µs")
-    report.add("where it goes: our code", "a write, encoded", write_us, "µs")
-    report.add("where it goes: asyncio and the kernel", "a cycle", alone_us - read_us - write_us, "µs")
-    report.add("where it goes: publishing and recording", "a cycle", whole_us - alone_us, "µs")
+def add_breakdown(report: Report, protocol_us: float, full_us: float) -> None:
+    """Split the CPU time of a cycle: hilrig's protocol code, measured without sockets, and the remainder."""
+    progress("protocol code")
+    read_us, write_us = protocol_code_us(READ), protocol_code_us(WRITE)
+    report.add("CPU time of protocol code", "one read", read_us, "µs")
+    report.add("CPU time of protocol code", "one write, encoded", write_us, "µs")
+    report.add("CPU time of asyncio and the kernel", "one cycle", protocol_us - read_us - write_us, "µs")
+    report.add("CPU time of publishing and recording", "one cycle", full_us - protocol_us, "µs")
 
 
 READ = bytes.fromhex("0001 0000 0006 01 03 0004 0004")
 WRITE = bytes.fromhex("0002 0000 000f 01 10 0000 0004 08 0001 0002 0003 0004")
 
 
-def own_code_us(frame: bytes, times: int = 30_000) -> float:
-    """Processor time of one request from the bytes that came to the bytes that go, without sockets, µs."""
-    with Service("edge", lab_of(1, 1), NowhereBus()) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
+def protocol_code_us(frame: bytes, times: int = 30_000) -> float:
+    """Return the CPU time of one request from the received to the sent bytes, without sockets, µs."""
+    with Service("edge", lab_of(1, 1), DiscardingBus()) as service:
+        service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
         state = JointState(rig="rig1", step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
-        arrival = Arrival(state.SerializeToString(), service.clock.monotonic_ns())
-        outlet = Mock(send_command=service.sender(topics.COMMAND, "rig1").send)
-        device = Device("rig1", DeviceSettings(), service.clock, outlet, lambda: arrival)
+        arrival = TimestampedPayload(state.SerializeToString(), service.clock.monotonic_ns())
+        output = Mock(send_command=service.rig_publisher(topics.COMMAND, "rig1").publish)
+        device = Device("rig1", DeviceSettings(), service.clock, output, lambda: arrival)
         server = RigServer(device, Limits(), service.clock, service.counters)
         transport = Mock(write=lambda _: None)
         connection = ModbusConnection(server, transport, device.connect("127.0.0.1", 1))
         for _ in range(2):
-            # The first round warms up.
+            # The first round is the warm-up.
             begin = time.thread_time()
             for number in range(times):
                 connection.get_buffer(-1)[: len(frame)] = frame
                 connection.buffer_updated(len(frame))
                 if number % 256 == 0:
-                    server.traffic.take(0, 0)
+                    server.request_log.drain(0, 0)
             used = time.thread_time() - begin
     return 1e6 * used / times
 
 
 def measure_resources(report: Report, client: Path, quick: bool) -> None:
+    """Measure CPU load and memory of an edge, and their growth over many connections."""
     seconds, connections = (2.0, 1_000) if quick else (10.0, 10_000)
-    with serving(serve_whole, 1) as (port, step, pid):
+    with serving(serve_full_stack, 1) as (port, step, pid):
         for case, rate in (("idle rig", 0.0), ("rig at 50 Hz", 50.0)):
             progress(case)
             before, begin = cpu_seconds(pid), time.monotonic()
             if rate:
-                ask(client, port, step, 1, seconds, rate)
+                run_modbus_client(client, port, step, 1, seconds, rate)
             else:
                 time.sleep(seconds)
             used = (cpu_seconds(pid) - before) / (time.monotonic() - begin)
-            report.add(case, "processor", 100 * used, "% of a core")
-            report.add(case, "memory", resident(pid) / 2**20, "MiB")
+            report.add(case, "CPU load", 100 * used, "% of a core")
+            report.add(case, "memory", resident_bytes(pid) / 2**20, "MiB")
         progress(f"{connections} connections")
         subprocess.run([client, "churn", str(port), str(connections)], check=True, stdout=subprocess.DEVNULL)
-        before_bytes, before_handles = resident(pid), handles(pid)
+        before_bytes, before_descriptors = resident_bytes(pid), open_descriptors(pid)
         subprocess.run([client, "churn", str(port), str(connections)], check=True, stdout=subprocess.DEVNULL)
-        # What the last ones left is closed at the loop's next turns.
+        # The event loop closes the last connections in its next iterations.
         time.sleep(0.5)
-        grown = (resident(pid) - before_bytes) / 2**20
-        more_handles = handles(pid) - before_handles
-        report.add(f"{connections:,} connections", "memory grown", grown, "MiB")
-        report.add(f"{connections:,} connections", "handles more", more_handles, "count")
-        report.bar(f"memory grown over {connections:,} connections", grown, "<=", 1.0, "MiB")
-        report.bar(f"handles more after {connections:,} connections", more_handles, "<=", 0, "count")
+        growth = (resident_bytes(pid) - before_bytes) / 2**20
+        added_descriptors = open_descriptors(pid) - before_descriptors
+        report.add(f"{connections:,} connections", "memory growth", growth, "MiB")
+        report.add(f"{connections:,} connections", "additional file descriptors", added_descriptors, "count")
+        report.require(f"memory growth over {connections:,} connections", growth, "<=", 1.0, "MiB")
+        report.require(
+            f"additional file descriptors after {connections:,} connections", added_descriptors, "<=", 0, "count"
+        )
 
 
-def ask(
+def run_modbus_client(
     client: Path,
     port: int,
     step: int,
@@ -230,14 +234,15 @@ def ask(
     rate: float = 0.0,
     samples: Path | None = None,
 ) -> Figures:
-    """What the client in C found; into `samples` goes each read, as it says."""
+    """Run the client in C and return its figures; it writes the time of each read into `samples`."""
     command = [client, *map(str, (port, step, connections, seconds, rate)), *([samples] if samples else [])]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=seconds + 30)
     figures: Figures = json.loads(done.stdout)
     return figures
 
 
-def middle(figures: list[Figures], *path: str) -> float:
+def median_of(figures: list[Figures], *path: str) -> float:
+    """Return the median over runs of the value at a path of keys."""
     values = []
     for one in figures:
         value: Any = one
@@ -247,11 +252,13 @@ def middle(figures: list[Figures], *path: str) -> float:
     return statistics.median(values)
 
 
-def handles(pid: int) -> int:
+def open_descriptors(pid: int) -> int:
+    """Return the number of open file descriptors of a process."""
     return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
-def resident(pid: int) -> int:
+def resident_bytes(pid: int) -> int:
+    """Return the resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

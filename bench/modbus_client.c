@@ -1,14 +1,14 @@
-/* Controllers that ask as fast as they can, or at a rate: read 4 positions, write 4 torques, on each connection.
+/* Controllers that poll without pauses or at a rate: read 4 positions and write 4 torques on each connection.
  *
  * usage: modbus_client PORT STEP CONNECTIONS SECONDS RATE [FILE]
- *   connection i goes to port PORT + i * STEP; RATE is cycles a second on each connection, 0 as fast as possible
- *   into FILE go two 64-bit numbers a read: when its cycle was over, ns of the wall clock, and the time it took, ns
+ *   connection i uses port PORT + i * STEP; RATE: cycles per second on each connection, 0: without pauses
+ *   FILE receives two 64-bit numbers per read: the end of its cycle, wall clock, ns, and the duration of the read, ns
  * usage: modbus_client churn PORT COUNT
  *   connect, read once, disconnect, COUNT times
- * Prints one JSON object: cycles a second of all connections, and the time of a read and of a cycle in microseconds.
- * At a rate, a cycle that is due while the one before is not answered begins after it, and its time counts from when it
- * was due: a server that falls behind is not asked less often for that.
- * One thread and raw frames: the client costs little beside the server that it measures.
+ * Prints one JSON object: cycles per second of all connections, and the times of a read and of a cycle in microseconds.
+ * At a rate, a cycle that is due before the previous one has finished starts after it, and its time counts from its due
+ * time: an overloaded server does not receive fewer requests.
+ * One thread and raw frames: the client needs little CPU time compared with the server.
  */
 #include <arpa/inet.h>
 #include <errno.h>
@@ -24,7 +24,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { READ_ANSWER = 9 + 8, WRITE_ANSWER = 12, MOST = 256, SAMPLES = 4000000 };
+enum { READ_RESPONSE_SIZE = 9 + 8, WRITE_RESPONSE_SIZE = 12, MAX_CONNECTIONS = 256, MAX_SAMPLES = 4000000 };
 
 static const uint8_t READ[] = {0, 1, 0, 0, 0, 6, 1, 3, 0, 4, 0, 4};
 static const uint8_t WRITE[] = {0, 2, 0, 0, 0, 15, 1, 16, 0, 0, 0, 4, 8, 0, 1, 0, 2, 0, 3, 0, 4};
@@ -33,8 +33,8 @@ struct connection {
     int fd;
     int writing, busy;
     size_t have;
-    uint8_t answer[300];
-    int64_t began, asked, due;
+    uint8_t response[300];
+    int64_t began, sent, due;
     float read_us;
 };
 
@@ -54,7 +54,7 @@ static int64_t now(void)
     return clock_ns(CLOCK_MONOTONIC);
 }
 
-static int dial(int port)
+static int connect_to(int port)
 {
     struct sockaddr_in address = {.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
     int one = 1, fd = socket(AF_INET, SOCK_STREAM, 0);
@@ -67,10 +67,10 @@ static int dial(int port)
     return fd;
 }
 
-static void ask(struct connection *c, const uint8_t *request, size_t size)
+static void send_request(struct connection *c, const uint8_t *request, size_t size)
 {
     c->have = 0;
-    c->asked = now();
+    c->sent = now();
     if (send(c->fd, request, size, MSG_NOSIGNAL) != (ssize_t)size) {
         perror("send");
         exit(3);
@@ -81,9 +81,9 @@ static void begin(struct connection *c, int64_t due)
 {
     c->writing = 0;
     c->busy = 1;
-    ask(c, READ, sizeof READ);
-    if (due) c->asked = due;
-    c->began = c->asked;
+    send_request(c, READ, sizeof READ);
+    if (due) c->sent = due;
+    c->began = c->sent;
 }
 
 static int by_value(const void *a, const void *b)
@@ -120,10 +120,10 @@ static void write_samples(const char *path)
 static int churn(int port, int times)
 {
     for (int i = 0; i < times; i++) {
-        struct connection c = {.fd = dial(port)};
-        ask(&c, READ, sizeof READ);
-        if (recv(c.fd, c.answer, sizeof c.answer, 0) <= 0) {
-            fprintf(stderr, "connection %d was not served\n", i + 1);
+        struct connection c = {.fd = connect_to(port)};
+        send_request(&c, READ, sizeof READ);
+        if (recv(c.fd, c.response, sizeof c.response, 0) <= 0) {
+            fprintf(stderr, "connection %d: no response\n", i + 1);
             return 3;
         }
         close(c.fd);
@@ -142,22 +142,22 @@ int main(int argc, char **argv)
     int port = atoi(argv[1]), step = atoi(argv[2]), connections = atoi(argv[3]);
     double seconds = atof(argv[4]), rate = atof(argv[5]);
     int64_t period = rate > 0 ? (int64_t)(1e9 / rate) : 0;
-    static struct connection all[MOST];
-    struct epoll_event events[MOST];
+    static struct connection all[MAX_CONNECTIONS];
+    struct epoll_event events[MAX_CONNECTIONS];
     int poller = epoll_create1(0);
-    if (connections > MOST) return 2;
-    reads = malloc(SAMPLES * sizeof *reads);
-    cycles = malloc(SAMPLES * sizeof *cycles);
-    over = malloc(SAMPLES * sizeof *over);
+    if (connections > MAX_CONNECTIONS) return 2;
+    reads = malloc(MAX_SAMPLES * sizeof *reads);
+    cycles = malloc(MAX_SAMPLES * sizeof *cycles);
+    over = malloc(MAX_SAMPLES * sizeof *over);
 
     for (int i = 0; i < connections; i++) {
         struct epoll_event event = {.events = EPOLLIN, .data.ptr = &all[i]};
-        all[i].fd = dial(port + i * step);
+        all[i].fd = connect_to(port + i * step);
         epoll_ctl(poller, EPOLL_CTL_ADD, all[i].fd, &event);
     }
     int64_t start = now(), end = start + (int64_t)(seconds * 1e9);
     for (int i = 0; i < connections; i++) {
-        /* At a rate, the connections are spread over the period. */
+        /* The connections are spread over the period. */
         all[i].due = start + (period ? period * i / connections : 0);
         if (!period) begin(&all[i], 0);
     }
@@ -174,31 +174,31 @@ int main(int argc, char **argv)
             }
             timeout = (int)((next - t) / 1000000);
         }
-        int ready = epoll_wait(poller, events, MOST, timeout);
+        int ready = epoll_wait(poller, events, MAX_CONNECTIONS, timeout);
         for (int i = 0; i < ready; i++) {
             struct connection *c = events[i].data.ptr;
-            ssize_t got = recv(c->fd, c->answer + c->have, sizeof c->answer - c->have, 0);
+            ssize_t got = recv(c->fd, c->response + c->have, sizeof c->response - c->have, 0);
             if (got <= 0) {
-                fprintf(stderr, "the server closed a connection\n");
+                fprintf(stderr, "the server closed the connection\n");
                 return 3;
             }
             c->have += (size_t)got;
-            if (c->have >= 9 && c->answer[7] & 0x80) {
-                fprintf(stderr, "function %d: exception %d\n", c->answer[7] & 0x7f, c->answer[8]);
+            if (c->have >= 9 && c->response[7] & 0x80) {
+                fprintf(stderr, "function %d: exception %d\n", c->response[7] & 0x7f, c->response[8]);
                 return 3;
             }
-            if (c->have < (c->writing ? (size_t)WRITE_ANSWER : (size_t)READ_ANSWER)) continue;
+            if (c->have < (c->writing ? (size_t)WRITE_RESPONSE_SIZE : (size_t)READ_RESPONSE_SIZE)) continue;
             int64_t t = now();
             if (!c->writing) {
-                c->read_us = (float)((double)(t - c->asked) * 1e-3);
+                c->read_us = (float)((double)(t - c->sent) * 1e-3);
                 c->writing = 1;
-                ask(c, WRITE, sizeof WRITE);
+                send_request(c, WRITE, sizeof WRITE);
                 continue;
             }
             over[count] = t;
             reads[count] = c->read_us;
             cycles[count] = (float)((double)(t - c->began) * 1e-3);
-            if (++count == SAMPLES) end = t;
+            if (++count == MAX_SAMPLES) end = t;
             c->busy = 0;
             if (!period) {
                 begin(c, 0);

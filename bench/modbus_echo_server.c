@@ -1,6 +1,6 @@
-/* The least that a Modbus server can be: libmodbus, registers in memory, one client after the other.
+/* A minimal Modbus server: libmodbus, registers in memory, one client at a time.
  *
- * usage: modbus_echo_server PORT        ends when its standard input ends
+ * usage: modbus_echo_server PORT        prints "ready"; stops when its standard input is closed
  */
 #include <errno.h>
 #include <modbus.h>
@@ -9,7 +9,7 @@
 #include <pthread.h>
 #include <unistd.h>
 
-static void *end_with_stdin(void *unused)
+static void *stop_with_stdin(void *unused)
 {
     char byte;
     (void)unused;
@@ -25,7 +25,7 @@ int main(int argc, char **argv)
         return 2;
     }
     pthread_t watch;
-    pthread_create(&watch, NULL, end_with_stdin, NULL);
+    pthread_create(&watch, NULL, stop_with_stdin, NULL);
     modbus_t *bus = modbus_new_tcp("127.0.0.1", atoi(argv[1]));
     modbus_mapping_t *map = modbus_mapping_new(8, 8, 16, 16);
     int listening = modbus_tcp_listen(bus, 1);

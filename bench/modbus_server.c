@@ -1,6 +1,6 @@
-/* A Modbus server in C for many clients: libmodbus and select, as its own example has it.
+/* A Modbus server for many clients: libmodbus and select, as in the example of libmodbus.
  *
- * usage: modbus_server PORT        says "ready"; ends when its standard input ends
+ * usage: modbus_server PORT        prints "ready"; stops when its standard input is closed
  */
 #include <errno.h>
 #include <modbus.h>
@@ -26,14 +26,14 @@ int main(int argc, char **argv)
     puts("ready");
     fflush(stdout);
     fd_set all;
-    int most = listening;
+    int max_fd = listening;
     FD_ZERO(&all);
     FD_SET(0, &all);
     FD_SET(listening, &all);
     for (;;) {
         fd_set ready = all;
-        if (select(most + 1, &ready, NULL, NULL, NULL) == -1) return 3;
-        for (int fd = 0; fd <= most; fd++) {
+        if (select(max_fd + 1, &ready, NULL, NULL, NULL) == -1) return 3;
+        for (int fd = 0; fd <= max_fd; fd++) {
             if (!FD_ISSET(fd, &ready)) continue;
             if (fd == 0) {
                 char byte;
@@ -41,7 +41,7 @@ int main(int argc, char **argv)
             } else if (fd == listening) {
                 int client = accept(listening, NULL, NULL);
                 FD_SET(client, &all);
-                if (client > most) most = client;
+                if (client > max_fd) max_fd = client;
             } else {
                 uint8_t query[MODBUS_TCP_MAX_ADU_LENGTH];
                 modbus_set_socket(bus, fd);

@@ -1,6 +1,6 @@
-"""The servers that `modbus.py` compares, each in a process of its own: pymodbus's, libmodbus's, and ours.
+"""The servers that `modbus.py` compares, each in its own process: pymodbus, libmodbus and the hilrig edge.
 
-A server says that it is ready through a pipe, and ends when the pipe does.
+A server reports through a pipe that it is ready and stops when the pipe is closed.
 """
 
 import asyncio
@@ -24,12 +24,12 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from hilrig_cli.local.demo import free_ports
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.service import run as run_edge
-from hilrig_runtime.bus.api import KEPT, Publisher
+from hilrig_runtime.bus.api import CACHE_DEPTH, Publisher
 from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency
+from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, set_short_slice
 from hilrig_schemas import JointState, RigBatch, TorqueCommand, topics
 
 Server = tuple[int, int, int]
@@ -38,8 +38,10 @@ Server = tuple[int, int, int]
 
 @contextmanager
 def running(body: Callable[..., None], *arguments: Any) -> Iterator[tuple[Any, int]]:
-    """Run `body`, with the arguments and the other end of a pipe, in a process of its own: what it said when it was
-    ready, and its process id."""
+    """Run `body` in its own process, with `arguments` and the other end of a pipe.
+
+    Yields the object that it sent when it was ready, and its process id.
+    """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=body, args=(*arguments, there))
@@ -56,7 +58,7 @@ def running(body: Callable[..., None], *arguments: Any) -> Iterator[tuple[Any, i
 
 @contextmanager
 def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterator[Server]:
-    """Run a server of ours."""
+    """Run a Python server in its own process."""
     port = free_ports(20_000, rigs)
     with running(serve, port, rigs) as (step, pid):
         yield port, step, pid
@@ -64,6 +66,7 @@ def serving(serve: Callable[[int, int, Connection], None], rigs: int) -> Iterato
 
 @contextmanager
 def serving_c(program: Path) -> Iterator[Server]:
+    """Run the C server."""
     port = free_ports(20_000)
     with subprocess.Popen([program, str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
@@ -77,18 +80,18 @@ def serving_c(program: Path) -> Iterator[Server]:
 
 
 @contextmanager
-def serving_c_beside_the_bus(program: Path) -> Iterator[Server]:
-    """The C server, as urgent as our edge, while others have as much to do with the bus as our edge under full load."""
-    with serving_c(program) as (port, step, pid), serving(pass_on_commands, 2):
+def serving_c_with_bus_load(program: Path) -> Iterator[Server]:
+    """Run the C server at the edge's priority, while other processes produce the bus load of a fully loaded edge."""
+    with serving_c(program) as (port, step, pid), serving(publish_bus_load, 2):
         with suppress(OSError):
             os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITIES["edge"]))
         yield port, step, pid
 
 
-def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG001
-    """pymodbus's own server with registers in memory."""
+def serve_pymodbus(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG001
+    """Run pymodbus's server with registers in memory."""
 
-    # It tells of every connection that goes.
+    # pymodbus logs each closed connection.
     logging.disable()
 
     async def body() -> None:
@@ -102,46 +105,47 @@ def serve_stock(port: int, rigs: int, control: Connection) -> None:  # noqa: ARG
     asyncio.run(body())
 
 
-class NowhereBus(MemoryBus):
-    """A bus that carries states and nothing else: what is published goes nowhere, and costs nothing."""
+class DiscardingBus(MemoryBus):
+    """A bus that delivers states and discards published messages at no cost."""
 
-    def publisher(self, key: str, traffic: topics.Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
-        return _Nowhere()
+    def publisher(self, key: str, traffic: topics.Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:  # noqa: ARG002
+        return _DiscardingPublisher()
 
 
-class _Nowhere(Publisher):
+class _DiscardingPublisher(Publisher):
     def put(self, payload: bytes) -> None:
-        """Nobody listens."""
+        """Discard the message."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""
 
 
-def serve_alone(port: int, rigs: int, control: Connection) -> None:
-    """The edge with a bus that leads nowhere; nothing is kept for a recorder, and no policy but the ordinary one."""
-    prefer_latency()
+def serve_protocol_only(port: int, rigs: int, control: Connection) -> None:
+    """Run the edge with a bus that discards messages, without a recording stream and without real-time policy."""
+    set_short_slice()
     lab = lab_of(port, rigs)
-    bus = NowhereBus()
+    bus = DiscardingBus()
     with Service("edge", lab, bus) as service:
-        service.log.append = lambda *_: None  # type: ignore[method-assign]
-        serve_ours(service, bus.hub.deliver, control)
+        service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
+        run_edge_service(service, bus.hub.deliver, control)
 
 
-def serve_whole(port: int, rigs: int, control: Connection) -> None:
-    """The edge as `hilrig edge` runs it; another process takes the simulation's place and hears every command."""
-    prefer_latency()
+def serve_full_stack(port: int, rigs: int, control: Connection) -> None:
+    """Run the edge as `hilrig edge` does; another process replaces the simulation and receives every command."""
+    set_short_slice()
     go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
     with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
-        serve_ours(service, None, control)
+        run_edge_service(service, None, control)
 
 
-def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, control: Connection) -> None:
+def run_edge_service(service: Service, deliver: Callable[[str, bytes], None] | None, control: Connection) -> None:
+    """Run the edge until the pipe is closed; `deliver` injects states on a bus without a simulation."""
     lab = service.lab
     alive = topics.alive_key(lab.name, "edge", "*")
 
     def watch() -> None:
-        while not service.bus.alive(alive):
+        while not service.bus.get_liveliness(alive):
             if deliver is not None:
                 for rig in lab.rigs:
                     state = JointState(rig=rig.name, step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
@@ -158,66 +162,70 @@ def serve_ours(service: Service, deliver: Callable[[str, bytes], None] | None, c
     run_edge(service)
 
 
-COMMANDS_A_TICK = 400
-"""Of a controller as fast as it can be."""
+COMMANDS_PER_TICK = 400
+"""Commands per tick of a controller that writes without pauses."""
 
 
-def pass_on_commands(port: int, rigs: int, control: Connection) -> None:
-    """In the edge's place, without Modbus: two messages of commands a step, and one batch for the log stream."""
+def publish_bus_load(port: int, rigs: int, control: Connection) -> None:
+    """Replace the edge, without Modbus: two command messages and one batch of the recording stream per step."""
     go_realtime(REALTIME_PRIORITIES["edge"])
     lab = lab_of(port, rigs)
     names = [rig.name for rig in lab.rigs]
     key = topics.COMMAND.key(lab.name, names[0])
     with running(send_states, lab), Service("edge", lab, ZenohBus(lab.bus, "edge")) as service:
-        states = service.latest_of_batches(topics.STATES)
+        states = service.latest_value_cache(topics.STATES)
         put = service.publisher(topics.COMMANDS).put
         command = TorqueCommand(rig=names[0], effort=[0.1] * 4, session="a" * 24, controller="127.0.0.1:50000")
         for field in ("seq", "basis_incarnation", "basis_step", "state_arrived_ns", "state_served_ns", "sent_ns"):
             setattr(command, field, time.monotonic_ns())
         encoded = command.SerializeToString()
-        departure = RigBatch(source=service.source, rigs=names, messages=[encoded] * rigs).SerializeToString()
+        batch = RigBatch(source=service.source, rigs=names, messages=[encoded] * rigs).SerializeToString()
         service.ready()
         control.send(0)
-        shown = None
+        last_state = None
         while not control.poll(0):
             state = states.get(names[0])
-            if state is None or state is shown:
+            if state is None or state is last_state:
                 time.sleep(0.0002)
                 continue
-            shown = state
+            last_state = state
             wait_until(state.arrived_ns + COALESCE_WINDOW_NS)
-            put(departure)
+            put(batch)
             wait_until(state.arrived_ns + lab.sim.step_ns - DEADLINE_MARGIN_NS)
-            put(departure)
-            service.log.extend([(key, number, time.time_ns(), encoded) for number in range(COMMANDS_A_TICK)])
+            put(batch)
+            service.recording_stream.extend(
+                [(key, number, time.time_ns(), encoded) for number in range(COMMANDS_PER_TICK)]
+            )
             service.beat(time.monotonic_ns())
 
 
 def wait_until(when_ns: int) -> None:
+    """Sleep until a time of the monotonic clock."""
     time.sleep(max(0, when_ns - time.monotonic_ns()) * 1e-9)
 
 
 def send_states(lab: LabConfig, control: Connection) -> None:
-    """In the simulation's place: states at 50 Hz, and every command received."""
+    """Replace the simulation: publish states at 50 Hz and receive every command."""
     go_realtime(REALTIME_PRIORITIES["sim"])
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
-        states = service.batch_sender(topics.STATES)
+        states = service.batch_publisher(topics.STATES)
         for rig in lab.rigs:
             service.add_to_batch(states, topics.STATE, rig.name)
-        service.latest_of_batches(topics.COMMANDS)
+        service.latest_value_cache(topics.COMMANDS)
         control.send(1)
         step = 0
         while not control.poll(0.02):
             step += 1
-            made = [
+            new_states = [
                 JointState(rig=rig.name, step=step, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
                 for rig in lab.rigs
             ]
-            states.send([state.SerializeToString() for state in made])
+            states.publish([state.SerializeToString() for state in new_states])
             service.beat(service.clock.monotonic_ns())
 
 
 def lab_of(port: int, rigs: int) -> LabConfig:
+    """Return a lab with free bus ports whose first rig listens on `port`."""
     return LabConfig.model_validate(
         {
             "edge": {"first_port": port, "max_connections": 64, "max_connections_per_host": 64},
@@ -228,6 +236,6 @@ def lab_of(port: int, rigs: int) -> LabConfig:
 
 
 def wait_for_end(control: Connection) -> None:
-    """Return when the other end of the pipe is closed."""
+    """Block until the other end of the pipe is closed."""
     with suppress(EOFError, OSError):
         control.recv()

@@ -1,9 +1,9 @@
-"""How much does the recorder take, and what does it cost beside the raw MCAP writer?
+"""Measures the throughput and the CPU time of the recorder, compared with the standard MCAP writer.
 
-A sender process publishes the log stream of a whole lab (500 rigs at 50 Hz by default) over the real bus; the
-recorder, as a user starts it, writes a file for each rig. Its processor time comes from its own health reports. The
-same messages go through the stock `mcap` writer in this process, in the same run: no bus, no sessions, one file, and
-a sender at work beside it, so that both are measured on a machine that is equally busy.
+A sender process publishes the recording stream of a lab (500 rigs at 50 Hz by default) over zenoh; the recorder, as
+`hilrig recorder` runs it, writes one file per rig. Its CPU time comes from its health reports. In the same run, the
+standard `mcap` writer writes the same messages in this process: without bus and sessions, into one file, while a sender
+runs, so that both are measured under the same load of the machine.
 """
 
 import json
@@ -34,61 +34,71 @@ from hilrig_schemas import Event, Health, JointState, OpenSession
 from hilrig_schemas.topics import HEALTH, STATE, alive_key
 
 HZ = 50.0
-"""States a second of each rig."""
-SETTLED_SECONDS = 60
-"""From this length of a run on, a fifth of it is enough for memory to settle. What waits while the host takes the
-processors away is in memory for a moment: so it is the median of a fifth that counts."""
-VARIANTS = 200
-"""Different states a rig has; then they repeat."""
+"""States per second of each rig."""
+MIN_GROWTH_RUN_S = 60
+"""Shortest run whose memory growth is checked: its first fifth is the warm-up.
+
+CPU steal fills the ingest queue for a moment, so the median memory of a fifth of the run is used.
+"""
+DISTINCT_STATES = 200
+"""Number of distinct states of a rig before they repeat."""
 
 
 def main() -> int:
     if len(sys.argv) > 1 and sys.argv[1] == "--send":
-        send(load_lab(Path(sys.argv[2])), float(sys.argv[3]), to_nobody="--to-nobody" in sys.argv)
+        send(load_lab(Path(sys.argv[2])), float(sys.argv[3]), without_recorder="--without-recorder" in sys.argv)
         return 0
-    return run(measure, "What does the recorder take without loss, and what does a message cost it?")
+    return run(
+        measure, "How many messages does the recorder store without loss, and how much CPU time does a message need?"
+    )
 
 
 def measure(report: Report, quick: bool) -> None:
     seconds = float(os.environ.get("HILRIG_BENCH_SECONDS", "10" if quick else "60"))
     rigs = int(os.environ.get("HILRIG_BENCH_RIGS", "500"))
     raw_runs = 2 if quick else 5
-    raw = raw_writer_beside_a_sender(rigs, raw_runs)
+    raw = standard_writer_with_sender(rigs, raw_runs)
     progress(f"{rigs} rigs at {HZ:g} Hz for {seconds:g} s")
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
         found = record(Path(folder), rigs, seconds)
-    # Before and after: the speed of a shared machine is not the same all the time.
-    raw += raw_writer_beside_a_sender(rigs, raw_runs)
-    raw_rate = report.add("raw mcap writer", "messages a CPU second", statistics.median(rate for rate, _ in raw), "1/s")
-    report.add("raw mcap writer", "a message on disk", raw[0][1], "bytes")
+    # Measured before and after the recorder: the speed of a shared machine varies over time.
+    raw += standard_writer_with_sender(rigs, raw_runs)
+    raw_rate = report.add(
+        "standard MCAP writer", "messages per CPU second", statistics.median(rate for rate, _ in raw), "1/s"
+    )
+    report.add("standard MCAP writer", "size per message on disk", raw[0][1], "bytes")
     case = f"recorder, {rigs} rigs at {HZ:g} Hz for {seconds:g} s"
     rate = report.add(case, "sent", found.sent / found.wall_s, "messages/s")
-    per_core = report.add(case, "messages a CPU second, bus included", found.sent / found.cpu_s, "1/s")
-    report.add(case, "processor", 100 * found.cpu_s / found.wall_s, "% of a core")
-    report.add(case, "a message on disk, everything included", found.size / found.recorded, "bytes")
-    report.add(case, "stated as lost in transport", found.lost_transport, "messages")
-    report.add(case, "stated as lost in the recorder", found.lost_recorder, "messages")
+    per_core = report.add(case, "messages per CPU second, bus included", found.sent / found.cpu_s, "1/s")
+    report.add(case, "CPU load", 100 * found.cpu_s / found.wall_s, "% of a core")
+    report.add(case, "size per message on disk, everything included", found.size / found.recorded, "bytes")
+    report.add(case, "reported lost in transport", found.lost_transport, "messages")
+    report.add(case, "reported lost in the recorder", found.lost_recorder, "messages")
     report.add(case, "memory, second fifth of the run", found.memory_early / 2**20, "MiB")
     report.add(case, "memory, last fifth of the run", found.memory_late / 2**20, "MiB")
-    report.add(case, "memory, most", found.memory_most / 2**20, "MiB")
-    report.bar("messages a CPU second, recorder with its bus over raw writer", per_core / raw_rate, ">=", 0.6)
-    report.bar("messages missing in the files", found.sent - found.recorded, "<=", 0)
-    report.bar("sent, of what was meant to be sent", rate / (rigs * HZ), ">=", 0.98)
-    if seconds >= SETTLED_SECONDS:
+    report.add(case, "memory, maximum", found.memory_max / 2**20, "MiB")
+    report.require(
+        "messages per CPU second, recorder with bus, ratio to the standard writer", per_core / raw_rate, ">=", 0.6
+    )
+    report.require("messages missing in the files", found.sent - found.recorded, "<=", 0)
+    report.require("messages sent, relative to the planned number", rate / (rigs * HZ), ">=", 0.98)
+    if seconds >= MIN_GROWTH_RUN_S:
         growth = found.memory_late - found.memory_early
         # From the middle of the second fifth to the middle of the last.
-        report.add(case, "growth of memory, if it went on", growth / 2**20 * 3600 / (0.6 * seconds), "MiB an hour")
-        report.bar("growth of memory, second to last fifth", 100 * growth / found.memory_early, "<=", 10, "%")
-    report.say(f"HILRIG_BENCH_SECONDS and HILRIG_BENCH_RIGS change the run; this one sent {found.sent} messages.")
+        report.add(case, "memory growth, extrapolated", growth / 2**20 * 3600 / (0.6 * seconds), "MiB/h")
+        report.require(
+            "memory growth, from the second to the last fifth", 100 * growth / found.memory_early, "<=", 10, "%"
+        )
+    report.add_note(f"HILRIG_BENCH_SECONDS and HILRIG_BENCH_RIGS change the load; this run sent {found.sent} messages.")
 
 
-# -- the sender, a process of its own -------------------------------------------------------------------------------
+# -- the sender, a separate process ---------------------------------------------------------------------------------
 
 
 def states(rig: str, number: int) -> list[bytes]:
-    """Encoded states as a moving arm sends them."""
-    made = []
-    for step in range(1, VARIANTS + 1):
+    """Return encoded states of a moving arm."""
+    encoded_states = []
+    for step in range(1, DISTINCT_STATES + 1):
         t = 0.02 * step + number
         state = JointState(
             rig=rig,
@@ -107,13 +117,13 @@ def states(rig: str, number: int) -> list[bytes]:
         state.velocity.extend(math.cos(t + joint) for joint in range(4))
         state.effort.extend(0.1 * math.sin(3 * t + joint) for joint in range(4))
         state.integration_error.extend([1e-9] * 4)
-        made.append(state.SerializeToString())
-    return made
+        encoded_states.append(state.SerializeToString())
+    return encoded_states
 
 
-def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
-    """Send the states of every rig of a lab within a session each, and say how many."""
-    # As the simulations do for which it stands.
+def send(lab: LabConfig, seconds: float, *, without_recorder: bool) -> None:
+    """Publish the states of all rigs of a lab, one session per rig, and print the number of messages."""
+    # The priority of the simulation that this process replaces.
     go_realtime(REALTIME_PRIORITIES["sim"])
     rigs = [rig.name for rig in lab.rigs]
     pool = [(STATE.key(lab.name, rig), states(rig, number)) for number, rig in enumerate(rigs)]
@@ -121,55 +131,57 @@ def send(lab: LabConfig, seconds: float, *, to_nobody: bool) -> None:
     signal.signal(signal.SIGTERM, lambda *_: stopping.set())
     with Service("sim", lab, ZenohBus(lab.bus, "sim")) as service:
         service.ready()
-        if to_nobody:
+        if without_recorder:
             print("sending", flush=True)
         else:
             wait_for(service, lab)
         sessions = [OpenSession(rig=rig, session=f"20260101T000000Z-{rig}-abcd") for rig in rigs]
-        service.log.set_sessions(sessions)
+        service.recording_stream.set_sessions(sessions)
         emit(service, sessions, Event.SESSION_START)
         rate = Rate(round(1e9 / HZ))
-        append, wall_ns = service.log.append, SYSTEM_CLOCK.wall_ns
+        append, wall_ns = service.recording_stream.append, SYSTEM_CLOCK.wall_ns
         ticks = round(seconds * HZ)
         begin_ns = SYSTEM_CLOCK.monotonic_ns()
         for tick in range(1, ticks + 1):
             rate.wait()
             stamp = wall_ns()
-            variant = tick % VARIANTS
+            variant = tick % DISTINCT_STATES
             for key, encoded in pool:
                 append(key, tick, stamp, encoded[variant])
-            service.log.flush(SYSTEM_CLOCK.monotonic_ns())
+            service.recording_stream.flush(SYSTEM_CLOCK.monotonic_ns())
             service.health.report_if_due(SYSTEM_CLOCK.monotonic_ns())
             if stopping.is_set():
                 ticks = tick
                 break
         emit(service, sessions, Event.SESSION_END)
-        service.log.set_sessions([])
+        service.recording_stream.set_sessions([])
         wall_s = (SYSTEM_CLOCK.monotonic_ns() - begin_ns) * 1e-9
         print(json.dumps({"sent": ticks * len(rigs), "wall_s": wall_s}), flush=True)
-        # The cache is here: what the recorder still asks for must be answered.
+        # The publisher cache is in this process: keep it available for the recorder's queries.
         for _ in range(100):
             rate.wait()
-            service.log.flush_if_due(SYSTEM_CLOCK.monotonic_ns())
+            service.recording_stream.flush_if_due(SYSTEM_CLOCK.monotonic_ns())
 
 
 def wait_for(service: Service, lab: LabConfig) -> None:
-    while not service.bus.alive(alive_key(lab.name, "recorder", "*"), timeout_s=0.2):
+    """Block until a recorder is alive."""
+    while not service.bus.get_liveliness(alive_key(lab.name, "recorder", "*"), timeout_s=0.2):
         time.sleep(0.05)
 
 
 def emit(service: Service, sessions: list[OpenSession], kind: Event.Kind) -> None:
+    """Emit an event of each session."""
     for session in sessions:
         service.emit(Event(rig=session.rig, session=session.session, kind=kind))
-    service.log.flush(SYSTEM_CLOCK.monotonic_ns())
+    service.recording_stream.flush(SYSTEM_CLOCK.monotonic_ns())
 
 
 # -- the measurement ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What a run of the recorder gave."""
+class RecorderRun:
+    """Results of one run of the recorder."""
 
     sent: int
     recorded: int
@@ -180,27 +192,27 @@ class Found:
     cpu_s: float
     memory_early: float
     memory_late: float
-    memory_most: int
+    memory_max: int
 
 
-def raw_writer_beside_a_sender(rigs: int, runs: int) -> list[tuple[float, float]]:
-    """The raw writer, measured while a sender keeps the machine as busy as it is while the recorder is measured."""
+def standard_writer_with_sender(rigs: int, runs: int) -> list[tuple[float, float]]:
+    """Measure the standard writer several times while a sender loads the machine as it does for the recorder."""
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
         config = write_lab(Path(folder), rigs)
-        command = [sys.executable, __file__, "--send", str(config), "600", "--to-nobody"]
+        command = [sys.executable, __file__, "--send", str(config), "600", "--without-recorder"]
         sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert sender.stdout is not None
         try:
             sender.stdout.readline()
-            return [raw_writer() for _ in range(runs)]
+            return [standard_writer() for _ in range(runs)]
         finally:
             sender.terminate()
             sender.wait(15)
             sender.stdout.close()
 
 
-def raw_writer() -> tuple[float, float]:
-    """Messages a CPU second and bytes a message of the stock writer, with the recorder's chunks and compression."""
+def standard_writer() -> tuple[float, float]:
+    """Return messages per CPU second and bytes per message of the standard writer, with the recorder's chunk size."""
     pool = [states(f"rig{number}", number) for number in range(5)]
     payloads = [payload for step in zip(*pool, strict=True) for payload in step] * 60
     with tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder:
@@ -219,8 +231,8 @@ def raw_writer() -> tuple[float, float]:
         return len(payloads) / spent, path.stat().st_size / len(payloads)
 
 
-def record(folder: Path, rigs: int, seconds: float) -> Found:
-    """Let the recorder record a lab; what it cost and what is in its files."""
+def record(folder: Path, rigs: int, seconds: float) -> RecorderRun:
+    """Record a lab and return the recorder's resources and the content of its files."""
     config = write_lab(folder, rigs)
     lab = load_lab(config)
     healths: list[Health] = []
@@ -234,7 +246,7 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
             bus.subscribe(
                 HEALTH.key(lab.name, "recorder", "*"), lambda _, payload: healths.append(Health.FromString(payload))
             )
-            said = json.loads(sender.stdout.readline())
+            sender_result = json.loads(sender.stdout.readline())
             paths = finished_files(lab, recorder, rigs)
             sender.wait(30)
     finally:
@@ -247,22 +259,23 @@ def record(folder: Path, rigs: int, seconds: float) -> Found:
     memory = [health.resident_bytes for health in busy]
     idle = healths[: healths.index(busy[0])]
     recorded, lost_transport, lost_recorder = contents(paths)
-    return Found(
-        sent=said["sent"],
+    return RecorderRun(
+        sent=sender_result["sent"],
         recorded=recorded,
         lost_transport=lost_transport,
         lost_recorder=lost_recorder,
         size=sum(path.stat().st_size for path in paths),
-        wall_s=said["wall_s"],
-        # Importing is not recording: what it took before the first session is not counted.
+        wall_s=sender_result["wall_s"],
+        # The CPU time before the first session (imports, start) is not counted.
         cpu_s=(healths[-1].cpu_ns - (idle[-1].cpu_ns if idle else 0)) * 1e-9,
         memory_early=statistics.median(memory[len(busy) // 5 : 2 * len(busy) // 5 + 1]),
         memory_late=statistics.median(memory[-(len(busy) // 5 + 1) :]),
-        memory_most=max(memory),
+        memory_max=max(memory),
     )
 
 
 def write_lab(folder: Path, rigs: int) -> Path:
+    """Write a lab.toml with free bus ports."""
     config = folder / "lab.toml"
     names = "".join(f'[[rigs]]\nname = "rig{number}"\n' for number in range(rigs))
     config.write_text(
@@ -272,25 +285,26 @@ def write_lab(folder: Path, rigs: int) -> Path:
 
 
 def finished_files(lab: LabConfig, recorder: subprocess.Popen[bytes], rigs: int) -> list[Path]:
+    """Wait until each rig has a complete recording and return the paths."""
     deadline = time.monotonic() + 60
     while True:
         paths = list((lab.recorder.folder / lab.name).glob("*/*.mcap"))
         if len(paths) >= rigs:
             return paths
         if recorder.poll() is not None or time.monotonic() > deadline:
-            raise SystemExit(f"only {len(paths)} of {rigs} recordings were finished")
+            raise SystemExit(f"only {len(paths)} of {rigs} recordings were completed")
         time.sleep(0.1)
 
 
 def contents(paths: list[Path]) -> tuple[int, int, int]:
-    """States in the files, and the losses that they state."""
+    """Return the number of states in the files, and of messages reported lost in transport and in the recorder."""
     found = lost_transport = lost_recorder = 0
     for path in paths:
         with path.open("rb") as stream:
             reader = make_reader(stream)
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
-                raise SystemExit(f"{path} has no index")
+                raise SystemExit(f"{path}: no summary section")
             states_id = next(channel.id for channel in summary.channels.values() if channel.topic == "/state")
             found += summary.statistics.channel_message_counts.get(states_id, 0)
             for record in reader.iter_metadata():

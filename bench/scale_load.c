@@ -1,6 +1,6 @@
-/* A class of controllers in one process: each holds one TCP connection to its own rig, and once a period reads the four
- * positions (function 3) and writes four torques (function 16), with phases spread over the period. Raw sockets and one
- * epoll, so that the load is light beside what it measures. Prints one JSON object.
+/* Many controllers in one process: each holds a TCP connection to its own rig and reads the four positions (function 3)
+ * and writes the four torques (function 16) once per period, with phases spread over the period. Raw sockets and one
+ * epoll instance keep the CPU load low. Prints one JSON object.
  *
  * usage: scale_load HOST PORT COUNT SECONDS PERIOD_MS        (rig k listens on PORT + k)
  */
@@ -19,20 +19,20 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { READ_ANSWER = 17, WRITE_ANSWER = 12, ROOM = 64 };
+enum { READ_RESPONSE_SIZE = 17, WRITE_RESPONSE_SIZE = 12, RESPONSE_CAPACITY = 64 };
 enum phase { WAITING, READING, WRITING };
 
 struct controller {
     int socket;
     enum phase phase;
-    int64_t due, asked;
+    int64_t due, sent;
     uint16_t transaction;
     size_t filled;
-    unsigned char answer[ROOM];
+    unsigned char response[RESPONSE_CAPACITY];
 };
 
 static int64_t *reads, *writes;
-static size_t read_count, write_count, room, skipped, failed, refused;
+static size_t read_count, write_count, capacity, skipped, failed, refused;
 
 static int64_t now_ns(void)
 {
@@ -66,9 +66,9 @@ static int connect_to(const char *host, int port)
     return s;
 }
 
-static void ask(struct controller *c, enum phase phase, int64_t now)
+static void send_request(struct controller *c, enum phase phase, int64_t now)
 {
-    /* The torque of the first joint goes to and fro, so that arms move and no two writes are alike. */
+    /* The torque of the first joint alternates, so that the arms move and consecutive writes differ. */
     int16_t torque = (int16_t)(c->transaction % 400 < 200 ? 300 + c->transaction % 7 : -300 - c->transaction % 7);
     unsigned char request[21] = {0, 0, 0, 0, 0, 6, 1, 3, 0, 4, 0, 4};
     size_t size = 12;
@@ -83,14 +83,14 @@ static void ask(struct controller *c, enum phase phase, int64_t now)
     request[0] = c->transaction >> 8;
     request[1] = c->transaction & 0xFF;
     c->phase = phase;
-    c->asked = now;
+    c->sent = now;
     c->filled = 0;
     if (send(c->socket, request, size, MSG_NOSIGNAL) != (ssize_t)size) failed++;
 }
 
-static void hear(struct controller *c, int64_t now, int64_t period)
+static void receive(struct controller *c, int64_t now, int64_t period)
 {
-    ssize_t got = recv(c->socket, c->answer + c->filled, ROOM - c->filled, MSG_DONTWAIT);
+    ssize_t got = recv(c->socket, c->response + c->filled, RESPONSE_CAPACITY - c->filled, MSG_DONTWAIT);
     if (got <= 0) {
         if (got < 0 && errno == EAGAIN) return;
         failed++;
@@ -99,19 +99,19 @@ static void hear(struct controller *c, int64_t now, int64_t period)
         return;
     }
     c->filled += got;
-    if (c->filled >= 9 && (c->answer[7] & 0x80)) {
+    if (c->filled >= 9 && (c->response[7] & 0x80)) {
         refused++;
         c->phase = WAITING;
         c->due = now + period;
         return;
     }
-    if (c->filled < (c->phase == READING ? READ_ANSWER : WRITE_ANSWER)) return;
+    if (c->filled < (c->phase == READING ? READ_RESPONSE_SIZE : WRITE_RESPONSE_SIZE)) return;
     if (c->phase == READING) {
-        if (read_count < room) reads[read_count++] = now - c->asked;
-        ask(c, WRITING, now_ns());
+        if (read_count < capacity) reads[read_count++] = now - c->sent;
+        send_request(c, WRITING, now_ns());
         return;
     }
-    if (write_count < room) writes[write_count++] = now - c->asked;
+    if (write_count < capacity) writes[write_count++] = now - c->sent;
     c->phase = WAITING;
     for (c->due += period; c->due <= now; c->due += period) skipped++;
 }
@@ -126,11 +126,11 @@ int main(int argc, char **argv)
     double seconds = atof(argv[4]);
     int64_t period = (int64_t)(atof(argv[5]) * 1e6);
     struct controller *all = calloc(count, sizeof *all);
-    room = (size_t)(count * (seconds / (period * 1e-9) + 10));
-    reads = malloc(room * sizeof *reads);
-    writes = malloc(room * sizeof *writes);
+    capacity = (size_t)(count * (seconds / (period * 1e-9) + 10));
+    reads = malloc(capacity * sizeof *reads);
+    writes = malloc(capacity * sizeof *writes);
     prctl(PR_SET_TIMERSLACK, 1);
-    /* Controllers stand on machines of their own: where the right is there, ours do not wait for the rig's processes. */
+    /* The controllers represent other machines: with the permission for it, they preempt the processes of the lab. */
     struct sched_param first = {.sched_priority = 10};
     sched_setscheduler(0, SCHED_FIFO, &first);
     int poll = epoll_create1(0);
@@ -149,14 +149,14 @@ int main(int argc, char **argv)
         for (int k = 0; k < count; k++) {
             struct controller *c = &all[k];
             if (c->phase != WAITING || c->socket < 0) continue;
-            if (c->due <= now) ask(c, READING, now_ns());
+            if (c->due <= now) send_request(c, READING, now_ns());
             else if (c->due < next) next = c->due;
         }
         struct timespec pause = {0, 0};
         int64_t left = next - now_ns();
         if (left > 0) pause = (struct timespec){left / 1000000000, left % 1000000000};
         int ready = epoll_pwait2(poll, events, 256, &pause, NULL);
-        for (int k = 0; k < ready; k++) hear(events[k].data.ptr, now_ns(), period);
+        for (int k = 0; k < ready; k++) receive(events[k].data.ptr, now_ns(), period);
     }
     double took = (now_ns() - begin) * 1e-9;
     struct timespec cpu;

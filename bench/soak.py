@@ -1,11 +1,11 @@
-"""Does a class of 64 rigs run for half an hour with controllers that come, go, die and misbehave?
+"""Checks that a lab of 64 rigs runs for half an hour while controllers connect, disconnect, crash and misbehave.
 
-A process plays all the controllers: some hold their rig and work, some vanish without a word, send rubbish or half a
-request, flood, fight for a rig that another holds, or connect and say nothing. Once every few seconds memory, handles
-and threads of each service are read; growth is the median slope of all pairs of samples after the warm-up, so that a
-recorder that has more files open at one moment than at another counts as neither. At the end every torque must be zero,
-every recording whole, and what is re-simulated the same bit for bit. `--minutes` says how long; interrupted, it judges
-what it has until then, and says how long that was.
+One process plays all controllers: some control their rig, some reset the connection, send garbage or half a request,
+flood, compete for a lease, or connect and stay idle. Memory, file descriptors and threads of each service are sampled
+every few seconds. The memory growth is the median slope of all pairs of samples after the warm-up, because it does not
+depend on the number of files that are open at the first and last sample. At the end, all torques must be zero, all
+recordings complete, and re-simulations identical bit for bit. `--minutes` sets the duration; after an interruption the
+data collected so far are evaluated and their duration is reported.
 """
 
 import argparse
@@ -41,50 +41,51 @@ from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, RigBatch
 from hilrig_schemas.topics import STATES
 
-QUESTION = "Does a class of 64 rigs run for long with controllers that come, go, die and misbehave?"
+QUESTION = "Does a lab of 64 rigs run for a long time while controllers connect, disconnect, crash and misbehave?"
 RIGS = 64
 READ = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
 SAMPLE_S = 2.0
-WARM_UP_SHARE = 0.3
-"""Of the run, and no more than `WARM_UP_S`: what memory grows later is growth."""
+WARM_UP_FRACTION = 0.3
+"""Warm-up as a fraction of the run, at most `WARM_UP_S`; memory growth is measured after it."""
 WARM_UP_S = 300.0
 GRACE_MS = 500
-"""Short, so that each controller has a session of its own."""
-ENDING_S = 6.0
-"""After the last controller: until its session has ended and its file is closed."""
-GROWTH_MIB_H = 12.0
-"""What a service may grow in an hour; what is below can't be told from noise in half an hour."""
-LONG_S = 600.0
-"""After the warm-up: in less, noise is more than that."""
-RESIMULATED = 200
-"""Recordings, evenly out of all; each takes as long as reading some twenty."""
+"""Short, so that each controller starts a new session."""
+SESSION_END_WAIT_S = 6.0
+"""Time after which the session of the last controller has ended and its file is closed."""
+MAX_GROWTH_MIB_H = 12.0
+"""Largest memory growth of a service; smaller values can't be distinguished from noise within half an hour."""
+MIN_GROWTH_RUN_S = 600.0
+"""Shortest time after the warm-up for which memory growth is checked; noise dominates in shorter runs."""
+MAX_RESIMULATED = 200
+"""Number of recordings that are re-simulated, spread over all; each takes as long as reading about twenty."""
 
 
 def write(torque: int) -> bytes:
+    """Return a request that writes a torque of the first joint."""
     return struct.pack(">HHHBBHHB4h", 1, 0, 15, 1, 16, 0, 4, 8, torque, 0, 0, 0)
 
 
-# -- the controllers, a process of its own ---------------------------------------------------------------------------
+# -- the controllers, a separate process -----------------------------------------------------------------------------
 
 
-class Chaos:
-    """Controllers of all kinds, until the time is over."""
+class ControllerMix:
+    """Runs controllers with random behaviors on all rigs for a given time."""
 
     def __init__(self, first_port: int, seconds: float, seed: int) -> None:
         self._first_port = first_port
         self._end_s = time.monotonic() + seconds
         self._random = random.Random(seed)
         self.counts: dict[str, int] = {}
-        self._kinds: tuple[Callable[[int], Awaitable[None]], ...] = (
-            self.work,
-            self.work,
-            self.work,
-            self.vanish,
-            self.say_rubbish,
-            self.say_half,
+        self._behaviors: tuple[Callable[[int], Awaitable[None]], ...] = (
+            self.control,
+            self.control,
+            self.control,
+            self.reset,
+            self.send_garbage,
+            self.send_partial_request,
             self.flood,
-            self.fight,
-            self.be_silent,
+            self.compete_for_lease,
+            self.stay_idle,
         )
 
     async def run(self) -> None:
@@ -96,24 +97,24 @@ class Chaos:
                 loop.call_soon_threadsafe(self.stop)
 
         threading.Thread(target=stop_with_parent, daemon=True).start()
-        await asyncio.gather(*(self._seat(self._first_port + rig) for rig in range(RIGS)))
+        await asyncio.gather(*(self._run_port(self._first_port + rig) for rig in range(RIGS)))
 
     def stop(self) -> None:
-        """Nobody comes any more; who is there goes when he is done."""
+        """Start no further controllers; those that run finish."""
         self._end_s = 0.0
 
-    async def _seat(self, port: int) -> None:
+    async def _run_port(self, port: int) -> None:
         while time.monotonic() < self._end_s:
-            kind = self._random.choice(self._kinds)
-            name = getattr(kind, "__name__", "")
+            behavior = self._random.choice(self._behaviors)
+            name = getattr(behavior, "__name__", "")
             self.counts[name] = self.counts.get(name, 0) + 1
             try:
-                await asyncio.wait_for(kind(port), 30)
+                await asyncio.wait_for(behavior(port), 30)
             except (OSError, TimeoutError, asyncio.IncompleteReadError):
-                self.counts["broken"] = self.counts.get("broken", 0) + 1
+                self.counts["failed"] = self.counts.get("failed", 0) + 1
             await asyncio.sleep(self._random.uniform(0, 1))
 
-    async def work(self, port: int) -> None:
+    async def control(self, port: int) -> None:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         for _ in range(self._random.randint(10, 150)):
             if time.monotonic() > self._end_s:
@@ -126,21 +127,21 @@ class Chaos:
         writer.close()
         await writer.wait_closed()
 
-    async def vanish(self, port: int) -> None:
+    async def reset(self, port: int) -> None:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(write(500))
         await reader.readexactly(12)
-        # A reset, as of a program that was killed.
+        # A TCP reset, as from a killed process.
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         writer.close()
 
-    async def say_rubbish(self, port: int) -> None:
+    async def send_garbage(self, port: int) -> None:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(self._random.randbytes(self._random.randint(7, 400)))
         await asyncio.wait_for(reader.read(), 5)
         writer.close()
 
-    async def say_half(self, port: int) -> None:
+    async def send_partial_request(self, port: int) -> None:
         _, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(READ[: self._random.randint(1, 11)])
         await asyncio.sleep(self._random.uniform(0, 3))
@@ -153,18 +154,18 @@ class Chaos:
         await reader.readexactly(17 * count)
         writer.close()
 
-    async def fight(self, port: int) -> None:
-        both = [await asyncio.open_connection("127.0.0.1", port) for _ in range(2)]
+    async def compete_for_lease(self, port: int) -> None:
+        connections = [await asyncio.open_connection("127.0.0.1", port) for _ in range(2)]
         for _ in range(20):
-            for reader, writer in both:
+            for reader, writer in connections:
                 writer.write(write(100))
                 head = await reader.readexactly(6)
                 await reader.readexactly(int.from_bytes(head[4:], "big"))
             await asyncio.sleep(0.05)
-        for _, writer in both:
+        for _, writer in connections:
             writer.close()
 
-    async def be_silent(self, port: int) -> None:
+    async def stay_idle(self, port: int) -> None:
         _, writer = await asyncio.open_connection("127.0.0.1", port)
         await asyncio.sleep(self._random.uniform(0, 8))
         writer.close()
@@ -175,7 +176,7 @@ class Chaos:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One service at one moment."""
+    """Resources of one service at one time."""
 
     at_s: float
     resident_mib: float
@@ -184,24 +185,26 @@ class Sample:
 
 
 @dataclass
-class Watched:
-    """What was seen while it ran."""
+class Observation:
+    """Samples of the services and counts of the controllers."""
 
     samples: dict[str, list[Sample]] = field(default_factory=dict)
-    """Of each service."""
+    """Service → its samples."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Controllers of each kind."""
+    """Behavior → number of controllers."""
     seconds: float = 0.0
-    """How long the controllers were at it."""
+    """Time for which the controllers ran."""
 
-    def look(self, supervisor: Supervisor) -> None:
+    def sample_services(self, supervisor: Supervisor) -> None:
+        """Add a sample of each service."""
         for name, pid in supervisor.pids.items():
-            # One that has just died is looked at again when it is back.
+            # A service that has just crashed is sampled again after its restart.
             with suppress(OSError, KeyError):
                 self.samples.setdefault(name, []).append(sample(pid))
 
 
 def sample(pid: int) -> Sample:
+    """Read the resources of a process from /proc."""
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
     handles = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
     resident_mib = int(status["VmRSS"].split()[0]) / 1024
@@ -209,65 +212,66 @@ def sample(pid: int) -> Sample:
 
 
 def measure(minutes: float, report: Report, quick: bool) -> None:
+    """Run the lab with the controllers, then check services and recordings."""
     seconds = 60.0 * (1.0 if quick else minutes)
-    said: list[str] = []
+    supervisor_lines: list[str] = []
     with (
         tempfile.TemporaryDirectory(prefix="hilrig-bench-") as folder,
         interruptions() as interrupted,
         services_log(Path(folder) / "log"),
     ):
         lab, config, port = write_lab(Path(folder), rigs=RIGS, session_grace_ms=GRACE_MS)
-        with running_lab(lab, config, said.append, threading.Event()) as supervisor:
-            before = Watched()
-            before.look(supervisor)
-            watched = watch(supervisor, port, seconds, interrupted)
-            tell("what is left goes")
-            end_s = time.monotonic() + ENDING_S
+        with running_lab(lab, config, supervisor_lines.append, threading.Event()) as supervisor:
+            before = Observation()
+            before.sample_services(supervisor)
+            observation = watch(supervisor, port, seconds, interrupted)
+            log("waiting for the last sessions to end")
+            end_s = time.monotonic() + SESSION_END_WAIT_S
             while time.monotonic() < end_s:
                 supervisor.poll()
                 time.sleep(POLL_S)
-            after = Watched()
-            after.look(supervisor)
-            moving = standing_torques(lab)
-        for line in (*said, *troubles(Path(folder) / "log")):
-            tell(line)
-        tell("recordings are read")
-        found = whole(Path(folder))
-        parts = len(list(Path(folder).rglob("*.part")))
-    case = f"{RIGS} rigs for {watched.seconds / 60:.3g} min"
-    for kind, count in sorted(watched.counts.items()):
-        report.add(case, f"controllers that {kind.replace('_', ' ')}", count, "count")
+            after = Observation()
+            after.sample_services(supervisor)
+            active_rigs = rigs_with_torque(lab)
+        for line in (*supervisor_lines, *service_warnings(Path(folder) / "log")):
+            log(line)
+        log("checking the recordings")
+        found = check_recordings(Path(folder))
+        part_files = len(list(Path(folder).rglob("*.part")))
+    case = f"{RIGS} rigs for {observation.seconds / 60:.3g} min"
+    for behavior, count in sorted(observation.counts.items()):
+        report.add(case, f"controllers: {behavior.replace('_', ' ')}", count, "count")
     report.add(case, "recordings", found.files, "count")
     report.add(case, "recordings re-simulated", found.resimulated, "count")
-    for name, samples in sorted(watched.samples.items()):
-        judge(report, case, name, before.samples[name][0], samples, after.samples.get(name, samples)[-1])
-    report.bar("minutes made, of those meant", watched.seconds / seconds, ">=", 0.99)
-    report.bar("services that died", sum("restarting" in line for line in said), "<=", 0)
-    report.bar("rigs with a torque when all have gone", moving, "<=", 0)
-    report.bar("recordings that are not whole", found.torn + parts, "<=", 0)
-    report.bar("recordings that re-simulate to something else", found.different, "<=", 0)
-    report.bar("messages lost", found.lost, "<=", 0)
+    for name, samples in sorted(observation.samples.items()):
+        check_service(report, case, name, before.samples[name][0], samples, after.samples.get(name, samples)[-1])
+    report.require("duration, relative to the planned one", observation.seconds / seconds, ">=", 0.99)
+    report.require("services that crashed", sum("restarting" in line for line in supervisor_lines), "<=", 0)
+    report.require("rigs with a torque after the last controller", active_rigs, "<=", 0)
+    report.require("incomplete recordings", found.incomplete + part_files, "<=", 0)
+    report.require("recordings that differ from their re-simulation", found.mismatched, "<=", 0)
+    report.require("messages lost", found.lost, "<=", 0)
 
 
-def troubles(log: Path) -> Iterator[str]:
-    """What the services warned of, rubbish that was meant as such apart; not all of it."""
-    expected = (": INFO: ", "sent no Modbus")
+def service_warnings(log: Path) -> Iterator[str]:
+    """Yield the first warnings of the services, without those about intended garbage."""
+    expected = (": INFO: ", "did not send Modbus TCP")
     lines = [
-        line for line in log.read_text(errors="replace").splitlines() if not any(word in line for word in expected)
+        line for line in log.read_text(errors="replace").splitlines() if not any(text in line for text in expected)
     ]
     yield from lines[:40]
     if len(lines) > 40:
-        yield f"and {len(lines) - 40} more lines"
+        yield f"{len(lines) - 40} more lines"
 
 
 @contextmanager
 def interruptions() -> Iterator[threading.Event]:
-    """Set by the first Ctrl-C or SIGTERM; the second ends the process as usual."""
+    """Yield an event that the first Ctrl-C or SIGTERM sets; the second one ends the process as usual."""
     interrupted = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def interrupt(number: int, _: object) -> None:
-        tell("interrupted: what there is until now is judged; once more ends at once")
+        log("interrupted: evaluating the data collected so far; press Ctrl-C again to stop immediately")
         interrupted.set()
         signal.signal(number, before[signal.Signals(number)])
 
@@ -278,143 +282,149 @@ def interruptions() -> Iterator[threading.Event]:
         signal.signal(number, handler)
 
 
-def watch(supervisor: Supervisor, port: int, seconds: float, interrupted: threading.Event) -> Watched:
-    """Let the controllers loose, and look at the services until they have gone."""
-    watched = Watched()
-    command = [sys.executable, __file__, "--chaos", str(port), str(seconds)]
-    begin_s = due_s = tell_s = time.monotonic()
-    # In a group of its own: a terminal's Ctrl-C is for us. It ends with its standard input.
-    chaos = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-    with chaos:
-        assert chaos.stdin is not None
-        assert chaos.stdout is not None
-        while chaos.poll() is None:
+def watch(supervisor: Supervisor, port: int, seconds: float, interrupted: threading.Event) -> Observation:
+    """Start the controllers and sample the services until the controllers have finished."""
+    observation = Observation()
+    command = [sys.executable, __file__, "--controllers", str(port), str(seconds)]
+    begin_s = due_s = log_s = time.monotonic()
+    # A new process group, so that Ctrl-C reaches only this process. The child stops when its standard input is closed.
+    controllers = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+    with controllers:
+        assert controllers.stdin is not None
+        assert controllers.stdout is not None
+        while controllers.poll() is None:
             supervisor.poll()
             now_s = time.monotonic()
             if not interrupted.is_set():
-                watched.seconds = min(seconds, now_s - begin_s)
-            elif not chaos.stdin.closed:
-                chaos.stdin.close()
+                observation.seconds = min(seconds, now_s - begin_s)
+            elif not controllers.stdin.closed:
+                controllers.stdin.close()
             if now_s >= due_s:
                 due_s += SAMPLE_S
-                watched.look(supervisor)
-            if now_s >= tell_s:
-                tell_s += 60.0
-                newest = {name: samples[-1] for name, samples in watched.samples.items()}
-                tell(
+                observation.sample_services(supervisor)
+            if now_s >= log_s:
+                log_s += 60.0
+                newest = {name: samples[-1] for name, samples in observation.samples.items()}
+                log(
                     f"{(now_s - begin_s) / 60:.0f} min: "
-                    + ", ".join(f"{n} {s.resident_mib:.1f} MiB, {s.handles} handles" for n, s in newest.items())
+                    + ", ".join(
+                        f"{n} {s.resident_mib:.1f} MiB, {s.handles} file descriptors" for n, s in newest.items()
+                    )
                 )
             time.sleep(POLL_S)
-        watched.counts = json.loads(chaos.stdout.read())
-    return watched
+        observation.counts = json.loads(controllers.stdout.read())
+    return observation
 
 
-def judge(report: Report, case: str, name: str, before: Sample, samples: Sequence[Sample], after: Sample) -> None:
-    """Memory, handles and threads of one service."""
+def check_service(
+    report: Report, case: str, name: str, before: Sample, samples: Sequence[Sample], after: Sample
+) -> None:
+    """Add and check memory, file descriptors and threads of one service."""
     begin_s, end_s = samples[0].at_s, samples[-1].at_s
-    warm_s = begin_s + min(WARM_UP_S, WARM_UP_SHARE * (end_s - begin_s))
+    warm_s = begin_s + min(WARM_UP_S, WARM_UP_FRACTION * (end_s - begin_s))
     settled = [one for one in samples if one.at_s >= warm_s]
-    report.add(case, f"{name}: memory when settled", settled[0].resident_mib, "MiB")
+    report.add(case, f"{name}: memory after the warm-up", settled[0].resident_mib, "MiB")
     report.add(case, f"{name}: memory at the end", settled[-1].resident_mib, "MiB")
-    report.add(case, f"{name}: handles before", before.handles, "count")
-    report.add(case, f"{name}: handles p95", percentile([one.handles for one in samples], 0.95), "count")
-    report.add(case, f"{name}: handles after", after.handles, "count")
+    report.add(case, f"{name}: file descriptors before", before.handles, "count")
+    report.add(case, f"{name}: file descriptors p95", percentile([one.handles for one in samples], 0.95), "count")
+    report.add(case, f"{name}: file descriptors after", after.handles, "count")
     report.add(case, f"{name}: threads before", before.threads, "count")
     report.add(case, f"{name}: threads after", after.threads, "count")
-    growth = report.add(case, f"{name}: growth of memory", growth_mib_h(settled), "MiB/h")
-    if settled[-1].at_s - settled[0].at_s >= LONG_S:
-        report.bar(f"{name}: growth of memory", growth, "<=", GROWTH_MIB_H, "MiB/h")
+    growth = report.add(case, f"{name}: memory growth", growth_mib_h(settled), "MiB/h")
+    if settled[-1].at_s - settled[0].at_s >= MIN_GROWTH_RUN_S:
+        report.require(f"{name}: memory growth", growth, "<=", MAX_GROWTH_MIB_H, "MiB/h")
     else:
-        report.say(f"{name}: too short a run to judge the growth of memory; it takes {LONG_S / 60:g} min after warm-up")
-    report.bar(f"{name}: handles left behind", after.handles - before.handles, "<=", 2)
-    report.bar(f"{name}: threads left behind", after.threads - before.threads, "<=", 2)
+        report.add_note(f"{name}: memory growth not checked; it needs {MIN_GROWTH_RUN_S / 60:g} min after the warm-up")
+    report.require(f"{name}: additional file descriptors", after.handles - before.handles, "<=", 2)
+    report.require(f"{name}: additional threads", after.threads - before.threads, "<=", 2)
 
 
 def growth_mib_h(samples: Sequence[Sample]) -> float:
-    """Median of the slopes between all pairs of samples (Theil and Sen), MiB an hour."""
+    """Return the median of the slopes between all pairs of samples (Theil–Sen estimator), MiB/h."""
     at_s = np.array([one.at_s for one in samples])
     mib = np.array([one.resident_mib for one in samples])
     first, second = np.triu_indices(len(samples), 1)
     return 3600 * float(np.median((mib[second] - mib[first]) / (at_s[second] - at_s[first])))
 
 
-def standing_torques(lab: LabConfig) -> int:
-    """Rigs whose arm has a torque now, or of which nothing is heard."""
+def rigs_with_torque(lab: LabConfig) -> int:
+    """Return the number of rigs that have a torque or whose state was not received."""
     zero: dict[str, bool] = {}
     complete = threading.Event()
 
-    def hear(_: str, payload: bytes) -> None:
+    def on_states(_: str, payload: bytes) -> None:
         batch = RigBatch.FromString(payload)
         for rig, message in zip(batch.rigs, batch.messages, strict=True):
             zero[rig] = not any(JointState.FromString(message).effort)
         if len(zero) == len(lab.rigs):
             complete.set()
 
-    with ZenohBus(lab.bus, "tool") as bus, bus.subscribe(STATES.key(lab.name, "*", "*"), hear):
+    with ZenohBus(lab.bus, "tool") as bus, bus.subscribe(STATES.key(lab.name, "*", "*"), on_states):
         complete.wait(3.0)
     return sum(not zero.get(rig.name, False) for rig in lab.rigs)
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What the recordings are."""
+class RecordingCheck:
+    """Results of reading and re-simulating the recordings."""
 
     files: int
-    torn: int
-    """They can't be read, had to be recovered, or miss states."""
+    incomplete: int
+    """Recordings that can't be read, were recovered or lack states."""
     lost: int
-    """Messages that they state as lost."""
+    """Messages that the recordings report as lost."""
     resimulated: int
-    different: int
+    mismatched: int
 
 
-def whole(folder: Path) -> Found:
-    """Read every recording, and re-simulate some."""
+def check_recordings(folder: Path) -> RecordingCheck:
+    """Read all recordings and re-simulate some of them."""
     paths = sorted(folder.rglob("*.mcap"))
-    some = paths[:: max(1, len(paths) // RESIMULATED)]
+    some = paths[:: max(1, len(paths) // MAX_RESIMULATED)]
     with ProcessPoolExecutor() as pool:
         read = list(pool.map(read_one, paths, chunksize=16))
         same = list(pool.map(resimulate_one, some, chunksize=4))
-    return Found(len(paths), sum(torn for torn, _ in read), sum(lost for _, lost in read), len(some), same.count(False))
+    incomplete = sum(is_incomplete for is_incomplete, _ in read)
+    lost = sum(lost_here for _, lost_here in read)
+    return RecordingCheck(len(paths), incomplete, lost, len(some), same.count(False))
 
 
 def read_one(path: Path) -> tuple[bool, int]:
-    """Whether it is torn, and how many messages it states as lost."""
+    """Return whether a recording is incomplete, and the number of messages that it reports as lost."""
     try:
         run = open_run(path)
     except InputError as error:
-        tell(str(error))
+        log(str(error))
         return True, 0
     losses = run.losses
     steps = run.states["step"].astype(np.int64)
     gaps = int((np.diff(steps) != 1).sum())
-    torn = run.recovered or losses is None or gaps > 0 or not run.parameters_json
-    if torn:
-        tell(f"{path.name}: recovered {run.recovered}, {gaps} gaps, parameters {bool(run.parameters_json)}")
-    return torn, 0 if losses is None else losses.transport + losses.recorder
+    incomplete = run.recovered or losses is None or gaps > 0 or not run.parameters_json
+    if incomplete:
+        log(f"{path.name}: recovered {run.recovered}, {gaps} gaps, parameters {bool(run.parameters_json)}")
+    return incomplete, 0 if losses is None else losses.transport + losses.recorder
 
 
 def resimulate_one(path: Path) -> bool:
-    """Whether it re-simulates to what was recorded; what is too short to be re-simulated does."""
+    """Return whether the re-simulation equals the recording; true if it is too short to be re-simulated."""
     try:
         found = verify(path)
     except InputError as error:
-        tell(str(error))
+        log(str(error))
         return False
     return found.same or found.steps == 0
 
 
-def tell(text: str) -> None:
-    """Say how it goes, also where nobody watches: it is kept if this process is ended."""
+def log(text: str) -> None:
+    """Print the progress on standard error, also without a terminal."""
     print(f"  {text}", file=sys.stderr, flush=True)
 
 
 def main() -> int:
-    if "--chaos" in sys.argv:
-        chaos = Chaos(int(sys.argv[2]), float(sys.argv[3]), seed=1)
-        asyncio.run(chaos.run())
-        print(json.dumps(chaos.counts))
+    if "--controllers" in sys.argv:
+        controllers = ControllerMix(int(sys.argv[2]), float(sys.argv[3]), seed=1)
+        asyncio.run(controllers.run())
+        print(json.dumps(controllers.counts))
         return 0
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--minutes", type=float, default=30.0)

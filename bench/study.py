@@ -1,8 +1,9 @@
-"""How fast is a study in virtual time, next to the clock and to the same study with scipy's `solve_ivp` in a loop?
+"""Measures the speed of a simulated study, compared with real time and with scipy's `solve_ivp` in a loop.
 
-200 delays by 200 gains, 10 s each at a step of 20 ms: 40,000 closed loops of the arm with its registers, on all cores.
-The peer does what one writes first: for each run and step a `solve_ivp` over 20 ms under the held torque, with the same
-controller, delay and registers; a few runs are timed, on one core, and the rest is a multiplication.
+The study has 200 delays by 200 gains, 10 s each at a step of 20 ms: 40,000 closed loops of the arm with its registers,
+on all cores. The peer is a simple implementation: for each run and step one `solve_ivp` call over 20 ms with constant
+torque, with the same controller, delay and registers. A few of its runs are timed on one core; the time of all is
+extrapolated.
 """
 
 import statistics
@@ -21,19 +22,20 @@ from hilrig_study.simulation.timing import NO_POLL, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.sweep import all_cells, run_cells, sweep
 
-PEERS = ((20.0, 0.3), (60.0, 0.4), (120.0, 0.2))
-"""Delays, ms, and gains of the runs that are timed with solve_ivp."""
+PEER_RUNS = ((20.0, 0.3), (60.0, 0.4), (120.0, 0.2))
+"""Delays, ms, and gains of the runs that are timed with `solve_ivp`."""
 
 
 def study_of(side: int) -> StudyConfig:
+    """Return a study of `side` delays by `side` gains."""
     return StudyConfig(
         x=AxisConfig(what="delay_ms", range=(0.0, 200.0), count=side),
         y=AxisConfig(what="gain", range=(0.05, 1.5), count=side),
     )
 
 
-def one_by_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[float, np.ndarray]:
-    """Seconds that one run takes, and where the arm is at its end."""
+def run_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[float, np.ndarray]:
+    """Simulate one run with `solve_ivp`; return the time that it takes, s, and the final joint positions."""
     timing, rig, plant_model, scenario = study.loop.timing(), study.rig(), study.linear_plant(), study.task.scenario()
     ticks = round(study.loop.duration_s * 1e9 / timing.step_ns)
     line = timeline(timing, ticks, command_delay_ns=round(delay_ms * 1e6))
@@ -42,13 +44,13 @@ def one_by_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[
     memory = controller.start(1)
     state = np.concatenate([scenario.start, np.zeros(4)])
     commands: list[np.ndarray] = []
-    seen = np.empty((ticks, 4))
+    read_positions = np.empty((ticks, 4))
     begin = time.perf_counter()
     for tick in range(ticks):
-        seen[tick] = quantization.position(state[:4, np.newaxis])[:, 0]
+        read_positions[tick] = quantization.position(state[:4, np.newaxis])[:, 0]
         effort = np.array(plant_model.holding) if line.in_force[tick] == NO_POLL else commands[line.in_force[tick]]
         now = np.array([line.poll_ns[tick] * 1e-9])
-        known = seen[line.basis[tick], :, np.newaxis]
+        known = read_positions[line.basis[tick], :, np.newaxis]
         given, memory = controller.law(memory, Measurement(now, known, scenario.goal(now), np.zeros(1)))
         commands.append(quantization.effort(given)[:, 0])
 
@@ -60,45 +62,54 @@ def one_by_solve_ivp(study: StudyConfig, delay_ms: float, gain: float) -> tuple[
 
 
 def measure(report: Report, quick: bool) -> None:
+    """Time the sweep, one batch and some runs of the peer."""
     side = 40 if quick else 200
     study = study_of(side)
     seconds = []
     for number in range(1 if quick else 3):
-        progress(f"{side} x {side} in virtual time, run {number + 1}")
+        progress(f"{side} x {side}, simulation, run {number + 1}")
         swept = sweep(study, Path(), lambda _: None, theory=False)
         seconds.append(swept.seconds)
-    took = report.add(f"{side} x {side}, 10 s each", "virtual time", statistics.median(seconds), "s")
+    simulation_s = report.add(f"{side} x {side}, 10 s each", "simulation", statistics.median(seconds), "s")
     runs = side * side
-    report.add(f"{side} x {side}, 10 s each", "a run", took / runs * 1e3, "ms")
-    real = report.add("against the clock", "times real time", runs * study.loop.duration_s / took, "times")
+    report.add(f"{side} x {side}, 10 s each", "per run", simulation_s / runs * 1e3, "ms")
+    speedup = report.add("compared with real time", "speedup", runs * study.loop.duration_s / simulation_s, "times")
     progress("with theory")
     both = sweep(study, Path(), lambda _: None)
-    report.add(f"{side} x {side}, with theory", "virtual time and theory", both.seconds, "s")
+    report.add(f"{side} x {side}, with theory", "simulation and theory", both.seconds, "s")
     cells = all_cells(study)[:1000]
     begin = time.perf_counter()
     run_cells(study, cells)
-    report.add("one batch of 1,000 on one core", "a run", time.perf_counter() - begin, "ms")
+    report.add("one batch of 1,000 on one core", "per run", time.perf_counter() - begin, "ms")
     peers = []
-    for delay_ms, gain in PEERS[: 1 if quick else None]:
+    for delay_ms, gain in PEER_RUNS[: 1 if quick else None]:
         progress(f"solve_ivp: delay {delay_ms:g} ms, gain {gain:g}")
-        peer_s, end = one_by_solve_ivp(study, delay_ms, gain)
+        peer_s, end = run_solve_ivp(study, delay_ms, gain)
         peers.append(peer_s)
-        mine = cells[:1].copy()
-        mine["delay_ms"], mine["gain"] = delay_ms, gain
-        _, outcome = run_cells(study, mine, keep=True)
-        apart = np.degrees(np.abs(outcome.positions[-1, :2, 0] - end[:2]).max())
-        report.add(f"solve_ivp, delay {delay_ms:g} ms, gain {gain:g}", "a run", peer_s * 1e3, "ms")
-        report.add(f"solve_ivp, delay {delay_ms:g} ms, gain {gain:g}", "apart at the end", apart, "°")
+        cell = cells[:1].copy()
+        cell["delay_ms"], cell["gain"] = delay_ms, gain
+        _, outcome = run_cells(study, cell, keep=True)
+        difference = np.degrees(np.abs(outcome.positions[-1, :2, 0] - end[:2]).max())
+        report.add(f"solve_ivp, delay {delay_ms:g} ms, gain {gain:g}", "per run", peer_s * 1e3, "ms")
+        report.add(
+            f"solve_ivp, delay {delay_ms:g} ms, gain {gain:g}", "difference of the final positions", difference, "°"
+        )
     peer = statistics.median(peers)
-    report.add("solve_ivp in a loop, one core", f"{side} x {side}, by multiplication", peer * runs, "s")
+    report.add("solve_ivp in a loop, one core", f"{side} x {side}, extrapolated", peer * runs, "s")
     if not quick:
-        report.bar("200 x 200 sweep, 10 s each", took, "<=", 60, "s")
-    report.bar("study against the clock", real, ">=", 5000 if not quick else 500, "times")
-    report.bar(
-        "study against solve_ivp in a loop on one core", peer * runs / took, ">=", 300 if not quick else 30, "times"
+        report.require("200 x 200 sweep, 10 s each", simulation_s, "<=", 60, "s")
+    report.require("speedup over real time", speedup, ">=", 5000 if not quick else 500, "times")
+    report.require(
+        "speedup over solve_ivp in a loop on one core",
+        peer * runs / simulation_s,
+        ">=",
+        300 if not quick else 30,
+        "times",
     )
-    report.say("The sweep uses all cores, spawned; solve_ivp is timed on one, run by run, as a loop over it would be.")
+    report.add_note(
+        "The sweep uses all cores in spawned processes; solve_ivp runs on one core, one run after the other."
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(run(measure, "How fast is a study in virtual time, next to the clock and to solve_ivp in a loop?"))
+    sys.exit(run(measure, "How fast is a simulated study, compared with real time and with solve_ivp in a loop?"))

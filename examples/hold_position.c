@@ -1,10 +1,10 @@
-/* Hold the arm, and move it: a joint controller over Modbus TCP with libmodbus. A place to start from.
+/* Example joint controller over Modbus TCP with libmodbus: holds the arm and moves it between two poses.
  *
  *     gcc -O2 -o hold_position hold_position.c $(pkg-config --cflags --libs libmodbus) -lm
  *     ./hold_position 127.0.0.1 5020 16
  *
- * Each turn of the loop reads four positions, computes four torques and writes them at once, then waits for the next
- * turn at a deadline that does not drift. Ends with 0 if the arm is where it was sent.
+ * Each cycle reads four positions, computes four torques, writes them in one request, and waits for an absolute
+ * deadline, so the period does not drift. The exit code is 0 if the arm is at its goal at the end.
  */
 #define _POSIX_C_SOURCE 200809L
 #include <errno.h>
@@ -17,21 +17,21 @@
 
 enum { JOINTS = 4, POSES = 2 };
 
-static const double PERIOD = 0.02;     /* s between two turns of the loop */
+static const double PERIOD = 0.02;     /* period of the control cycle, s */
 static const double MOVE_EVERY = 4.0;  /* s in each pose */
 static const double POSE[POSES][JOINTS] = {{30, -45, 50, 20}, {-20, 60, 120, -30}}; /* degrees, degrees, mm, degrees */
 
-/* What one degree (mm) of error, and one degree (mm) a second of speed, is worth; N·m and N. */
+/* Gains: N·m per degree (N per mm) of error, and N·m per degree/s (N per mm/s) of speed. */
 static const double KP[JOINTS] = {0.25, 0.25, 0.03, 0.004};
 static const double KD[JOINTS] = {0.04, 0.03, 0.002, 0.0005};
-/* The quill hangs on joint 3, which counts positive downwards: its weight is carried with a force upwards. */
+/* Joint 3 carries the quill and counts positive downwards: an upward force compensates the weight. */
 static const double GRAVITY[JOINTS] = {0, 0, -0.5 * 9.81, 0};
-/* Errors that count no further: the arm does not leap at a far goal. */
-static const double MOST[JOINTS] = {30, 30, 40, 60};
+/* Limits of the error, so that the arm does not accelerate too much toward a distant goal. */
+static const double MAX_ERROR[JOINTS] = {30, 30, 40, 60};
 
-static double limit(double value, double most)
+static double limit(double value, double bound)
 {
-    return fmax(-most, fmin(most, value));
+    return fmax(-bound, fmin(bound, value));
 }
 
 static double seconds(struct timespec t)
@@ -46,7 +46,7 @@ int main(int argc, char **argv)
     double duration = argc > 3 ? atof(argv[3]) : 16.0;
     modbus_t *rig = modbus_new_tcp(host, port);
     if (rig == NULL || modbus_connect(rig) == -1) {
-        fprintf(stderr, "no rig answers at %s:%d: %s\n", host, port, modbus_strerror(errno));
+        fprintf(stderr, "can't connect to a rig at %s:%d: %s\n", host, port, modbus_strerror(errno));
         return 3;
     }
 
@@ -68,11 +68,11 @@ int main(int argc, char **argv)
         const double *goal = POSE[(int)(time / MOVE_EVERY) % POSES];
         for (int j = 0; j < JOINTS; j++) {
             double position = (int16_t)words[j] / 100.0;
-            /* The registers step by 0.01: the difference of two is rough, so it is smoothed. */
+            /* The registers have a resolution of 0.01, so the difference quotient is filtered. */
             if (!first) speed[j] = 0.5 * speed[j] + 0.5 * (position - before[j]) / PERIOD;
             before[j] = position;
             error[j] = goal[j] - position;
-            double torque = KP[j] * limit(error[j], MOST[j]) - KD[j] * speed[j] + GRAVITY[j];
+            double torque = KP[j] * limit(error[j], MAX_ERROR[j]) - KD[j] * speed[j] + GRAVITY[j];
             words[j] = (uint16_t)(int16_t)lround(limit(1000 * torque, 32767));
         }
         first = 0;

@@ -1,18 +1,17 @@
-"""Pick every part and place it in the tray: a controller for hilrig, as a good student would write it.
+"""Example controller for hilrig that picks every part and places it in the tray.
 
-It needs nothing of hilrig but the address: positions come and torques go through the rig's Modbus registers (holding
-registers 1-4 torques, 5-8 positions, coil 1 the magnet). What it knows is the arm's data sheet and the task, that is
-where the parts lie and where they belong.
+It uses only the rig's Modbus registers (holding registers 1-4: torques, 5-8: positions, coil 1: magnet), the data
+sheet of the arm, and the task: the positions of the parts and their places in the tray.
 
     python pick_and_place.py --host 127.0.0.1 --port 5020 --duration 20
 
-How it works, from the outside in:
-- a plan of moves from pose to pose (inverse kinematics gives the joints);
-- each move follows an S-curve (quintic polynomial), so that acceleration never jumps;
-- torque = what the model says the motion needs (inertia, friction, gravity with what the magnet holds)
-         + PD on the error, which has to clean up only what the model got wrong;
-- the magnet is switched when the arm is seen to rest where it should be. A curve's time says where it ought to be: on a
-  computer or a network that was held up for a moment, it isn't.
+Method:
+- a plan of moves from pose to pose (inverse kinematics computes the joints);
+- each move follows an S-curve (quintic polynomial) with continuous acceleration;
+- torque = feedforward of the model (inertia, friction, gravity including the held part)
+         + PD feedback of the error, which corrects the errors of the model;
+- the magnet is switched when the measured position is at rest at its goal. The time on the curve is not sufficient: if
+  the computer or the network is delayed, the arm is behind its curve.
 """
 
 import argparse
@@ -30,42 +29,42 @@ from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
-# The arm's data sheet: metres, kilograms, newtons.
+# Data sheet of the arm: meters, kilograms, newtons.
 L1, L2, L3 = 0.139, 0.300, 0.300
 M1, M2, M3, J4 = 1.0, 1.0, 0.5, 0.005
 FRICTION = np.array([2.0, 2.0, 5.0, 0.05])
 GRAVITY = 9.81
 LOWER = np.array([math.radians(-133), math.radians(-153), 0.0, math.radians(-327)])
 UPPER = np.array([math.radians(133), math.radians(153), 0.200, math.radians(327)])
-LARGEST_EFFORT = 32.767  # what the registers can say
+LARGEST_EFFORT = 32.767  # range of the registers
 
-# How fast a move may be.
+# Limits of a move.
 SPEED = np.array([4.5, 4.5, 0.70, 9.0])
 ACCELERATION = np.array([20.0, 20.0, 9.0, 50.0])
 
-# Feedback: with stiffness w(B + wM) and damping 2wM, an error vanishes at the rates w and w + friction/inertia. The
-# later efforts act, the smaller must w be.
+# Feedback: with stiffness w(B + wM) and damping 2wM, an error decays at the rates w and w + friction/inertia. A larger
+# latency requires a smaller w.
 LARGEST_RATE = 6.0
 RATE_TIMES_LATENCY = 0.22
 ERROR_FILTER_S = 0.03
-STALE_S = 0.025  # positions that stay the same for so long are new ones all the same
-LEAD_S = 0.02  # an effort acts that much later than it is written: until the rig's next step, and half of it
-SHORT_CYCLE_S = 0.030  # a controller that is slower than that moves the arm more slowly
-CYCLE_LEAD = 1.25  # of a cycle beyond the usual period: three quarters on the way, half of one acting
-FAST = 0.5  # (rad/s)²: a motion that shows how late the arm is
-LAG_SHARE = 0.15  # of what is seen of the lag is learnt at a time
+STALE_S = 0.025  # unchanged positions count as new ones after this time
+LEAD_S = 0.02  # mean time from the write of a torque to its effect: to the rig's next step, and half of it
+SHORT_CYCLE_S = 0.030  # with a longer control cycle, moves are slowed down
+CYCLE_LEAD = 1.25  # additional lead per additional cycle time: three quarters in transit, half of one in effect
+FAST = 0.5  # (rad/s)²: speed from which the lag of the arm can be measured
+LAG_SHARE = 0.15  # weight of a new lag measurement in the moving average
 LARGEST_LAG_S = 0.25
-HELD_UP_S = 0.045  # new positions that take longer than two steps of the rig were held up
+HELD_UP_S = 0.045  # positions that are delayed by more than two steps of the rig indicate an interruption
 
 PERIOD_S = 0.010
 RIG_STEP_S = 0.020
-CLEARANCE_Z = 0.025  # height of the tip while it travels: what it carries passes over everything
-HOVER = 0.001  # distance at which parts are taken and set down
-# Where a pose on the way counts as passed, and where the magnet may be switched: near enough, and at rest (per second).
+CLEARANCE_Z = 0.025  # height of the tip while moving, m: a carried part passes over all others
+HOVER = 0.001  # distance between tip and part when picking and placing, m
+# Tolerances for passing an intermediate pose, and for switching the magnet: position, and speed (per second).
 PASSED = np.array([math.radians(4.0), math.radians(4.0), 0.006, math.radians(10.0)])
 IN_PLACE = np.array([math.radians(0.05), math.radians(0.05), 0.0008, math.radians(1.0)])
 AT_REST = np.array([math.radians(1.0), math.radians(1.0), 0.010, math.radians(10.0)])
-REST_S = 0.04  # so long: two steps of the rig
+REST_S = 0.04  # minimum time at rest before the magnet is switched: two steps of the rig
 GRIP_S = 0.10
 
 HOME = np.array([0.0, 0.0, L1 - CLEARANCE_Z, 0.0])
@@ -73,7 +72,7 @@ HOME = np.array([0.0, 0.0, L1 - CLEARANCE_Z, 0.0])
 
 @dataclass(frozen=True)
 class Part:
-    """A part as the task describes it: middle of its footprint, m; yaw, rad; kg."""
+    """Part of the task: center of its footprint, m; yaw, rad; mass, kg."""
 
     name: str
     x: float
@@ -85,7 +84,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a part belongs: m, rad."""
+    """Place of a part in a tray: m, rad."""
 
     x: float
     y: float
@@ -95,7 +94,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Task:
-    """What lies where, and where it belongs."""
+    """Parts and their places."""
 
     parts: tuple[Part, ...]
     places: tuple[Place, ...]
@@ -114,7 +113,7 @@ DEFAULT_SCENE = {
 
 
 def task_of(scene: dict) -> Task:
-    """The task, from the `[scene]` of a lab's file; what it leaves out is as in hilrig's defaults."""
+    """Read the task from the `[scene]` of a lab's file; missing keys have hilrig's defaults."""
     table = scene.get("table", {}).get("height_mm", -60.0) / 1000
     parts = []
     for part in scene.get("parts", DEFAULT_SCENE["parts"]):
@@ -141,7 +140,7 @@ def task_of(scene: dict) -> Task:
 
 
 def joints_for(x: float, y: float, z: float, yaw: float, near: np.ndarray) -> np.ndarray:
-    """Joints that bring the tool to a pose: of the two elbows, the one that is nearer to the joints `near`."""
+    """Inverse kinematics of a tool pose: of the two solutions, the one that is nearer to the joints `near`."""
     cosine = (x * x + y * y - L2 * L2 - L3 * L3) / (2 * L2 * L3)
     if abs(cosine) > 1:
         raise ValueError(f"({x:.3f}, {y:.3f}) m is out of the arm's reach")
@@ -153,9 +152,9 @@ def joints_for(x: float, y: float, z: float, yaw: float, near: np.ndarray) -> np
         theta4 = near[3] + math.remainder(theta4 - near[3], 2 * math.pi)
         joints = np.array([theta1, theta2, L1 - z, theta4])
         if np.all((joints >= LOWER) & (joints <= UPPER)):
-            way = np.abs(joints - near)[:2].max()
-            if best is None or way < best[0]:
-                best = (way, joints)
+            distance = np.abs(joints - near)[:2].max()
+            if best is None or distance < best[0]:
+                best = (distance, joints)
     if best is None:
         raise ValueError(f"({x:.3f}, {y:.3f}, {z:.3f}) m is not within the joints' limits")
     return best[1]
@@ -164,7 +163,7 @@ def joints_for(x: float, y: float, z: float, yaw: float, near: np.ndarray) -> np
 def efforts_for(
     joints: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, held_mass: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Efforts that the model needs for a motion, and the mass matrix with which feedback is scaled."""
+    """Inverse dynamics: torques for a motion, and the mass matrix, which scales the feedback."""
     mass = M2 + M3 + held_mass
     p, ps = mass * L2 * L3 * math.cos(joints[1]), mass * L2 * L3 * math.sin(joints[1])
     a22 = mass * L3 * L3
@@ -176,23 +175,23 @@ def efforts_for(
 
 
 class Move:
-    """An S-curve from joints to joints: all start and arrive together, at rest; `slowed` so many times."""
+    """S-curve between two joint positions: all joints start and arrive together, at rest; `slowed` is a time factor."""
 
     def __init__(self, start: np.ndarray, goal: np.ndarray, slowed: float = 1.0) -> None:
         self.start, self.goal = start, goal
-        way = np.abs(goal - start)
-        # Peaks of the quintic: 15/8 of the mean speed, 10/sqrt(3) ways over the time squared.
-        fastest = float(max((1.875 * way / SPEED).max(), np.sqrt(5.774 * way / ACCELERATION).max()))
+        distance = np.abs(goal - start)
+        # Maxima of the quintic: speed 15/8 of the mean, acceleration 10/sqrt(3) times distance / time².
+        fastest = float(max((1.875 * distance / SPEED).max(), np.sqrt(5.774 * distance / ACCELERATION).max()))
         self.duration = slowed * max(0.1, fastest)
 
     def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Joints, their speeds and accelerations."""
-        way, duration = self.goal - self.start, self.duration
+        """Positions, speeds and accelerations of the joints at a time."""
+        distance, duration = self.goal - self.start, self.duration
         s = min(max(time_s / duration, 0.0), 1.0)
         position = s**3 * (10 - 15 * s + 6 * s * s)
         speed = 30 * s * s * (1 - s) ** 2 / duration
         acceleration = 60 * s * (1 - s) * (1 - 2 * s) / duration**2
-        return self.start + way * position, way * speed, way * acceleration
+        return self.start + distance * position, distance * speed, distance * acceleration
 
 
 # --- The plan --------------------------------------------------------------------------------------------------------
@@ -200,7 +199,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Stage:
-    """Go to the goal; one that `switches` the magnet does so once the arm rests there, however long that takes."""
+    """Move to a goal; if `switches` is set, the magnet is switched once the arm is at rest there."""
 
     text: str
     goal: np.ndarray
@@ -211,7 +210,7 @@ class Stage:
 
 
 def plan(task: Task, start: np.ndarray) -> Iterator[Stage]:
-    """The stages of the work from the joints `start` on, one part after the other."""
+    """Generate the stages of the task from the joints `start`, part by part."""
     here = np.array([start[0], start[1], HOME[2], start[3]])
     yield Stage("up", here)
     for number, (part, place) in enumerate(zip(task.parts, task.places, strict=False), start=1):
@@ -219,24 +218,24 @@ def plan(task: Task, start: np.ndarray) -> Iterator[Stage]:
         above = joints_for(part.x, part.y, CLEARANCE_Z, part.yaw, here)
         at = joints_for(part.x, part.y, top + HOVER, part.yaw, above)
         yield Stage(f"over {part.name}", above)
-        yield Stage(f"take {part.name}", at, switches=True, magnet=True, held_mass=part.mass)
+        yield Stage(f"pick {part.name}", at, switches=True, magnet=True, held_mass=part.mass)
         yield Stage(f"lift {part.name}", above, magnet=True, held_mass=part.mass)
         above_place = joints_for(place.x, place.y, CLEARANCE_Z, place.yaw, above)
         at_place = joints_for(place.x, place.y, place.z + part.height + HOVER, place.yaw, above_place)
         yield Stage(f"carry {part.name}", above_place, magnet=True, held_mass=part.mass)
-        yield Stage(f"set down {part.name}", at_place, switches=True, placed=number)
+        yield Stage(f"place {part.name}", at_place, switches=True, placed=number)
         yield Stage("up", above_place, placed=number)
         here = above_place
     yield Stage("home", HOME, placed=min(len(task.parts), len(task.places)))
 
 
 class Controller:
-    """From positions to efforts: knows the plan, not how the numbers travel."""
+    """Computes torques from positions according to the plan; independent of the communication."""
 
-    def __init__(self, task: Task, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, task: Task, log: Callable[[str], None] = lambda _: None) -> None:
         self._task = task
         self._stages: Iterator[Stage] = iter(())
-        self._say = say
+        self._log = log
         self._move: Move | None = None
         self._began_s = 0.0
         self._switched_s: float | None = None
@@ -250,26 +249,26 @@ class Controller:
         self._speed = np.zeros(4)
         self._last_s = self._cycle_s = 0.0
         self.usual_cycle_s = PERIOD_S
-        """From one update to the next, as a rule."""
+        """Moving average of the time between updates."""
         self.magnet = False
         self.placed = 0
         self.doing = ""
-        """The stage that it is at; empty: the work is done, or has not begun."""
+        """Current stage; empty: the task is finished, or has not started."""
         self.done = False
         self.largest_error = np.zeros(4)
         self.lag_s = LEAD_S
-        """How late the arm is seen to follow: the loop's latency, learnt while it moves."""
+        """Measured lag of the arm behind its curve: the loop latency, estimated while it moves."""
 
     @property
     def missing(self) -> list[str]:
-        """Names of the parts that it has not placed."""
+        """Names of the parts that are not placed yet."""
         return [part.name for part in self._task.parts[self.placed :]]
 
     def update(self, now_s: float, joints: np.ndarray) -> np.ndarray:
-        """Efforts for positions read at `now_s`: N·m, N·m, N, N·m from rad, rad, m, rad."""
+        """Compute torques (N·m, N·m, N, N·m) for positions (rad, rad, m, rad) that were read at `now_s`."""
         self._cycle_s = min(max(0.0, now_s - self._last_s), 0.1)
         self._last_s = now_s
-        # On a slow network a cycle takes longer, and so does an effort's way to the arm.
+        # On a slow network both the cycle and the transmission of a torque take longer.
         self.usual_cycle_s += 0.1 * (self._cycle_s - self.usual_cycle_s)
         lead_s = LEAD_S + CYCLE_LEAD * max(0.0, self.usual_cycle_s - PERIOD_S)
         if self._move is None:
@@ -279,18 +278,18 @@ class Controller:
         self._compare(now_s, joints)
         self._advance(now_s, joints)
         assert self._move is not None
-        # What is asked for acts a little later.
-        coming, speed, acceleration = self._move.at(now_s - self._began_s + lead_s)
-        feedforward, matrix = efforts_for(coming, speed, acceleration, self._held_mass)
+        # The torques take effect after the lead time.
+        position, speed, acceleration = self._move.at(now_s - self._began_s + lead_s)
+        feedforward, matrix = efforts_for(position, speed, acceleration, self._held_mass)
         rate = min(LARGEST_RATE, RATE_TIMES_LATENCY / max(lead_s, self.lag_s))
         feedback = rate * (FRICTION * self._error + matrix @ (rate * self._error + 2 * self._error_rate))
         return np.clip(feedforward + feedback, -LARGEST_EFFORT, LARGEST_EFFORT)
 
     def _compare(self, now_s: float, joints: np.ndarray) -> None:
-        """The error, and how fast it changes, whenever the rig has made a step.
+        """Update the error and its rate whenever the rig has made a step.
 
-        Between its steps the rig answers with the same positions: to hold these against a reference that goes on would
-        show errors that are none. And positions answer to what was asked a while ago: the lag.
+        Between steps the rig returns the same positions: comparing them with the advancing reference would give false
+        errors. The positions are also compared with the reference of an earlier time, because of the lag.
         """
         assert self._move is not None
         since_s = now_s - self._seen_s
@@ -300,16 +299,16 @@ class Controller:
         if same and (since_s < STALE_S or fast > FAST):
             return
         error = then - joints
-        # An error along the motion is a delay: on a curve that is right, the arm is only late.
+        # An error in the direction of the motion is a lag: the arm is on its curve, but late.
         late_s = float(error[:2] @ speed[:2]) / fast if fast > FAST else 0.0
         if since_s > max(HELD_UP_S, 2 * self.usual_cycle_s):
-            # The rig or this program was held up for a moment: the curve waits for the arm.
+            # The rig or this program was interrupted: shift the curve in time, so that it waits for the arm.
             self._began_s += min(max(0.0, late_s), since_s)
             error = self._move.at(now_s - self._began_s - self.lag_s)[0] - joints
             self._on_its_curve = False
         elif self._on_its_curve:
             self.lag_s = min(max(self.lag_s + LAG_SHARE * late_s, 0.0), LARGEST_LAG_S)
-        # Filtered difference quotients: right on a ramp, however seldom positions come.
+        # Filtered difference quotients: exact on a ramp for any period of the positions.
         share = (1.0 - math.exp(-since_s / ERROR_FILTER_S)) / max(since_s, 1e-3)
         if self._seen is not None:
             self._speed += share * (joints - self._seen - self._speed * since_s)
@@ -318,35 +317,35 @@ class Controller:
         self.largest_error = np.maximum(self.largest_error, np.abs(error))
 
     def _begin(self, now_s: float, start: np.ndarray) -> None:
-        # An effort stands for a cycle: the longer that is, the slower a motion it can follow.
+        # A torque is held for a cycle: the longer the cycle, the slower the motion must be.
         self._move = Move(start, self._stage.goal, max(1.0, self.usual_cycle_s / SHORT_CYCLE_S))
         self._began_s = now_s
         self._switched_s = None
         self._on_its_curve = True
         self.doing = self._stage.text
-        self._say(self.doing)
+        self._log(self.doing)
 
     def _advance(self, now_s: float, joints: np.ndarray) -> None:
-        """Go on to the next stage when the arm is seen to be where this one ends; the clock alone decides nothing."""
+        """Start the next stage when the measured position has reached the goal of this one."""
         stage, move = self._stage, self._move
         assert move is not None
         if self.done or now_s - self._began_s < move.duration:
             return
-        away = np.abs(joints - stage.goal)
+        distance = np.abs(joints - stage.goal)
         if not stage.switches:
-            if np.all(away < PASSED):
-                self._go_on(now_s)
+            if np.all(distance < PASSED):
+                self._start_next_stage(now_s)
         elif self._switched_s is None:
-            resting = np.all(away < IN_PLACE) and np.all(np.abs(self._speed) < AT_REST)
-            # However long a cycle took, it has seen the arm once.
+            resting = np.all(distance < IN_PLACE) and np.all(np.abs(self._speed) < AT_REST)
+            # A long cycle is still only one measurement.
             self._resting_s = self._resting_s + min(self._cycle_s, self.usual_cycle_s) if resting else 0.0
             if self._resting_s >= max(REST_S, 1.5 * self.usual_cycle_s):
                 self._switched_s = now_s
                 self.magnet, self._held_mass = stage.magnet, stage.held_mass
         elif now_s - self._switched_s >= GRIP_S:
-            self._go_on(now_s)
+            self._start_next_stage(now_s)
 
-    def _go_on(self, now_s: float) -> None:
+    def _start_next_stage(self, now_s: float) -> None:
         self.placed = max(self.placed, self._stage.placed)
         following = next(self._stages, None)
         if following is None:
@@ -360,25 +359,25 @@ class Controller:
 
 
 class Rig:
-    """The rig as the paper's registers show it."""
+    """Modbus client of a rig: the registers of the paper."""
 
     def __init__(self, host: str, port: int) -> None:
         self._client = ModbusTcpClient(host, port=port, timeout=3.0, retries=0)
         if not self._client.connect():
-            raise ConnectionError(f"no rig answers at {host}:{port}")
+            raise ConnectionError(f"can't connect to a rig at {host}:{port}")
 
     def read(self) -> np.ndarray:
-        """Joint positions: rad, rad, m, rad, from degrees and millimetres times 100."""
+        """Read joint positions: rad, rad, m, rad (registers: degrees and millimeters times 100)."""
         return joints_of(self._client.read_holding_registers(4, count=4))
 
     def write(self, efforts: np.ndarray) -> None:
-        """Efforts: N·m, N·m, N, N·m, as thousandths."""
+        """Write torques: N·m, N·m, N, N·m (registers: thousandths)."""
         answer = self._client.write_registers(0, registers_of(efforts))
         if answer.isError():
-            raise ConnectionError(f"the rig refused a torque: {answer}")
+            raise ConnectionError(f"the rig rejected the torques: {answer}")
 
     def exchange(self, efforts: np.ndarray) -> np.ndarray:
-        """Write efforts and read positions in one request (function 23), on its way once there and back."""
+        """Write torques and read positions in one request (function 23), that is, in one round trip."""
         return joints_of(
             self._client.readwrite_registers(
                 read_address=4, read_count=4, write_address=0, values=registers_of(efforts)
@@ -386,13 +385,13 @@ class Rig:
         )
 
     def switch(self, magnet: bool) -> None:
-        """The magnet, on or off."""
+        """Switch the magnet on or off."""
         answer = self._client.write_coil(0, magnet)
         if answer.isError():
-            raise ConnectionError(f"the rig refused to switch the magnet: {answer}")
+            raise ConnectionError(f"the rig rejected the magnet command: {answer}")
 
     def close(self) -> None:
-        """Leave the rig without torque."""
+        """Zero the torques and disconnect."""
         try:
             self.write(np.zeros(4))
         except (ConnectionError, ModbusException):
@@ -402,24 +401,24 @@ class Rig:
 
 
 def joints_of(answer: ModbusPDU) -> np.ndarray:
-    """Joints that the rig answered."""
+    """Convert a response to joint positions."""
     if answer.isError():
-        raise ConnectionError(f"the rig refused: {answer}")
+        raise ConnectionError(f"the rig rejected the request: {answer}")
     values = np.array(answer.registers, dtype=np.uint16).astype(np.int16) / 100
     return np.array([math.radians(values[0]), math.radians(values[1]), values[2] / 1000, math.radians(values[3])])
 
 
 def registers_of(efforts: np.ndarray) -> list[int]:
-    """Efforts as the registers hold them."""
+    """Convert torques to register values."""
     return [int(value) for value in np.rint(efforts * 1000).astype(np.int16).view(np.uint16)]
 
 
 def control(
     rig: Rig, controller: Controller, duration_s: float, overtime_s: float = 0.0, *, once: bool = False
 ) -> dict:
-    """Close the loop every `PERIOD_S`, or as often as the network allows, for `duration_s`; says how it went.
+    """Close the loop every `PERIOD_S`, or as often as the network allows, for `duration_s`; return the result.
 
-    Where the work is not done by then it may take `overtime_s` more; with `once` it ends as soon as the work is done.
+    If the task is not finished by then, it may take `overtime_s` more. With `once`, return as soon as it is finished.
     """
     began_s = time.monotonic()
     joints, request_s = rig.read(), time.monotonic() - began_s
@@ -427,10 +426,10 @@ def control(
         asked_s = time.monotonic()
         joints = rig.read()
         request_s = min(request_s, time.monotonic() - asked_s)
-    # Reading, then writing, answers the newest positions, but is two requests. Where these take longer than a period,
-    # one request that does both makes the cycle half as long, and the answers no older.
+    # A read followed by a write uses the newest positions, but needs two requests. If these take longer than a period,
+    # one combined request halves the cycle, and the positions are not older.
     slow = 2 * request_s > PERIOD_S
-    # Paced by the rig's steps, so that what is read is of one age; a slower network sets a pace of its own.
+    # The period of the rig's steps gives positions of constant age; a slower network determines the period itself.
     period_s = RIG_STEP_S if slow else PERIOD_S
     controller.usual_cycle_s = max(period_s, request_s)
     deadline_s, cycles, magnet, done_s = time.monotonic(), 0, False, None
@@ -439,7 +438,7 @@ def control(
             joints = rig.read()
         efforts = controller.update(now_s, joints)
         if controller.magnet != magnet:
-            # Before the efforts that count on it: with nothing on the magnet, a part's weight too much lifts the quill.
+            # Before the torques that include the part's weight: without a part on the magnet they would lift the quill.
             magnet = controller.magnet
             rig.switch(magnet)
         if slow:
@@ -469,32 +468,34 @@ def control(
 
 
 def sentence(result: dict) -> str:
-    """How it went, for people."""
-    said = f"{result['placed']} of {result['parts']} parts placed"
+    """Describe the result in one line."""
+    text = f"{result['placed']} of {result['parts']} parts placed"
     if result["done_s"] is not None:
-        said += f" in {result['done_s']:.1f} s"
+        text += f" in {result['done_s']:.1f} s"
     elif result["missing"]:
-        said += f", not {', '.join(result['missing'])}: the time was over at {result['doing']!r}"
-    return f"{said}; {result['cycles_per_s']:.0f} cycles a second"
+        text += f", missing {', '.join(result['missing'])}: the time ended during {result['doing']!r}"
+    return f"{text}; {result['cycles_per_s']:.0f} cycles per second"
 
 
 def main() -> int:
-    """Run it; exit code 0: every part is placed, 1: not all, 2: the task is wrong, 3: no rig."""
+    """Run the controller; exit code 0: all parts placed, 1: parts missing, 2: invalid task, 3: no connection."""
     parser = argparse.ArgumentParser(description="Pick every part and place it in the tray.")
     parser.add_argument("--host", default="127.0.0.1", help="address of the rig")
     parser.add_argument("--port", type=int, default=5020, help="Modbus TCP port of the rig")
-    parser.add_argument("--duration", type=float, default=20.0, help="seconds to run")
-    parser.add_argument("--overtime", type=float, default=0.0, help="seconds more, if the work is not done by then")
-    parser.add_argument("--once", action="store_true", help="end when the work is done")
-    parser.add_argument("--scene", type=Path, help="lab.toml whose [scene] is the task; default: hilrig's own scene")
-    parser.add_argument("--json", action="store_true", help="one JSON object at the end, on standard output")
+    parser.add_argument("--duration", type=float, default=20.0, help="duration, s")
+    parser.add_argument("--overtime", type=float, default=0.0, help="extra time if the task is not finished, s")
+    parser.add_argument("--once", action="store_true", help="stop when the task is finished")
+    parser.add_argument(
+        "--scene", type=Path, help="lab.toml whose [scene] is the task; default: hilrig's default scene"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end on standard output")
     options = parser.parse_args()
     try:
         scene = tomllib.loads(options.scene.read_text(encoding="utf-8")).get("scene", {}) if options.scene else {}
         task = task_of(scene)
         list(plan(task, HOME))
     except (OSError, ValueError, KeyError) as error:
-        print(f"the task is not understood: {error}", file=sys.stderr)
+        print(f"invalid task: {error}", file=sys.stderr)
         return 2
     goal = min(len(task.parts), len(task.places))
     out = sys.stderr if options.json else sys.stdout
@@ -509,7 +510,7 @@ def main() -> int:
         finally:
             rig.close()
     except (ConnectionError, ModbusException) as error:
-        print(f"the rig is gone: {error}", file=sys.stderr)
+        print(f"connection to the rig failed: {error}", file=sys.stderr)
         return 3
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

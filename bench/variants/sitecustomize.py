@@ -1,6 +1,6 @@
-"""Applies a variant of the ablation to every Python process that `bench/ablation.py` starts.
+"""Applies a variant of the ablation study to the Python processes that `bench/ablation.py` starts.
 
-Python imports a module of this name at start-up when its folder is on PYTHONPATH.
+Python imports a module of this name at startup if its folder is on PYTHONPATH.
 """
 
 import os

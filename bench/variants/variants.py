@@ -1,4 +1,4 @@
-"""Variants of the services in which one optimization is disabled: each function replaces it with the plain way."""
+"""Variants of the services with one optimization disabled; each function installs the simple implementation."""
 
 import contextlib
 from collections.abc import Callable
@@ -6,14 +6,14 @@ from typing import Any
 
 
 def no_coalescing() -> None:
-    """Every command is sent at once, in a message of its own."""
+    """Send each command immediately in its own message."""
     from hilrig_modbus_edge.command_scheduler import CommandScheduler
 
     CommandScheduler._send_time = lambda self, rig, now_ns: now_ns
 
 
 def fixed_window() -> None:
-    """Commands that arrive within 2 ms are sent together; no deadline."""
+    """Send the commands that arrive within 2 ms together, without a deadline."""
     from hilrig_modbus_edge import command_scheduler
 
     def send_time(self: Any, rig: str, now_ns: int) -> int:
@@ -22,29 +22,29 @@ def fixed_window() -> None:
     command_scheduler.CommandScheduler._send_time = send_time
 
 
-def no_further_writes() -> None:
-    """All commands of a rig are prompt, however often its controller writes."""
+def no_write_limit() -> None:
+    """Treat all commands of a rig alike, independent of the number of writes per state."""
     from hilrig_modbus_edge import command_scheduler
 
     command_scheduler.SEPARATE_WRITES = 1 << 30
 
 
-def edge_tick_whole() -> None:
-    """One turn of the event loop maintains all rigs in the edge's tick."""
+def unsplit_edge_tick() -> None:
+    """Maintain all rigs in one iteration of the event loop at the edge's tick."""
     from hilrig_modbus_edge import service
 
     service.RIGS_PER_TURN = 1 << 30
 
 
 def no_pre_encoding() -> None:
-    """States are encoded at the tick."""
+    """Encode states at the tick."""
     from hilrig_sim.loop import Simulation
 
     Simulation.pre_encode = lambda self, tick_ns: None
 
 
 def asyncio_readers() -> None:
-    """Sockets are served from asyncio's queue: `loop.add_reader` with the same receive call."""
+    """Serve sockets from asyncio's queue: `loop.add_reader` with the same receive call."""
     from selectors import EVENT_READ, EVENT_WRITE
 
     from hilrig_modbus_edge.server.event_loop import SocketTransport
@@ -72,7 +72,7 @@ def asyncio_readers() -> None:
 
 
 def millisecond_timers() -> None:
-    """The loop waits in whole milliseconds, as asyncio does; sockets are served from asyncio's queue too."""
+    """Wait in whole milliseconds, as asyncio does, and serve sockets from asyncio's queue."""
     import selectors
 
     from hilrig_modbus_edge.server.event_loop import DirectSelector
@@ -82,25 +82,25 @@ def millisecond_timers() -> None:
 
 
 def no_priorities() -> None:
-    """No real-time policy, no short slices, no exact sleep, no background priority."""
+    """Use no real-time policy, no short time slices, no exact sleep and no background priority."""
     from hilrig_runtime.process import lifecycle
 
     lifecycle._ask_for_time = lambda name, lab: None
 
 
-def receivers_not_ahead() -> None:
-    """zenoh's receiving threads have the priority of the thread that opened the bus."""
+def no_receiver_priority() -> None:
+    """Give zenoh's receiver threads the priority of the thread that opened the bus."""
     from hilrig_runtime.bus import zenoh_bus
 
-    zenoh_bus.one_ahead = contextlib.nullcontext
+    zenoh_bus.raise_priority = contextlib.nullcontext
 
 
 def no_log_batch() -> None:
-    """Every recorded message is sent to the recorder at once."""
-    from hilrig_runtime.messaging.recording_stream import LogStream
+    """Send each recorded message to the recorder immediately."""
+    from hilrig_runtime.messaging.recording_stream import RecordingStream
     from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
-    append, extend = LogStream.append, LogStream.extend
+    append, extend = RecordingStream.append, RecordingStream.extend
 
     def append_and_flush(self: Any, *entry: Any) -> None:
         append(self, *entry)
@@ -111,25 +111,25 @@ def no_log_batch() -> None:
             extend(self, [entry])
             self.flush(SYSTEM_CLOCK.monotonic_ns())
 
-    LogStream.append, LogStream.extend = append_and_flush, extend_and_flush
+    RecordingStream.append, RecordingStream.extend = append_and_flush, extend_and_flush
 
 
 def no_state_batch() -> None:
-    """The states of a tick go to the edge in a message each."""
-    from hilrig_runtime.messaging.rig_batch import BatchSender
+    """Send each state of a tick to the edge in its own message."""
+    from hilrig_runtime.messaging.rig_batch import BatchPublisher
     from hilrig_schemas import RigBatch
 
-    send = BatchSender.send
+    publish = BatchPublisher.publish
 
-    def send_each(self: Any, payloads: Any) -> None:
-        put = self._put_together
+    def publish_each(self: Any, payloads: Any) -> None:
+        put = self._put_batch
         for rig, payload in zip(self._rigs, payloads, strict=True):
             put(RigBatch(source=self._source, rigs=[rig], messages=[payload]).SerializeToString())
-        self._put_together = lambda _: None
-        send(self, payloads)
-        self._put_together = put
+        self._put_batch = lambda _: None
+        publish(self, payloads)
+        self._put_batch = put
 
-    BatchSender.send = send_each
+    BatchPublisher.publish = publish_each
 
 
 VARIANTS: dict[str, tuple[Callable[[], None], ...]] = {
@@ -137,23 +137,23 @@ VARIANTS: dict[str, tuple[Callable[[], None], ...]] = {
     "full again": (),
     "no coalescing": (no_coalescing,),
     "fixed window": (fixed_window,),
-    "no rule for further writes": (no_further_writes,),
+    "no limit of separate writes": (no_write_limit,),
     "no pre-encoding": (no_pre_encoding,),
     "sockets by add_reader": (asyncio_readers,),
     "add_reader, timers in ms": (millisecond_timers,),
-    "edge tick in one turn": (edge_tick_whole,),
+    "edge tick in one iteration": (unsplit_edge_tick,),
     "no priorities": (no_priorities,),
-    "receivers not ahead": (receivers_not_ahead,),
-    "no batch of the log": (no_log_batch,),
-    "no batch of states": (no_state_batch,),
+    "no receiver priority": (no_receiver_priority,),
+    "no batches of records": (no_log_batch,),
+    "no batches of states": (no_state_batch,),
     "all": (
         no_coalescing,
         no_pre_encoding,
         millisecond_timers,
-        edge_tick_whole,
+        unsplit_edge_tick,
         no_priorities,
         no_log_batch,
         no_state_batch,
     ),
 }
-"""Name → the functions that disable something; `full again` shows the spread of the measurement."""
+"""Name → the functions that disable optimizations; `full again` shows the spread of the measurement."""

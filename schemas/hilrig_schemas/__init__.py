@@ -9,7 +9,7 @@ from hilrig_schemas.v1.log_batch_pb2 import LogBatch, OpenSession
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusKind, ModbusRequest, ModbusTraffic
 from hilrig_schemas.v1.rig_batch_pb2 import RigBatch
 from hilrig_schemas.v1.rig_config_pb2 import RigConfig
-from hilrig_schemas.v1.roster_pb2 import Roster
+from hilrig_schemas.v1.service_info_pb2 import ServiceInfo
 from hilrig_schemas.v1.torque_command_pb2 import TorqueCommand
 
 __all__ = [
@@ -29,6 +29,6 @@ __all__ = [
     "RigBatch",
     "RigConfig",
     "RigReport",
-    "Roster",
+    "ServiceInfo",
     "TorqueCommand",
 ]

@@ -24,7 +24,7 @@ from hilrig_schemas import (
     ModbusTraffic,
     RigBatch,
     RigConfig,
-    Roster,
+    ServiceInfo,
     TorqueCommand,
 )
 
@@ -96,7 +96,7 @@ LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
 """What a person asks of a service: sessions by hand of the recorder, rigs more or fewer of simulation and edge."""
-ROSTER: Final = ServiceTopic("roster", Roster, Traffic.QUERY)
+SERVICE_INFO: Final = ServiceTopic("service_info", ServiceInfo, Traffic.QUERY)
 """Who runs, where, and for which rigs."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
 """The states of a tick together, for the edges; a watcher of one rig takes that rig's `STATE`."""
@@ -104,7 +104,7 @@ COMMANDS: Final = ServiceTopic("commands", RigBatch, Traffic.CONTROL)
 """Commands as they leave an edge, for the simulation; a watcher of one rig takes that rig's `COMMAND`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
-SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, ROSTER, STATES, COMMANDS)  # type: ignore[assignment]
+SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, SERVICE_INFO, STATES, COMMANDS)  # type: ignore[assignment]
 RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in RIG_TOPICS if topic.channel}
 
 ALIVE: Final = "alive"

@@ -125,23 +125,23 @@ def test_a_question_is_answered_by_everyone_who_serves_it(open_bus: OpenBus) -> 
     def refuse(_: bytes) -> bytes:
         raise OperationError("not now")
 
-    sim.serve("hil/lab/rig1/config", lambda payload: b"one:" + payload)
-    sim.serve("hil/lab/rig2/config", refuse)
-    answers = eventually(lambda: len(found := tool.ask("hil/lab/*/config", b"?")) == 2 and found)
+    sim.declare_queryable("hil/lab/rig1/config", lambda payload: b"one:" + payload)
+    sim.declare_queryable("hil/lab/rig2/config", refuse)
+    answers = eventually(lambda: len(found := tool.query("hil/lab/*/config", b"?")) == 2 and found)
     by_error = sorted((answer.error, answer.payload) for answer in answers)
     assert by_error == [("", b"one:?"), ("not now", b"")]
 
 
 def test_a_question_without_a_server_gets_no_answer(open_bus: OpenBus) -> None:
-    assert open_bus("tool").ask("hil/lab/nobody/config", timeout_s=0.2) == []
+    assert open_bus("tool").query("hil/lab/nobody/config", timeout_s=0.2) == []
 
 
 def test_liveliness_shows_who_is_there_and_who_went(open_bus: OpenBus) -> None:
     sim, tool = open_bus("sim"), open_bus("tool")
-    token = sim.announce("hil/lab/alive/sim/1")
-    eventually(lambda: tool.alive("hil/lab/alive/*/*") == ["hil/lab/alive/sim/1"])
+    token = sim.declare_token("hil/lab/alive/sim/1")
+    eventually(lambda: tool.get_liveliness("hil/lab/alive/*/*") == ["hil/lab/alive/sim/1"])
     changes: list[tuple[str, bool]] = []
-    tool.watch("hil/lab/alive/*/*", lambda *change: changes.append(change))
+    tool.subscribe_liveliness("hil/lab/alive/*/*", lambda *change: changes.append(change))
     eventually(lambda: changes == [("hil/lab/alive/sim/1", True)])
     token.close()
     eventually(lambda: changes[-1] == ("hil/lab/alive/sim/1", False))

@@ -32,7 +32,7 @@ def test_its_latencies_are_those_of_then() -> None:
     assert report.loop_ms is not None
     assert (report.loop_ms.p50, report.loop_ms.max) == pytest.approx((39.999632, 60.0488), abs=1e-6)
     assert (report.lost.transport, report.lost.recorder) == (0, 0)
-    assert report.reasons == ("94 samples only: 500 are needed for a 99th percentile",)
+    assert report.reasons == ("only 94 samples: 500 are required for a 99th percentile",)
 
 
 def test_its_steps_are_simulated_again() -> None:

@@ -70,7 +70,7 @@ class Alerts:
         self._bus.subscribe(HEALTH.key(lab.name, "recorder", "*"), self._on_health)
 
     def _on_health(self, _key: str, payload: bytes) -> None:
-        self.received.append(Health.FromString(payload).trouble)
+        self.received.append(Health.FromString(payload).alert)
 
     def close(self) -> None:
         self._bus.close()

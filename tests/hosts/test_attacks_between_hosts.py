@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hilrig_runtime.config.lab import load_lab
-from hilrig_runtime.security.x509 import Identity, issue_peer
+from hilrig_runtime.security.x509 import Credential, issue_peer
 from support.bus_certificates import bad_identities, folder_of_one, make_bus_folder, write
 from support.lab_of_hosts import HILRIG, SLACK_NS, TIMEOUT_NS, LabOfHosts, Rig, Session, zero_after
 from support.namespaces import Network, require_namespaces
@@ -63,7 +63,7 @@ while time.monotonic() < end:
 
 
 @contextmanager
-def secured(folder: Path) -> Iterator[tuple[LabOfHosts, Identity]]:
+def secured(folder: Path) -> Iterator[tuple[LabOfHosts, Credential]]:
     """The lab with its certificates and nothing running, and their authority."""
     require_namespaces()
     authority = make_bus_folder(folder / "bus", ["router", "sim", *EDGES, "recorder", "operator"], ["router"])
@@ -82,7 +82,7 @@ def config_of(folder: Path, certificates: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def lab_and_authority(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LabOfHosts, Identity]]:
+def lab_and_authority(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LabOfHosts, Credential]]:
     with secured(tmp_path_factory.mktemp("lab")) as (lab, authority):
         for host in COMMANDS:
             lab.start(host)
@@ -90,7 +90,7 @@ def lab_and_authority(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tupl
 
 
 @pytest.fixture
-def lab(lab_and_authority: tuple[LabOfHosts, Identity]) -> LabOfHosts:
+def lab(lab_and_authority: tuple[LabOfHosts, Credential]) -> LabOfHosts:
     return lab_and_authority[0]
 
 
@@ -122,7 +122,7 @@ def test_a_flood_on_one_rig_stops_no_other_and_no_watchdog(lab: LabOfHosts) -> N
 
 
 def test_a_host_with_a_wrong_certificate_hears_and_moves_nothing(
-    lab_and_authority: tuple[LabOfHosts, Identity], tmp_path: Path
+    lab_and_authority: tuple[LabOfHosts, Credential], tmp_path: Path
 ) -> None:
     lab, authority = lab_and_authority
     wrong = bad_identities(authority)

@@ -61,7 +61,7 @@ def test_report_layout_and_no_network_requests(report: Path, browser: Browser, w
     text = browser.run("document.body.innerText")
     for expected in ("Task: There", "passed", "register wait", "controlled by 192.0.2.7:40001"):
         assert expected in text, expected
-    picture = browser.picture()
+    picture = browser.screenshot()
     # White sections on a gray page, with lines in the joints' colors.
     assert (picture > 0.99).all(axis=-1).mean() > 0.3
     for color in JOINT_COLORS:

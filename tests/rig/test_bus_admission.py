@@ -14,7 +14,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import router_config
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.security.x509 import Identity, issue_peer, make_authority
+from hilrig_runtime.security.x509 import Credential, issue_peer, make_authority
 from support.bus_certificates import HOSTS, NOW, bad_identities, folder_of_one, make_bus_folder
 from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import eventually
@@ -29,7 +29,7 @@ class Lab:
     """A lab's certificates, and somebody's own."""
 
     folder: Path
-    authority: Identity
+    authority: Credential
     port: int
 
     def config(self, folder: Path, topology: str = "router") -> BusConfig:

@@ -70,32 +70,32 @@ MAY_READ: dict[str, set[str]] = {
 }
 _CONFIGS = {"rig1/config", "rig2/config"}
 _OF_EDGES = {f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("lease", "impairment")}
-_ROSTERS = {"roster/sim/1", "roster/edge/1", "roster/recorder/1"}
+_SERVICE_INFOS = {"service_info/sim/1", "service_info/edge/1", "service_info/recorder/1"}
 _CONTROLS = {"control/sim/1", "control/edge/1", "control/recorder/1"}
-ASKED = sorted(_CONFIGS | _OF_EDGES | _ROSTERS | _CONTROLS)
+ASKED = sorted(_CONFIGS | _OF_EDGES | _SERVICE_INFOS | _CONTROLS)
 MAY_ASK: dict[str, set[str]] = {
-    "sim": _ROSTERS,
-    "east": _CONFIGS | _ROSTERS,
-    "west": _CONFIGS | _ROSTERS,
-    "recorder": _CONFIGS | _ROSTERS | _CONTROLS,
+    "sim": _SERVICE_INFOS,
+    "east": _CONFIGS | _SERVICE_INFOS,
+    "west": _CONFIGS | _SERVICE_INFOS,
+    "recorder": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
     "operator": set(ASKED),
-    "viewer": _CONFIGS | _ROSTERS,
+    "viewer": _CONFIGS | _SERVICE_INFOS,
     "student": set(),
 }
 MAY_ANSWER: dict[str, set[str]] = {
-    "sim": {*_CONFIGS, "roster/sim/1", "control/sim/1"},
-    "east": {"rig1/lease", "rig1/impairment", "roster/edge/1", "control/edge/1"},
-    "west": {"rig2/lease", "rig2/impairment", "roster/edge/1", "control/edge/1"},
-    "recorder": {"roster/recorder/1", "control/recorder/1"},
+    "sim": {*_CONFIGS, "service_info/sim/1", "control/sim/1"},
+    "east": {"rig1/lease", "rig1/impairment", "service_info/edge/1", "control/edge/1"},
+    "west": {"rig2/lease", "rig2/impairment", "service_info/edge/1", "control/edge/1"},
+    "recorder": {"service_info/recorder/1", "control/recorder/1"},
     "operator": set(),
     "viewer": set(),
     "student": set(),
 }
 # A question to all goes out to everyone of a kind; what one answers is held by the other direction's rules.
 MAY_BE_ASKED = MAY_ANSWER | {
-    "sim": _CONFIGS | _ROSTERS | _CONTROLS,
-    **dict.fromkeys(EDGES, _OF_EDGES | _ROSTERS | _CONTROLS),
-    "recorder": _ROSTERS | _CONTROLS,
+    "sim": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
+    **dict.fromkeys(EDGES, _OF_EDGES | _SERVICE_INFOS | _CONTROLS),
+    "recorder": _SERVICE_INFOS | _CONTROLS,
 }
 FLOWS = {"ingress", "egress"}
 LIVING = ["alive/sim/1", "alive/edge/1", "alive/recorder/1"]

@@ -221,7 +221,7 @@ def test_recordings_are_listed_served_and_reported(running_lab: ConsoleWithLab) 
 
     with Watcher(running_lab.console.port):
         runs = eventually(listed, every_s=0.2)
-    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["trouble"]
+    assert "hilrig recover" in runs["lab/rig9/torn.mcap"]["error"]
     status, headers, body = running_lab.console.ask("/recordings/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert (status, body) == (200, good.read_bytes())
     assert headers["content-disposition"].startswith("attachment")
@@ -301,7 +301,7 @@ def test_simulation_restart_is_shown(running_lab: ConsoleWithLab) -> None:
         try:
             eventually(lambda: watcher.rig("rig2")["state"] == "no simulation")
             eventually(lambda: watcher.pose("rig2") is None)
-            assert any("sim/1" in trouble for trouble in watcher.newest["lab"]["troubles"])
+            assert any("sim/1" in alert for alert in watcher.newest["lab"]["alerts"])
         finally:
             os.kill(sim, signal.SIGKILL)
         eventually(lambda: watcher.rig("rig2")["state"] == "free" and watcher.pose("rig2"))
@@ -337,7 +337,7 @@ def test_browser_shows_changing_values(running_lab: ConsoleWithLab, tmp_path: Pa
             assert browser.run("document.documentElement.scrollWidth") <= width
             eventually(lambda: browser.run("document.querySelectorAll('.arm:not(.stale) .one').length") == 2)
         assert browser.errors == []
-        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", asked).partition("?")[0] for asked in browser.requests} <= {
+        assert {re.sub(r"^http://127\.0\.0\.1:\d+/", "", url).partition("?")[0] for url in browser.requests} <= {
             "",
             "console.css",
             "console.js",
@@ -368,7 +368,7 @@ def test_password_is_required_off_loopback(tmp_path: Path) -> None:
             assert running.process.wait(PATIENT_S) == 0
             eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
-        assert "can be overheard" in running.process.stderr.read()
+        assert "the password is sent unencrypted" in running.process.stderr.read()
 
 
 def test_serves_https_with_certificate(tmp_path: Path) -> None:
@@ -395,8 +395,8 @@ def answers(address: ListenAddress, tls: TlsFiles | None) -> bool:
 
 
 def test_reports_occupied_port(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        listen = f"127.0.0.1:{taken.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        listen = f"127.0.0.1:{occupied.getsockname()[1]}"
         done = hilrig("console", "--config", write_lab(tmp_path), "--listen", listen)
     assert done.returncode == 3
     (line,) = done.stderr.splitlines()

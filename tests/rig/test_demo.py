@@ -1,4 +1,4 @@
-"""`hilrig demo`: what a newcomer runs first, from the command to every file that it leaves."""
+"""`hilrig demo`: its output, exit code and result files."""
 
 import json
 from pathlib import Path
@@ -25,17 +25,17 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return out / "out", json.loads(done.stdout)
 
 
-def test_it_says_where_everything_is(demo: tuple[Path, dict[str, Any]]) -> None:
-    _, said = demo
+def test_result_files_exist(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, result = demo
     for key in ("recording", "rrd", "plot"):
-        assert Path(said[key]).stat().st_size > 10_000
+        assert Path(result[key]).stat().st_size > 10_000
 
 
-def test_its_latency_is_what_the_latency_command_says(demo: tuple[Path, dict[str, Any]]) -> None:
-    _, said = demo
-    again = hilrig("latency", said["recording"], "--json")
+def test_latency_equals_the_result_of_hilrig_latency(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, result = demo
+    again = hilrig("latency", result["recording"], "--json")
     latency = json.loads(again.stdout)
-    assert latency == said["latency"]
+    assert latency == result["latency"]
     assert {"samples", "loop_ms", "stages_ms", "step_ms", "lost", "fit", "reasons"} <= set(latency)
     assert set(latency["lost"]) == {"transport", "recorder", "file"}
     assert set(latency["stages_ms"]) == set(STAGES)
@@ -44,33 +44,31 @@ def test_its_latency_is_what_the_latency_command_says(demo: tuple[Path, dict[str
     assert again.returncode == (0 if latency["fit"] else 1)
 
 
-def test_the_stages_of_each_sample_add_up_exactly_and_none_is_negative(demo: tuple[Path, dict[str, Any]]) -> None:
-    _, said = demo
-    samples = measure(open_run(said["recording"])).table
-    assert len(samples) == said["latency"]["samples"] > 300
+def test_stages_of_each_sample_sum_to_the_loop_latency(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, result = demo
+    samples = measure(open_run(result["recording"])).table
+    assert len(samples) == result["latency"]["samples"] > 300
     assert np.array_equal(sum(samples[stage] for stage in STAGES), samples["loop"])
     for stage in STAGES:
         assert samples[stage].min() >= 0, stage
 
 
 def test_nothing_is_lost(demo: tuple[Path, dict[str, Any]]) -> None:
-    _, said = demo
-    assert said["latency"]["lost"] == {"transport": 0, "recorder": 0, "file": 0}
+    _, result = demo
+    assert result["latency"]["lost"] == {"transport": 0, "recorder": 0, "file": 0}
 
 
-def test_the_recording_is_verified_and_every_part_stands_in_the_tray(demo: tuple[Path, dict[str, Any]]) -> None:
-    _, said = demo
-    assert said["verify"]["exact"]
-    assert said["task"]["placed"] == len(said["task"]["parts"]) == 4
-    assert said["task"]["largest_error_mm"] < 2.0
-    assert (said["task"]["missing"], said["task"]["why"], said["controller"]["missing"]) == ([], "", [])
+def test_recording_is_verified_and_every_part_is_placed(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, result = demo
+    assert result["verify"]["exact"]
+    assert result["task"]["placed"] == len(result["task"]["parts"]) == 4
+    assert result["task"]["largest_error_mm"] < 2.0
+    assert (result["task"]["missing"], result["task"]["why"], result["controller"]["missing"]) == ([], "", [])
 
 
-def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_decoder(
-    demo: tuple[Path, dict[str, Any]],
-) -> None:
-    _, said = demo
-    with Path(said["recording"]).open("rb") as stream:
+def test_recording_is_readable_with_the_mcap_library(demo: tuple[Path, dict[str, Any]]) -> None:
+    _, result = demo
+    with Path(result["recording"]).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         assert summary is not None
@@ -83,8 +81,8 @@ def test_the_recording_opens_with_the_plain_reader_and_decodes_with_the_stock_de
     assert steps == list(range(steps[0], steps[0] + len(steps)))
 
 
-def test_a_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A controller that writes without ever having read: what it writes answers no state, so there is no sample.
+def test_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The controller writes without reading: its commands are based on no state, so there is no latency sample.
     from hilrig_cli.local import demo as module
 
     controller = tmp_path / "never_reads.py"

@@ -1,6 +1,6 @@
-"""The demo's controller on a slow network: with a loop of 60 ms every part still stands in its place.
+"""The demo's controller on a slow network: with a loop latency of 60 ms it places every part.
 
-Once; with HILRIG_LONG in the environment three times.
+Runs once; with HILRIG_LONG in the environment three times.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_cli.local.demo import judge
+from hilrig_cli.local.demo import check_placement
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
 from support.labs import RunningLab, write_lab
@@ -29,17 +29,17 @@ RUNS = 3 if os.environ.get("HILRIG_LONG") else 1
 
 @contextmanager
 def slow_network(port: int, delay_s: float) -> Iterator[int]:
-    """A TCP way to a port on which every byte takes `delay_s`, each direction; gives the port of its near end."""
+    """TCP proxy to a port that delays every byte by `delay_s` in each direction; yields the proxy's port."""
     loop = asyncio.new_event_loop()
 
-    async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while data := await reader.read(4096):
             loop.call_later(delay_s, writer.write, data)
         loop.call_later(delay_s, writer.close)
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         far_reader, far_writer = await asyncio.open_connection("127.0.0.1", port)
-        await asyncio.gather(carry(reader, far_writer), carry(far_reader, writer), return_exceptions=True)
+        await asyncio.gather(forward(reader, far_writer), forward(far_reader, writer), return_exceptions=True)
 
     server = loop.run_until_complete(asyncio.start_server(serve, "127.0.0.1", 0))
     thread = threading.Thread(target=loop.run_forever, daemon=True)
@@ -52,7 +52,7 @@ def slow_network(port: int, delay_s: float) -> Iterator[int]:
 
 
 @pytest.mark.parametrize("attempt", range(RUNS))
-def test_with_a_loop_of_60_ms_every_part_is_placed_within_2_mm(attempt: int, tmp_path: Path) -> None:
+def test_every_part_is_placed_with_a_loop_of_60_ms(attempt: int, tmp_path: Path) -> None:
     with RunningLab(write_lab(tmp_path, extra="edge.session_grace_ms = 100")) as lab:
         with slow_network(lab.port, 0.020) as port:
             command = [sys.executable, str(ROOT / "examples/pick_and_place.py"), "--port", str(port), "--json"]
@@ -65,7 +65,7 @@ def test_with_a_loop_of_60_ms_every_part_is_placed_within_2_mm(attempt: int, tmp
     report = measure(run)
     assert report.loop_ms is not None
     assert report.loop_ms.p50 == pytest.approx(60, abs=12)
-    result = judge(run)
+    result = check_placement(run)
     assert result.placed == len(result.parts) == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0

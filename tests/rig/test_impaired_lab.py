@@ -1,7 +1,7 @@
-"""A lab that is impaired on purpose, with real processes: what is measured is what was asked for.
+"""Tests of network impairment with real processes: the measured delays and losses are the configured ones.
 
-One lab with a rig a distribution; a controller of each writes every 30 ms, further apart than its delays are spread, so
-that none is overtaken. The recordings are judged as `hilrig latency` judges them.
+One lab with one rig per distribution. The controller of each writes every 30 ms, longer than the spread of the delays,
+so that no command is superseded. The recordings are evaluated as by `hilrig latency`.
 """
 
 import json
@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilrig_modbus_edge.impairment.model import Impairment, way_seed
+from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run, open_run
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 from support.edge_rig import RawClient
 from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import eventually
@@ -38,14 +38,14 @@ DISTRIBUTIONS: dict[str, Any] = {
     "gamma:12,3,5": stats.gamma(16, loc=5, scale=9 / 12),
     "exponential:3,10": stats.expon(10, 3),
 }
-COMMAND_RIGS = {f"{text.partition(':')[0]}-way": text for text in DISTRIBUTIONS}
-STATE_WAY = "uniform:1,6"
-RIGS = ("free", *COMMAND_RIGS, "trace", "state-way", "lossy", "scheduled")
+COMMAND_RIGS = {f"{text.partition(':')[0]}-link": text for text in DISTRIBUTIONS}
+STATE_DELAY = "uniform:1,6"
+RIGS = ("free", *COMMAND_RIGS, "trace", "state-link", "lossy", "scheduled")
 
 
 @dataclass
 class Session:
-    """One rig's recording, judged."""
+    """Recording of one rig and its latency report."""
 
     run: Run
     report: LatencyReport
@@ -62,24 +62,24 @@ class Session:
 def write_impaired_lab(folder: Path) -> Path:
     trace = folder / "trace.txt"
     trace.write_text("".join(f"{delay}\n" for delay in TRACE_MS))
-    ways = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
-    ways["trace"] = f"command = 'trace:{trace}'"
-    ways["state-way"] = f"state = '{STATE_WAY}'"
-    ways["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
-    ways["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
+    impairments = {name: f"command = '{text}'" for name, text in COMMAND_RIGS.items()}
+    impairments["trace"] = f"command = 'trace:{trace}'"
+    impairments["state-link"] = f"state = '{STATE_DELAY}'"
+    impairments["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
+    impairments["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
     text = f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {free_ports(len(RIGS))}\nsession_grace_ms = 0\n"
     text += f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n"
     for rig in RIGS:
         text += f"[[rigs]]\nname = '{rig}'\n"
-        if rig in ways:
-            text += f"[rigs.impairment]\nseed = {SEED}\n{ways[rig]}\n"
+        if rig in impairments:
+            text += f"[rigs.impairment]\nseed = {SEED}\n{impairments[rig]}\n"
     path = folder / "lab.toml"
     path.write_text(text)
     return path
 
 
 def every(period_s: float, cycle: Callable[[RawClient], object]) -> Callable[[int], None]:
-    """A controller that does its cycle at a period."""
+    """Return a controller that runs its cycle periodically."""
 
     def control(port: int) -> None:
         with RawClient("127.0.0.1", port) as client:
@@ -91,13 +91,13 @@ def every(period_s: float, cycle: Callable[[RawClient], object]) -> Callable[[in
     return control
 
 
-def answer(client: RawClient) -> None:
+def read_and_write(client: RawClient) -> None:
     positions = client.read(4, 4)
     client.write(0, positions[0] & 0xFF, 0, 0, 0)
 
 
-def answer_each_state(port: int) -> None:
-    """Look for the next state again and again, and answer each one that comes."""
+def write_for_each_state(port: int) -> None:
+    """Poll for the next state, and write once for each new one."""
     with RawClient("127.0.0.1", port) as client:
         end = time.monotonic() + SECONDS
         last = None
@@ -116,13 +116,14 @@ def lab_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def shown(lab_folder: Path) -> dict[str, Any]:
-    """What `hilrig impair --json` said while the lab ran; running it made the recordings."""
+    """Run the lab, which makes the recordings; return the output of `hilrig impair --json`."""
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
         ports = lab.lab.ports
-        assert f"{ports['constant-way']}, step 10 ms, impaired: state way none; command way constant" in lab.output()
+        text = "step 10 ms, impairment: state link none; command link constant"
+        assert f"{ports['constant-link']}, {text}" in lab.output()
         assert f"{ports['free']}, step 10 ms\n" in lab.output()
-        controllers = {rig: every(0.03, answer) for rig in RIGS} | {"state-way": answer_each_state}
+        controllers = {rig: every(0.03, read_and_write) for rig in RIGS} | {"state-link": write_for_each_state}
         threads = [threading.Thread(target=controllers[rig], args=(ports[rig],)) for rig in RIGS]
         for thread in threads:
             thread.start()
@@ -148,7 +149,7 @@ def assert_stages_add_up(session: Session) -> None:
 
 
 @pytest.mark.parametrize("rig", COMMAND_RIGS)
-def test_injected_is_what_was_asked_for(sessions: dict[str, Session], rig: str) -> None:
+def test_injected_delay_has_configured_distribution(sessions: dict[str, Session], rig: str) -> None:
     session, distribution = sessions[rig], DISTRIBUTIONS[COMMAND_RIGS[rig]]
     assert_stages_add_up(session)
     assert session.report.samples > 200
@@ -160,17 +161,17 @@ def test_injected_is_what_was_asked_for(sessions: dict[str, Session], rig: str) 
 
 
 @pytest.mark.parametrize("rig", COMMAND_RIGS)
-def test_each_command_has_the_delay_that_its_seed_gives_it(sessions: dict[str, Session], rig: str) -> None:
+def test_each_command_has_the_delay_of_its_seed(sessions: dict[str, Session], rig: str) -> None:
     commands = sessions[rig].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
-    way = WayImpairment.model_validate(COMMAND_RIGS[rig])
-    drawn, _ = Impairment(way, way_seed(SEED, rig, "command")).draw(2000)
-    expected = drawn[(commands["seq"] - commands["seq"][0]).astype(int)]
+    link = LinkImpairment.model_validate(COMMAND_RIGS[rig])
+    sampled, _ = Impairment(link, link_seed(SEED, rig, "command")).draw(2000)
+    expected = sampled[(commands["seq"] - commands["seq"][0]).astype(int)]
     assert commands["command_injected_ns"].tolist() == expected.tolist()
 
 
-def test_a_trace_is_injected_in_its_order(sessions: dict[str, Session]) -> None:
-    """The one at the very end of the session may still have been on its way."""
+def test_trace_is_injected_in_its_order(sessions: dict[str, Session]) -> None:
+    """The last command of the session may still have been in flight."""
     assert_stages_add_up(sessions["trace"])
     commands = sessions["trace"].run.commands
     commands = commands[commands["write_arrived_ns"] > 0]
@@ -180,29 +181,30 @@ def test_a_trace_is_injected_in_its_order(sessions: dict[str, Session]) -> None:
     assert (commands["command_injected_ns"] / 1e6).tolist() == expected
 
 
-def test_injected_on_the_states_way_is_what_was_asked_for(sessions: dict[str, Session]) -> None:
-    """Each state that was answered had the delay that its seed gives it, and those that it gives are spread as asked.
+def test_injected_state_delay_is_that_of_its_seed(sessions: dict[str, Session]) -> None:
+    """Each state with a response has the delay of its seed; the delays of the seed have the configured distribution.
 
-    Not judged is how those that were answered are spread: where the machine stalls, a state is overtaken by the next
-    and never answered, and more often one that was held up long. The delays begin anew with a session, while some are
-    on their way: the very ends are left out.
+    The distribution of the states with a response is not tested: if the machine stalls, a state is superseded by the
+    next one and gets no response, more often one with a long delay. The delays restart with a session while some states
+    are in flight: the first and last ones are excluded.
     """
-    session = sessions["state-way"]
+    session = sessions["state-link"]
     assert_stages_add_up(session)
     assert session.report.samples > 250
     table = session.report.table[5:-5]
-    drawn, _ = Impairment(WayImpairment.model_validate(STATE_WAY), way_seed(SEED, "state-way", "state")).draw(3000)
-    (first,) = np.flatnonzero(drawn == table["injected"][0])
+    link = LinkImpairment.model_validate(STATE_DELAY)
+    sampled, _ = Impairment(link, link_seed(SEED, "state-link", "state")).draw(3000)
+    (first,) = np.flatnonzero(sampled == table["injected"][0])
     after = (table["basis_step"] - table["basis_step"][0]).astype(int)
-    assert table["injected"].tolist() == drawn[first + after].tolist()
-    found = stats.kstest(drawn[first : first + after[-1] + 1] / 1e6, stats.uniform(1, 5).cdf)
+    assert table["injected"].tolist() == sampled[first + after].tolist()
+    found = stats.kstest(sampled[first : first + after[-1] + 1] / 1e6, stats.uniform(1, 5).cdf)
     assert found.pvalue > 0.01, found
 
 
 @pytest.mark.parametrize("rig", [*COMMAND_RIGS, "trace"])
-def test_the_loop_is_longer_by_what_was_injected(sessions: dict[str, Session], rig: str) -> None:
-    """To the tick's quantisation: what is added to a loop appears in it as whole steps, on average as it is."""
-    # Where the machine stalls, it stalls all of them; the longest are left out.
+def test_loop_latency_grows_by_the_injected_delay(sessions: dict[str, Session], rig: str) -> None:
+    """Up to the quantization by the tick: an added delay appears as whole steps, and on average as itself."""
+    # A stall of the machine affects all rigs; the longest latencies are excluded.
     loop_ms, free_ms, injected_ms = (
         stats.trim_mean(values, 0.05)
         for values in (sessions[rig].loop_ms, sessions["free"].loop_ms, sessions[rig].injected_ms)
@@ -210,23 +212,23 @@ def test_the_loop_is_longer_by_what_was_injected(sessions: dict[str, Session], r
     assert loop_ms - free_ms == pytest.approx(injected_ms, abs=0.5 * STEP_MS)
     table = sessions[rig].report.table
     rest = (table["loop"] - table["injected"] - table["tick_wait"]) / 1e6
-    # What is left but the wait for the tick is what it was, whatever was injected.
+    # The remaining latency without the wait for the tick does not depend on the injected delay.
     free = sessions["free"].report.table
     free_rest = (free["loop"] - free["tick_wait"]) / 1e6
     assert np.median(rest) == pytest.approx(np.median(free_rest), abs=0.5 * STEP_MS)
 
 
-def test_what_is_lost_leaves_a_gap_in_the_numbers(sessions: dict[str, Session], shown: dict[str, Any]) -> None:
+def test_lost_commands_leave_gaps_in_the_numbers(sessions: dict[str, Session], shown: dict[str, Any]) -> None:
     counts = shown["lossy"]["commands"]
     commands = sessions["lossy"].run.commands
     written = commands[commands["write_arrived_ns"] > 0]
     assert counts["lost"] > 0.04 * counts["count"]
     assert len(written) == counts["count"] - counts["lost"] - counts["overtaken"]
     assert int(np.diff(written["seq"].astype(int)).max()) > 2, "losses come in bursts"
-    assert sessions["lossy"].report.lost.transport == 0, "what is lost on purpose is no gap of the recording"
+    assert sessions["lossy"].report.lost.transport == 0, "injected losses must not count as losses of the recording"
 
 
-def test_a_schedule_is_followed_and_on_the_record(sessions: dict[str, Session]) -> None:
+def test_schedule_is_followed_and_recorded(sessions: dict[str, Session]) -> None:
     run = sessions["scheduled"].run
     commands = run.commands[run.commands["write_arrived_ns"] > 0]
     begun_ns = commands["write_arrived_ns"][0]
@@ -236,28 +238,30 @@ def test_a_schedule_is_followed_and_on_the_record(sessions: dict[str, Session]) 
         assert len(part) > 20
         assert set(part["command_injected_ns"].tolist()) == {injected_ns}
     assert run.events["text"][run.events["kind"] == "IMPAIRMENT_CHANGED"].tolist() == [
-        f"impairment of scheduled: state way none; command way constant delay 20 ms, seed {SEED} (by schedule)",
-        "impairment of scheduled: none (by schedule)",
+        f"impairment of scheduled: state link none; command link constant delay 20 ms, seed {SEED} (source: schedule)",
+        "impairment of scheduled: none (source: schedule)",
     ]
 
 
-def test_an_impaired_run_is_simulated_again_to_the_last_bit(sessions: dict[str, Session]) -> None:
+def test_impaired_run_is_verified_bit_exactly(sessions: dict[str, Session]) -> None:
     done = hilrig("verify", sessions["lossy"].run.path)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_a_recording_can_be_the_trace_of_another_loop(sessions: dict[str, Session], lab_folder: Path) -> None:
+def test_recording_can_be_used_as_delay_trace(sessions: dict[str, Session], lab_folder: Path) -> None:
     from hilrig_replay.export.delay_trace import delay_trace
 
-    session = sessions["normal-way"]
+    session = sessions["normal-link"]
     trace = delay_trace(session.run)
     table = session.report.table
     assert trace.delays_ms == tuple(((table["controller"] + table["injected"]) / 1e6).tolist())
-    assert np.mean(trace.delays_ms) > np.mean(session.injected_ms), "the controller and its network count too"
+    assert np.mean(trace.delays_ms) > np.mean(session.injected_ms), (
+        "the trace must include the controller and its network"
+    )
 
 
-def test_a_lab_is_impaired_by_command_while_it_runs(tmp_path: Path, sessions: dict[str, Session]) -> None:
-    recording = sessions["gamma-way"].run.path
+def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict[str, Session]) -> None:
+    recording = sessions["gamma-link"].run.path
     config = write_lab(tmp_path)
     with RunningLab(config) as lab, RawClient("127.0.0.1", lab.port) as client:
         client.write(0, 1)
@@ -269,32 +273,32 @@ def test_a_lab_is_impaired_by_command_while_it_runs(tmp_path: Path, sessions: di
             return decoded
 
         assert row()["impairment"] == "none"
-        told = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
-        assert told["ways"]["state"]["delay"]["offset_ms"] == 15
-        assert told["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
-        assert (told["seed"], told["set_by"]) == (7, "hand")
-        assert row() | {"states": 0, "commands": 0} == told | {"states": 0, "commands": 0}
+        status = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
+        assert status["ways"]["state"]["delay"]["offset_ms"] == 15
+        assert status["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
+        assert (status["seed"], status["set_by"]) == (7, "override")
+        assert row() | {"states": 0, "commands": 0} == status | {"states": 0, "commands": 0}
         assert row("--trace", recording)["ways"]["command"]["delay"]["kind"] == "trace"
         assert row("--off")["impairment"] == "none"
         assert row("--lab")["set_by"] == "lab.toml"
         table = hilrig("impair", "rig1", "--preset", "mobile", "--seed", "3", "--config", config)
-        for word in ("gamma mean 15 ms", "gilbert", "(hand, seed 3)"):
+        for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
             assert word in table.stdout
         for options, complaint in (
             (("rig1", "--command", "constant:-3"), "delay_ms: expected greater than or equal to 0, found '-3'"),
             (("rig1", "--preset", "wlan"), "no preset is called 'wlan': expected one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
-            (("rig1", "--trace", recording, "--command", "constant:1"), "leave out --command"),
-            (("rig1", "--off", "--preset", "vpn"), "--off and --lab stand alone"),
+            (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
+            (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
             (("rig9", "--off"), "no rig is called 'rig9'"),
-            (("--off",), "setting an impairment takes a rig"),
+            (("--off",), "a rig is required to set an impairment"),
         ):
             said = hilrig("impair", *options, "--config", config)
             assert (said.returncode, len(said.stderr.splitlines())) == (2, 1), said.stderr
             assert complaint in said.stderr
 
 
-def test_where_no_edge_runs_it_says_so(tmp_path: Path) -> None:
+def test_missing_edge_is_reported(tmp_path: Path) -> None:
     said = hilrig("impair", "--config", write_lab(tmp_path))
     assert said.returncode == 3
     assert "no edge answers for lab 'lab'" in said.stderr

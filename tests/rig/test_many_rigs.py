@@ -1,4 +1,4 @@
-"""A class of rigs as a user runs it: shared out among processes, looked at, more and fewer of them while it runs."""
+"""Tests of a lab with many rigs: partitioned among processes, monitored, with rigs added and removed at run time."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def rig_of(lab: RunningLab, name: str) -> dict[str, Any]:
 
 @pytest.fixture
 def controller(lab: RunningLab) -> Iterator[ModbusTcpClient]:
-    """Holds rig 4."""
+    """A client that holds the lease of rig 4."""
     with closing(ModbusTcpClient("127.0.0.1", port=lab.lab.ports["rig4"], timeout=2)) as client:
         assert client.connect()
         client.read_holding_registers(4, count=4)
@@ -65,7 +65,7 @@ def test_every_rig_is_served_by_one_of_the_edges(lab: RunningLab) -> None:
     assert all(rig["served"] and rig["simulated"] for rig in shown["rigs"])
 
 
-def test_top_shows_who_holds_a_rig_its_loop_and_that_it_is_recorded(lab: RunningLab) -> None:
+def test_top_shows_lease_holder_loop_and_recording(lab: RunningLab) -> None:
     def shown() -> dict[str, Any] | None:
         rig = rig_of(lab, "rig4")
         return rig if rig["controller"] and rig["recording"] and rig["loop_samples"] else None
@@ -79,7 +79,7 @@ def test_top_shows_who_holds_a_rig_its_loop_and_that_it_is_recorded(lab: Running
     assert "edge/2" in table
 
 
-def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
+def test_prometheus_metrics_are_served(lab: RunningLab) -> None:
     port = free_ports(1)
     command = [*HILRIG, "metrics", "--config", str(lab.config), "--listen", f"127.0.0.1:{port}"]
     with Popen(command, stdout=PIPE, text=True) as process:
@@ -91,7 +91,7 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
                 return str(answer.read().decode())
 
         try:
-            # Each service says once a second how it is: simulation, two edges and two recorders.
+            # Each service reports once per second: simulation, two edges and two recorders.
             eventually(lambda: text().count("hilrig_up{") == 5, every_s=0.2)
             assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
         finally:
@@ -102,18 +102,18 @@ def test_metrics_are_there_for_prometheus(lab: RunningLab) -> None:
     assert "choose another address with --listen" in taken.stderr
 
 
-def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusTcpClient) -> None:
-    with socket.socket() as stranger:
-        behind = lab.port + 4
-        # Where another one has the port behind the lab's already it may be gone a moment later.
+def test_rig_is_added_used_and_removed(lab: RunningLab, controller: ModbusTcpClient) -> None:
+    with socket.socket() as other:
+        next_port = lab.port + 4
+        # If another program has the next port already, it may release it a moment later.
         with suppress(OSError):
-            stranger.bind(("127.0.0.1", behind))
-            stranger.listen()
-            behind += 1
+            other.bind(("127.0.0.1", next_port))
+            other.listen()
+            next_port += 1
         done = hilrig("rig", "add", "guest", "--config", lab.config)
     assert done.returncode == 0, done.stderr
     port = int(done.stdout.strip().rpartition(":")[2])
-    assert port >= behind
+    assert port >= next_port
     with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
         assert client.connect()
         for _ in range(20):
@@ -130,15 +130,15 @@ def test_a_rig_is_added_used_and_taken_away(lab: RunningLab, controller: ModbusT
         assert hilrig("rig", "remove", "guest", "--config", lab.config).returncode == 0
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), timeout=2)
-    # The others did not feel it: the connection and the lease of rig 4 are what they were.
+    # The other rigs are not affected: connection and lease of rig 4 are unchanged.
     assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
 
 
-def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: RunningLab) -> None:
+def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
     for arguments, code, text in [
-        (("add", "rig1"), 2, "the lab has a rig called 'rig1' already"),
+        (("add", "rig1"), 2, "rig 'rig1' already exists in the lab"),
         (("add", "no name"), 2, "name: expected"),
-        (("add", "late", "--port", str(lab.port)), 3, "late was not added: edge/[12] .* can't listen on"),
+        (("add", "late", "--port", str(lab.port)), 3, "rig 'late' was not added: edge/[12] .* can't listen on"),
         (("remove", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
         (("reset", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
     ]:
@@ -154,16 +154,16 @@ def test_what_can_not_be_added_is_refused_and_nothing_is_left_of_it(lab: Running
     [("lease",), ("impair",), ("rig", "reset"), ("rig", "remove"), ("record", "start"), ("live",)],
     ids=" ".join,
 )
-def test_a_name_that_is_no_rig_s_is_refused_with_those_that_are(lab: RunningLab, words: tuple[str, ...]) -> None:
+def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tuple[str, ...]) -> None:
     done = hilrig(*words, "rg1", "--config", lab.config)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.endswith("hilrig: error: no rig is called 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
-def test_a_rig_that_is_given_twice_is_refused() -> None:
+def test_duplicate_rig_is_rejected() -> None:
     done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=PATIENT_S)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.endswith("hilrig: error: --rigs rig1,rig1: 'rig1' stands there 2 times, expected once\n")
+    assert done.stderr.endswith("hilrig: error: --rigs: duplicate rig 'rig1'\n")
 
 
 @pytest.mark.parametrize(
@@ -174,20 +174,20 @@ def test_a_rig_that_is_given_twice_is_refused() -> None:
         (("edge", "--instance", "2", "--rigs", "rig3"), "another edge is called '2' already"),
     ],
 )
-def test_a_second_service_of_a_rig_refuses(lab: RunningLab, arguments: tuple[str, ...], reason: str) -> None:
+def test_second_service_of_a_rig_does_not_start(lab: RunningLab, arguments: tuple[str, ...], reason: str) -> None:
     done = hilrig(*arguments, "--config", lab.config)
     assert done.returncode == 3
     assert re.search(reason, done.stderr)
 
 
-def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab, controller: ModbusTcpClient) -> None:
+def test_failed_edge_does_not_affect_rigs_of_the_other(lab: RunningLab, controller: ModbusTcpClient) -> None:
     first = next(
         pid
         for pid in lab.service_pids()
         if b"rig1,rig2" in Path(f"/proc/{pid}/cmdline").read_bytes() and _is(pid, "edge")
     )
     os.kill(first, signal.SIGKILL)
-    eventually(lambda: "edge is started again" in lab.output())
+    eventually(lambda: "edge restarted" in lab.output())
     assert not controller.write_registers(0, [100, 0, 0, 0]).isError()
 
     def back() -> bool:
@@ -197,22 +197,22 @@ def test_one_edge_dies_and_the_rigs_of_the_other_do_not_feel_it(lab: RunningLab,
     eventually(back, every_s=0.1)
 
 
-def test_logs_are_one_json_object_a_line(lab: RunningLab) -> None:
+def test_log_has_one_json_object_per_line(lab: RunningLab) -> None:
     lines = [line for line in lab.output().splitlines() if line.startswith("{")]
     assert lines
     for line in lines:
         assert {"time", "level", "service", "instance", "message"} <= set(json.loads(line))
 
 
-def test_a_lab_that_does_not_run_is_said_so(tmp_path: Path) -> None:
+def test_lab_that_is_not_running_is_reported(tmp_path: Path) -> None:
     config = write_lab(tmp_path)
     for command in (("top", "--json"), ("rig", "list")):
         done = hilrig(*command, "--config", config)
         assert done.returncode == 3
-        assert "nothing is heard of lab 'lab': is it running" in done.stderr
+        assert "no service of lab 'lab' found: is it running" in done.stderr
 
 
-def test_more_processes_than_rigs_are_refused(tmp_path: Path) -> None:
+def test_more_processes_than_rigs_are_rejected(tmp_path: Path) -> None:
     done = hilrig("up", "--edges", "2", "--config", write_lab(tmp_path))
     assert done.returncode == 2
     assert "--edges 2: expected 1 to 1, the number of rigs" in done.stderr

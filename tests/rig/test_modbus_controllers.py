@@ -1,7 +1,6 @@
-"""Controllers that people start from, and clients that nobody here wrote, against the whole rig.
+"""Tests of the example controllers, and of independent Modbus clients, with a complete lab.
 
-Python, C and Node.js run as a student runs them; each must move the arm to two poses and end with it where it was
-sent.
+The examples in Python, C and Node.js run as a student runs them; each must move the arm to two poses.
 """
 
 import json
@@ -25,9 +24,9 @@ pytestmark = pytest.mark.rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LONG_LEASE = "edge.lease_timeout_ms = 60000"
-"""A command takes its time to start on a busy machine."""
+"""Long enough for a command to start on a busy machine."""
 SECONDS = "7.8"
-"""Nearly both poses' time: the arm stands in the second one when the program ends."""
+"""Duration of nearly both poses: the arm is at the second one when the program ends."""
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +66,8 @@ def in_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "hold_position.js"
 
 
-def test_the_examples_hold_and_move_the_arm(lab: RunningLab, in_c: Path, in_node: Path) -> None:
-    """All three at once, each on a rig of its own."""
+def test_examples_hold_and_move_the_arm(lab: RunningLab, in_c: Path, in_node: Path) -> None:
+    """All three run at once, each on its own rig."""
     port = {rig.name: str(lab.lab.ports[rig.name]) for rig in lab.lab.rigs}
     commands = {
         "Python": [sys.executable, EXAMPLES / "hold_position.py", "--port", port["rig1"], "--duration", SECONDS],
@@ -86,7 +85,7 @@ def test_the_examples_hold_and_move_the_arm(lab: RunningLab, in_c: Path, in_node
 
 
 @pytest.mark.parametrize("name", ["Python", "C", "Node.js"])
-def test_an_example_without_a_rig_says_so(name: str, request: pytest.FixtureRequest) -> None:
+def test_example_reports_a_missing_rig(name: str, request: pytest.FixtureRequest) -> None:
     commands = {
         "Python": lambda: [sys.executable, EXAMPLES / "hold_position.py", "--port", "1"],
         "C": lambda: [request.getfixturevalue("in_c"), "127.0.0.1", "1"],
@@ -98,7 +97,7 @@ def test_an_example_without_a_rig_says_so(name: str, request: pytest.FixtureRequ
     assert "Traceback" not in done.stderr
 
 
-def test_a_teacher_sees_who_holds_a_rig_and_takes_it_back(lab: RunningLab) -> None:
+def test_operator_lists_and_revokes_leases(lab: RunningLab) -> None:
     def ask(*arguments: str) -> subprocess.CompletedProcess[str]:
         return hilrig("lease", *arguments, "--config", lab.config)
 
@@ -115,7 +114,7 @@ def test_a_teacher_sees_who_holds_a_rig_and_takes_it_back(lab: RunningLab) -> No
         assert holder.write(0, 0).hex() == "9006"
 
 
-def test_questions_that_cannot_be_answered_say_why(lab: RunningLab, tmp_path: Path) -> None:
+def test_lease_command_reports_errors(lab: RunningLab, tmp_path: Path) -> None:
     unknown = hilrig("lease", "rig9", "--config", lab.config)
     assert unknown.returncode == 2
     assert "rig1, rig2, rig3" in unknown.stderr
@@ -126,8 +125,8 @@ def test_questions_that_cannot_be_answered_say_why(lab: RunningLab, tmp_path: Pa
     assert "Traceback" not in nobody.stderr
 
 
-def test_two_foreign_clients_at_once_and_the_lease_between_them(in_c: Path) -> None:
-    """libmodbus holds the rig; mbpoll reads beside it and is refused when it writes."""
+def test_libmodbus_holds_the_lease_and_mbpoll_is_denied(in_c: Path) -> None:
+    """libmodbus holds the lease; mbpoll may read, and its writes are denied."""
     require_mbpoll()
     with running_edge() as rig, moving(rig):
         with subprocess.Popen(
@@ -140,7 +139,7 @@ def test_two_foreign_clients_at_once_and_the_lease_between_them(in_c: Path) -> N
             assert "busy" in refusal.value.stderr.lower()
             assert all(command.controller == rig.commands[1].controller for command in rig.commands[1:])
             assert holder.wait(30) in (0, 1)
-        # It is gone: mbpoll gets the rig.
+        # It has disconnected: mbpoll acquires the lease.
         eventually(lambda: rig.kinds().count("LEASE_GRANTED") == rig.kinds().count("LEASE_LOST"))
         mbpoll_write(rig.port, 1, 1000)
         assert rig.commands[-1].effort[0] == 1.0
@@ -150,11 +149,11 @@ def test_two_foreign_clients_at_once_and_the_lease_between_them(in_c: Path) -> N
 
 @contextmanager
 def moving(rig: EdgeRig) -> Iterator[None]:
-    """States at 50 Hz while it lasts."""
-    over = threading.Event()
+    """Publish states at 50 Hz in the context."""
+    done = threading.Event()
 
     def send_states() -> None:
-        while not over.wait(0.02):
+        while not done.wait(0.02):
             rig.state()
 
     thread = threading.Thread(target=send_states)
@@ -162,12 +161,12 @@ def moving(rig: EdgeRig) -> Iterator[None]:
     try:
         yield
     finally:
-        over.set()
+        done.set()
         thread.join()
 
 
-def test_the_plc_project_speaks_of_registers_that_exist() -> None:
-    """OpenPLC is not run here; its files are held against the map."""
+def test_plc_project_uses_existing_registers() -> None:
+    """OpenPLC is not started; its files are compared with the register map."""
     config = dict(
         re.findall(r'^device0\.(\w+) = "([^"]*)"', (EXAMPLES / "openplc/mbconfig.cfg").read_text(), re.MULTILINE)
     )

@@ -1,4 +1,4 @@
-"""The edge on real sockets: leases, sessions, watchdog, limits, stamps, the record of its traffic, and its end."""
+"""Tests of the edge on real sockets: timestamps, lease, sessions, watchdog, limits, request log, shutdown."""
 
 import socket
 import statistics
@@ -23,10 +23,10 @@ from support.waiting import eventually
 pytestmark = pytest.mark.rig
 
 
-# -- the loop: stamps
+# -- timestamps
 
 
-def test_a_write_is_published_with_stamps_in_the_order_of_time() -> None:
+def test_write_has_timestamps_in_chronological_order() -> None:
     with running_edge() as rig, rig.client() as client:
         began_ns = now_ns()
         state = rig.state()
@@ -47,7 +47,7 @@ def test_a_write_is_published_with_stamps_in_the_order_of_time() -> None:
         assert command.controller == client.address
 
 
-def test_pipelined_reads_and_writes_never_give_a_negative_stage() -> None:
+def test_pipelined_requests_give_no_negative_stage() -> None:
     with running_edge() as rig, rig.client() as client:
         read = client.frame(b"\x03\x00\x04\x00\x04")
         write = client.frame(bytes.fromhex("10 00 00 00 01 02 00 01"))
@@ -63,7 +63,7 @@ def test_pipelined_reads_and_writes_never_give_a_negative_stage() -> None:
             assert command.state_served_ns <= command.write_arrived_ns <= command.sent_ns
 
 
-def test_what_was_sent_is_on_the_record_byte_for_byte() -> None:
+def test_every_request_is_in_the_request_log() -> None:
     with running_edge() as rig, rig.client() as client:
         client.write(0, 7)
         client.read(4, 4)
@@ -112,10 +112,10 @@ def test_busy_polling_client_sends_few_messages_a_step() -> None:
     assert len(sent) <= elapsed_ns // COALESCE_WINDOW_NS + (SEPARATE_WRITES + 1) * steps < written
 
 
-# -- one writer
+# -- lease
 
 
-def test_two_controllers_one_writes_and_both_read() -> None:
+def test_one_client_writes_and_both_read() -> None:
     with running_edge() as rig, rig.client() as holder, rig.client() as other:
         holder.write(0, 500)
         assert other.write(0, 900).hex() == "9006"
@@ -125,16 +125,16 @@ def test_two_controllers_one_writes_and_both_read() -> None:
         assert (refusal.controller_data.controller, refusal.controller_data.holder) == (other.address, holder.address)
         holder.close()
         eventually(lambda: other.write(0, 900).hex() == "1000000001")
-        # Of the same host, and within a second: told when it has stayed.
+        # Same host within a second: reported after it has kept the lease for a second.
         eventually(lambda: rig.kinds().count("LEASE_GRANTED") == 2)
 
 
-def test_the_teacher_sees_and_frees_a_lease() -> None:
+def test_operator_queries_and_revokes_the_lease() -> None:
     with running_edge() as rig, rig.client() as holder, MemoryBus(rig.hub) as teacher:
         key = topics.LEASE.key(rig.lab.name, "rig1")
 
         def ask(release: bool = False) -> LeaseStatus:
-            [answer] = teacher.ask(key, LeaseRequest(release=release).SerializeToString())
+            [answer] = teacher.query(key, LeaseRequest(release=release).SerializeToString())
             return LeaseStatus.FromString(answer.payload)
 
         assert ask().holder == ""
@@ -143,7 +143,7 @@ def test_the_teacher_sees_and_frees_a_lease() -> None:
         assert (released := ask(release=True)).released == holder.address
         assert released.holder == ""
         assert ask(release=True).released == ""
-        # The one who held it is not faster than all others.
+        # The previous holder cannot acquire it again at once.
         assert holder.write(0, 1).hex() == "9006"
         with rig.client() as other:
             other.write(0, 1)
@@ -153,7 +153,7 @@ def test_the_teacher_sees_and_frees_a_lease() -> None:
 # -- sessions
 
 
-def test_a_session_lasts_over_reconnects_and_ends_after_its_grace() -> None:
+def test_session_survives_reconnects_and_ends_after_grace() -> None:
     with running_edge(session_grace_ms=300) as rig:
         for _ in range(3):
             with rig.client() as client:
@@ -168,11 +168,11 @@ def test_a_session_lasts_over_reconnects_and_ends_after_its_grace() -> None:
 
 
 TCP_REPAIR = 19
-"""Linux: a connection that is closed in this state is gone without a word, as if its host had lost its power."""
+"""Linux socket option: a connection closed in repair mode sends nothing, as if its host had lost its power."""
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can close a connection without a word")
-def test_a_controller_that_lost_its_power_comes_back_from_the_same_port_and_goes_on() -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can close a connection without sending anything")
+def test_client_after_power_loss_continues_its_session() -> None:
     with running_edge() as rig:
         holder = rig.client()
         source = holder.socket.getsockname()
@@ -181,23 +181,23 @@ def test_a_controller_that_lost_its_power_comes_back_from_the_same_port_and_goes
             holder.socket.setsockopt(socket.IPPROTO_TCP, TCP_REPAIR, 1)
         except OSError:
             holder.close()
-            pytest.skip("needs the right to vanish without a word (CAP_NET_ADMIN)")
+            pytest.skip("needs CAP_NET_ADMIN, to close a connection without sending anything")
         holder.close()
         with socket.create_connection(("127.0.0.1", rig.port), timeout=10, source_address=source) as again:
             again.sendall(bytes.fromhex("00 01 00 00 00 06 01 06 00 00 01 F4"))
             assert again.recv(300).hex(" ") == "00 01 00 00 00 06 01 06 00 00 01 f4"
-        assert "the connection broke" in rig.event(Event.LEASE_LOST).text
+        assert "connection lost" in rig.event(Event.LEASE_LOST).text
         assert rig.kinds().count("SESSION_START") == 1
         eventually(lambda: rig.service.counters.connections == 0)
 
 
-def test_the_log_stream_states_the_open_sessions() -> None:
+def test_open_sessions_are_announced() -> None:
     with running_edge() as rig, rig.client() as client:
         client.write(0, 0)
         eventually(lambda: rig.sessions == [rig.event(Event.SESSION_START).session])
 
 
-def test_an_orderly_end_leaves_no_torque_and_no_session() -> None:
+def test_shutdown_ends_torque_and_session() -> None:
     with running_edge() as rig, rig.client() as client:
         client.write(0, 1000)
         rig.service.stop()
@@ -212,7 +212,7 @@ def test_an_orderly_end_leaves_no_torque_and_no_session() -> None:
 
 
 @pytest.mark.parametrize("how", ["closes", "is silent", "reads on"])
-def test_torque_is_zero_within_the_time_out(how: str) -> None:
+def test_torque_is_zero_within_the_timeout(how: str) -> None:
     timeout_ms = 200
     with running_edge(watchdog_ms=timeout_ms) as rig, rig.client() as client:
         client.write(0, 1000)
@@ -227,28 +227,32 @@ def test_torque_is_zero_within_the_time_out(how: str) -> None:
         safe = rig.commands[-1]
         silent_ms = (safe.sent_ns - write.write_arrived_ns) / 1e6
         assert timeout_ms <= silent_ms < timeout_ms + 20
-        why = {"closes": "is gone", "is silent": "is silent", "reads on": "reads but does not write"}[how]
-        assert why in rig.event(Event.WATCHDOG_TRIP).text
+        cause = {
+            "closes": "no longer holds the lease",
+            "is silent": "sends no requests",
+            "reads on": "reads but does not write",
+        }[how]
+        assert cause in rig.event(Event.WATCHDOG_TRIP).text
 
 
-def test_the_time_out_by_register_holds_at_once() -> None:
+def test_timeout_register_is_active_at_once() -> None:
     with running_edge() as rig, rig.client() as client:
         client.write(0, 1000)
         client.write(101, 100)
         eventually(lambda: rig.commands[-1].safe, timeout_s=0.5)
 
 
-def test_the_standing_command_is_repeated_while_the_controller_thinks() -> None:
+def test_held_command_is_repeated() -> None:
     with running_edge(repeat_ms=50) as rig, rig.client() as client:
         client.write(0, 1000)
         seq = rig.commands[-1].seq
         eventually(lambda: [repeat.seq for repeat in rig.repeats].count(seq) >= 3)
 
 
-# -- who may connect, and how long
+# -- admission and idle timeout
 
 
-def test_connections_are_limited_and_the_operator_sees_it() -> None:
+def test_connections_are_limited_and_reported() -> None:
     with running_edge(max_connections=2, max_connections_per_host=5) as rig:
         with rig.client() as one, rig.client() as two:
             one.read(0, 1)
@@ -275,12 +279,12 @@ def test_only_allowed_networks_may_connect() -> None:
     with running_edge(allow=["10.0.0.0/8"]) as rig:
         with rig.client() as client:
             assert client.closed()
-        assert "networks" in rig.event(Event.CONNECTION_REFUSED).text
+        assert "allow-list" in rig.event(Event.CONNECTION_REFUSED).text
     with running_edge(allow=["10.0.0.0/8", "127.0.0.0/8"]) as rig, rig.client() as client:
         assert client.read(0, 1) == [0]
 
 
-def test_an_idle_connection_is_closed_and_a_used_one_is_not() -> None:
+def test_only_idle_connections_are_closed() -> None:
     with running_edge(idle_timeout_s=0.3) as rig, rig.client() as idle, rig.client() as used:
         closed = threading.Event()
         threading.Thread(target=lambda: idle.closed() and closed.set(), daemon=True).start()
@@ -291,23 +295,23 @@ def test_an_idle_connection_is_closed_and_a_used_one_is_not() -> None:
         used.read(0, 1)
 
 
-def test_half_a_request_does_not_keep_a_connection_open() -> None:
+def test_incomplete_request_does_not_keep_connection_open() -> None:
     with running_edge(idle_timeout_s=0.3) as rig, rig.client() as client:
         client.send(client.frame(b"\x03\x00\x00\x00\x01")[:9])
         assert client.closed()
 
 
-def test_who_does_not_read_his_answers_does_not_hurt_his_neighbour() -> None:
-    with running_edge() as rig, rig.client() as deaf, rig.client() as good:
-        deaf.socket.settimeout(0.2)
-        request = deaf.frame(b"\x04\x00\x00\x00\x24") * 400
+def test_client_that_does_not_read_does_not_delay_others() -> None:
+    with running_edge() as rig, rig.client() as blocked, rig.client() as good:
+        blocked.socket.settimeout(0.2)
+        request = blocked.frame(b"\x04\x00\x00\x00\x24") * 400
         sent = 0
         try:
             while sent < 200_000_000:
-                sent += deaf.socket.send(request)
+                sent += blocked.socket.send(request)
         except TimeoutError:
             pass
-        # It was not read from any more, long before all memory was used.
+        # The edge has stopped reading from it, long before memory was exhausted.
         assert sent < 100_000_000
         times = []
         for _ in range(200):
@@ -318,10 +322,10 @@ def test_who_does_not_read_his_answers_does_not_hurt_his_neighbour() -> None:
         assert max(times) < 1
 
 
-# -- where it listens
+# -- listening addresses
 
 
-def test_a_port_in_use_names_the_rig_and_the_address() -> None:
+def test_port_in_use_is_reported_with_rig_and_address() -> None:
     [port] = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"name": "left", "port": port}]})
     with running_edge() as other:
@@ -334,7 +338,7 @@ def test_a_port_in_use_names_the_rig_and_the_address() -> None:
     assert "lab.toml" in text
 
 
-def test_each_rig_has_a_port_and_a_life_of_its_own() -> None:
+def test_rigs_are_independent() -> None:
     with running_edge(rigs=("left", "right")) as rig, rig.client("left") as left, rig.client("right") as right:
         left.write(0, 100)
         right.write(0, 200)
@@ -342,7 +346,7 @@ def test_each_rig_has_a_port_and_a_life_of_its_own() -> None:
         assert {command.rig: command.effort[0] for command in rig.commands} == {"left": 0.1, "right": 0.2}
 
 
-def test_a_controller_that_connects_before_the_first_state_is_served_when_it_comes() -> None:
+def test_early_client_is_served_after_the_first_state() -> None:
     [port] = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"port": port}]})
     with Service("edge", lab, MemoryBus()) as service:
@@ -367,7 +371,7 @@ def _connect(port: int) -> RawClient | None:
         return None
 
 
-def test_it_listens_on_ipv6_too() -> None:
+def test_listens_on_ipv6() -> None:
     try:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError:

@@ -1,6 +1,6 @@
-"""Random and mutated frames over many connections: every request gets its answer, nobody else notices.
+"""Fuzz test of the edge: every request gets its response, and other clients are not affected.
 
-`HILRIG_FUZZ_FRAMES` sets how many frames; the seed is printed, and `HILRIG_FUZZ_SEED` repeats it.
+`HILRIG_FUZZ_FRAMES` sets the number of frames; the seed is printed, and `HILRIG_FUZZ_SEED` repeats it.
 """
 
 import json
@@ -47,7 +47,7 @@ print(json.dumps({"reads": len(times), "p99_ms": p99_ms(times), "machine_late_p9
 
 
 def random_pdu(chance: random.Random) -> bytes:
-    """A request that may be right, nearly right, or not at all."""
+    """Return a request that is valid, nearly valid, or random."""
     function = chance.choice((1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43, chance.randrange(256)))
     address = chance.choice((0, 1, 3, 4, 7, 8, 35, 36, 99, 100, 101, 102, 0xFFFF, chance.randrange(65536)))
     count = chance.choice((0, 1, 2, 4, 8, 36, 121, 123, 125, 126, 2000, 0xFFFF, chance.randrange(65536)))
@@ -65,7 +65,7 @@ def random_pdu(chance: random.Random) -> bytes:
 
 
 def mutated(chance: random.Random, frame: bytes) -> bytes:
-    """A frame with some bytes changed, left out, or added."""
+    """Return the frame with some bytes changed, removed, or inserted."""
     data = bytearray(frame)
     for _ in range(chance.randrange(1, 4)):
         where = chance.randrange(len(data))
@@ -82,7 +82,7 @@ def mutated(chance: random.Random, frame: bytes) -> bytes:
 
 
 def random_stream(chance: random.Random, frames: int) -> bytes:
-    """What one connection sends; most of it has a good header, for behind a bad one nothing is read."""
+    """Return the data of one connection; most headers are valid, because nothing is read after an invalid one."""
     parts = []
     for _ in range(frames):
         pdu = random_pdu(chance)[:253]
@@ -90,7 +90,7 @@ def random_stream(chance: random.Random, frames: int) -> bytes:
         frame = HEADER.pack(chance.randrange(65536), 0, len(pdu) + 1, unit) + pdu
         kind = chance.random()
         if kind < 0.35 and len(frame) > 9:
-            # Mutated behind the header, which keeps its length.
+            # Mutated after the header, with a valid length.
             body = mutated(chance, frame[7:])[:253]
             frame = HEADER.pack(chance.randrange(65536), 0, len(body) + 1, unit) + body if body else frame
         elif kind < 0.352:
@@ -103,7 +103,7 @@ def random_stream(chance: random.Random, frames: int) -> bytes:
 
 
 def requests_in(stream: bytes) -> list[tuple[int, int, int]]:
-    """Transaction, unit and function of what is a request, up to where the stream is no Modbus any more."""
+    """Return transaction, unit and function of each request, up to the first malformed one."""
     found = []
     while len(stream) >= 8:
         transaction, protocol, length, unit = HEADER.unpack(stream[:7])
@@ -115,7 +115,7 @@ def requests_in(stream: bytes) -> list[tuple[int, int, int]]:
 
 
 def talk(port: int, stream: bytes) -> bytes:
-    """Send it all, and read until the edge closes."""
+    """Send the data, and return everything received until the edge closes the connection."""
     answers = b""
     with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
         try:
@@ -124,7 +124,7 @@ def talk(port: int, stream: bytes) -> bytes:
             while part := client.recv(65536):
                 answers += part
         except OSError:
-            # It closed on what is no Modbus while more was on its way.
+            # The edge closed the connection after a malformed request, with further data in flight.
             pass
     return answers
 
@@ -134,11 +134,11 @@ def resident_mib(pid: int) -> float:
 
 
 @pytest.mark.timeout(600)
-def test_random_frames_hurt_nobody(tmp_path: Path) -> None:
+def test_random_frames_do_not_affect_other_clients(tmp_path: Path) -> None:
     print(f"HILRIG_FUZZ_SEED={SEED}")
     chance = random.Random(SEED)
     controller = build_c_client()
-    # Made beforehand: what is measured is the edge under them, not a machine that is busy making them.
+    # Generated in advance, so that the generation does not load the machine during the measurement.
     streams: list[tuple[int, bytes]] = []
     while sum(frames for frames, _ in streams) < FRAMES:
         frames = chance.randrange(1, 400)
@@ -171,7 +171,7 @@ def test_random_frames_hurt_nobody(tmp_path: Path) -> None:
             assert reader.poll() is None
             out, _ = reader.communicate("\n", timeout=10)
             healthy = json.loads(out)
-            assert looping.poll() is None, "the other rig's controller was disturbed"
+            assert looping.poll() is None, "the controller of the other rig was disturbed"
         finally:
             reader.kill()
             looping.kill()
@@ -180,8 +180,8 @@ def test_random_frames_hurt_nobody(tmp_path: Path) -> None:
         assert lab.service_pid("edge") == edge
         assert before_mib is not None
         grown_mib = resident_mib(edge) - before_mib
-        print(f"{sent} frames, {len(streams)} connections, neighbour {healthy}, memory {grown_mib:+.1f} MiB")
-        # A read waits for two processes to wake up: what a busy machine is late with that is not the edge's.
+        print(f"{sent} frames, {len(streams)} connections, other client {healthy}, memory {grown_mib:+.1f} MiB")
+        # A read includes the wake-up of two processes: their delay on a busy machine is not caused by the edge.
         assert healthy["p99_ms"] < 5 + 2 * healthy["machine_late_p99_ms"]
         assert grown_mib < 16
         assert "Traceback" not in lab.output()
@@ -190,7 +190,7 @@ def test_random_frames_hurt_nobody(tmp_path: Path) -> None:
 
 
 def has_garbage(stream: bytes, asked: list[tuple[int, int, int]]) -> bool:
-    """Whether something stands behind the requests: it may reset the connection, and answers get lost with it."""
+    """Return whether malformed data follows the requests: it may reset the connection and discard responses."""
     used = 0
     for _ in asked:
         used += 6 + struct.unpack_from(">H", stream, used + 4)[0]

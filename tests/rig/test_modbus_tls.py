@@ -1,4 +1,4 @@
-"""Modbus/TCP Security: right, wrong, expired and missing certificates, and what a role lets its bearer do."""
+"""Tests of Modbus/TCP Security: valid, invalid, expired and missing certificates, and roles."""
 
 import gc
 import json
@@ -19,13 +19,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
-from generate_conformance import SECURED
+from generate_conformance import SECURITY_RULES
 from hilrig_modbus_edge.server.tls import TlsPolicy
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.security.x509 import (
     ROLE_OID,
-    Identity,
+    Credential,
     issue_client,
     issue_server,
     make_authority,
@@ -49,9 +49,9 @@ class Lab:
     """Certificates of a lab, in a folder."""
 
     folder: Path
-    authority: Identity
+    authority: Credential
 
-    def write(self, name: str, identity: Identity) -> None:
+    def write(self, name: str, identity: Credential) -> None:
         (self.folder / f"{name}.pem").write_bytes(identity.certificate_pem)
         (self.folder / f"{name}.key").write_bytes(identity.key_pem)
 
@@ -77,7 +77,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
         lab.write(name, issue_client(authority, name, role, NOW, 30))
     lab.write("expired", issue_client(authority, "expired", "operator", NOW - timedelta(days=10), 9))
     lab.write("foreign", issue_client(stranger, "foreign", "operator", NOW, 30))
-    # A server's certificate is no client's, whoever signed it.
+    # A server certificate is not valid for a client.
     lab.write("server", issue_server(authority, ["localhost"], NOW, 30))
     return lab
 
@@ -90,7 +90,7 @@ def rig(lab: Lab) -> Iterator[EdgeRig]:
 
 
 def talk(rig: EdgeRig, context: ssl.SSLContext, *requests: bytes) -> list[bytes]:
-    """PDUs of the answers; an `OSError` where the edge does not take the certificate."""
+    """Return the PDUs of the responses; raises `OSError` if the edge rejects the certificate."""
     port = rig.lab.tls_ports["rig1"]
     with (
         socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
@@ -106,37 +106,37 @@ def talk(rig: EdgeRig, context: ssl.SSLContext, *requests: bytes) -> list[bytes]
         return answers
 
 
-def test_an_operator_reads_and_writes(rig: EdgeRig, lab: Lab) -> None:
+def test_operator_reads_and_writes(rig: EdgeRig, lab: Lab) -> None:
     answers = talk(rig, lab.client("operator"), WRITE, READ)
     assert answers == [bytes.fromhex("06 00 00 03 E8"), bytes.fromhex("03 08 03 E8 00 00 00 00 00 00")]
     assert rig.commands[-1].effort[0] == 1.0
 
 
 @pytest.mark.parametrize("name", ["observer", "plain", "chef"])
-def test_an_observer_and_who_has_no_role_read_only(rig: EdgeRig, lab: Lab, name: str) -> None:
+def test_observer_and_unknown_roles_are_read_only(rig: EdgeRig, lab: Lab, name: str) -> None:
     answers = talk(rig, lab.client(name), READ, WRITE)
     assert answers == [bytes.fromhex("03 08 00 00 00 00 00 00 00 00"), bytes.fromhex("86 01")]
-    assert "may read only" in rig.event(Event.LEASE_REFUSED).text
+    assert "read-only" in rig.event(Event.LEASE_REFUSED).text
 
 
 @pytest.mark.parametrize(("no_role", "answer"), [("operator", "06 00 00 03 E8"), ("observer", "86 01")])
-def test_what_no_role_means_is_configured(lab: Lab, no_role: str, answer: str) -> None:
+def test_permission_without_role_is_configurable(lab: Lab, no_role: str, answer: str) -> None:
     [port] = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role=no_role)) as rig:
         assert talk(rig, lab.client("plain"), WRITE) == [bytes.fromhex(answer)]
 
 
-def test_no_role_can_mean_no_entry(lab: Lab) -> None:
+def test_clients_without_role_can_be_refused(lab: Lab) -> None:
     [port] = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role="refuse")) as rig:
-        with pytest.raises(OSError):  # noqa: PT011  # which one depends on who is faster
+        with pytest.raises(OSError):  # noqa: PT011  # which one depends on the timing
             talk(rig, lab.client("plain"), READ)
         assert "no role" in rig.event(Event.CONNECTION_REFUSED).text
         assert talk(rig, lab.client("observer"), READ)
 
 
 @pytest.mark.parametrize(
-    ("name", "why"),
+    ("name", "reason"),
     [
         ("expired", "expired"),
         ("foreign", "certificate"),
@@ -144,14 +144,12 @@ def test_no_role_can_mean_no_entry(lab: Lab) -> None:
         ("", "peer did not return a certificate"),
     ],
 )
-def test_a_certificate_that_is_not_right_is_refused_and_the_operator_reads_why(
-    rig: EdgeRig, lab: Lab, name: str, why: str
-) -> None:
-    with pytest.raises(OSError):  # noqa: PT011  # the client's TLS library has many words for it
+def test_invalid_certificate_is_refused_with_reason(rig: EdgeRig, lab: Lab, name: str, reason: str) -> None:
+    with pytest.raises(OSError):  # noqa: PT011  # depends on the TLS library of the client
         talk(rig, lab.client(name), READ)
-    assert why in rig.event(Event.CONNECTION_REFUSED).text
+    assert reason in rig.event(Event.CONNECTION_REFUSED).text
     assert rig.service.counters.refused == 1
-    # The next one is served.
+    # The next client is served.
     assert talk(rig, lab.client("operator"), READ)
 
 
@@ -160,7 +158,7 @@ OPERATOR, OBSERVER = b"\x08operator", b"\x08observer"
 
 
 def client_with(lab: Lab, name: str, *values: bytes) -> ssl.SSLContext:
-    """A client whose certificate has these role extensions (DER), as nobody's tool should have made it."""
+    """Return the context of a client whose certificate has these malformed role extensions (DER)."""
     issued = issue_client(lab.authority, name, "", NOW, 30)
     builder = (
         x509.CertificateBuilder()
@@ -172,10 +170,10 @@ def client_with(lab: Lab, name: str, *values: bytes) -> ssl.SSLContext:
         .not_valid_after(NOW + timedelta(days=1))
     )
     for value in values:
-        # The builder refuses a second one of a kind.
+        # The builder rejects a duplicate extension.
         role = x509.Extension(ROLE_OID, critical=False, value=x509.UnrecognizedExtension(ROLE_OID, value))
         builder._extensions = [*builder._extensions, role]
-    lab.write(name, Identity(builder.sign(lab.authority.key, hashes.SHA256()), issued.key))
+    lab.write(name, Credential(builder.sign(lab.authority.key, hashes.SHA256()), issued.key))
     return lab.client(name)
 
 
@@ -184,57 +182,55 @@ def client_with(lab: Lab, name: str, *values: bytes) -> ssl.SSLContext:
     [
         pytest.param([UTF8 + OPERATOR, UTF8 + OBSERVER], id="two roles"),
         pytest.param([UTF8 + OPERATOR, UTF8 + OPERATOR], id="one role twice"),
-        pytest.param([PRINTABLE + OPERATOR], id="another kind of string"),
-        pytest.param([UTF8 + OPERATOR + b"\0"], id="something behind it"),
-        pytest.param([UTF8 + b"\x09operator"], id="shorter than it says"),
-        pytest.param([UTF8 + b"\x02\xff\xfe"], id="no UTF-8"),
+        pytest.param([PRINTABLE + OPERATOR], id="another string type"),
+        pytest.param([UTF8 + OPERATOR + b"\0"], id="trailing byte"),
+        pytest.param([UTF8 + b"\x09operator"], id="truncated"),
+        pytest.param([UTF8 + b"\x02\xff\xfe"], id="not UTF-8"),
         pytest.param([UTF8 + b"\x08Operator"], id="another case"),
         pytest.param([UTF8 + b"\x00"], id="empty"),
-        pytest.param([b""], id="nothing"),
+        pytest.param([b""], id="no value"),
     ],
 )
-def test_a_role_that_cannot_be_told_is_none(rig: EdgeRig, lab: Lab, roles: list[bytes]) -> None:
+def test_ambiguous_or_malformed_role_counts_as_no_role(rig: EdgeRig, lab: Lab, roles: list[bytes]) -> None:
     answers = talk(rig, client_with(lab, "odd", *roles), READ, WRITE)
     assert answers == [bytes.fromhex("03 08 00 00 00 00 00 00 00 00"), bytes.fromhex("86 01")]
-    assert "has not the role operator" in rig.event(Event.LEASE_REFUSED).text
+    assert "lacks the role operator" in rig.event(Event.LEASE_REFUSED).text
 
 
-def test_a_handshake_that_is_never_finished_is_given_up(
-    rig: EdgeRig, lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_incomplete_handshake_times_out(rig: EdgeRig, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilrig_modbus_edge.server.tls.HANDSHAKE_TIMEOUT_S", 0.2)
     with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as slow:
-        slow.sendall(Handshake(lab.client("operator")).go_on(b""))
+        slow.sendall(Handshake(lab.client("operator")).proceed(b""))
         while slow.recv(4096):
             pass
     assert "longer than 0.2 seconds" in rig.event(Event.CONNECTION_REFUSED).text
     assert talk(rig, lab.client("operator"), READ)
 
 
-@pytest.mark.parametrize("says_hello", [False, True])
-def test_who_hangs_up_before_the_connection_is_secured_is_told_of(
-    rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, says_hello: bool
+@pytest.mark.parametrize("sends_hello", [False, True])
+def test_aborted_handshake_is_reported(
+    rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, sends_hello: bool
 ) -> None:
     with socket.create_connection(("127.0.0.1", rig.lab.tls_ports["rig1"]), timeout=5) as leaving:
-        if says_hello:
-            leaving.sendall(Handshake(lab.client("operator")).go_on(b""))
+        if sends_hello:
+            leaving.sendall(Handshake(lab.client("operator")).proceed(b""))
             assert leaving.recv(1)
-    assert "closed the connection before it was secured" in rig.event(Event.CONNECTION_REFUSED).text
+    assert "closed the connection during the handshake" in rig.event(Event.CONNECTION_REFUSED).text
     assert talk(rig, lab.client("operator"), READ)
     gc.collect()
     assert not caplog.records
 
 
 class Handshake:
-    """A client's side of a handshake, by hand."""
+    """Client side of a handshake, executed step by step."""
 
     def __init__(self, context: ssl.SSLContext) -> None:
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._client = context.wrap_bio(self._incoming, self._outgoing, server_hostname="localhost")
         self.done = False
 
-    def go_on(self, received: bytes) -> bytes:
-        """What the client says to what it received."""
+    def proceed(self, received: bytes) -> bytes:
+        """Return the bytes that the client sends after it has received some."""
         self._incoming.write(received)
         with suppress(ssl.SSLWantReadError):
             self._client.do_handshake()
@@ -243,18 +239,18 @@ class Handshake:
 
 
 def mutated(random: Random, data: bytes) -> bytes:
-    """Data with a byte changed, cut off, or with something in between."""
-    place = random.randrange(len(data) + 1)
+    """Return the data with a byte changed, truncated, or with random bytes inserted."""
+    position = random.randrange(len(data) + 1)
     how = random.randrange(4)
-    if how == 0 and place < len(data):
-        return data[:place] + random.randbytes(1) + data[place + 1 :]
+    if how == 0 and position < len(data):
+        return data[:position] + random.randbytes(1) + data[position + 1 :]
     if how == 1:
-        return data[:place]
-    return data[:place] + random.randbytes(random.randint(1, 40)) + data[place:]
+        return data[:position]
+    return data[:position] + random.randbytes(random.randint(1, 40)) + data[position:]
 
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
-def test_mutated_handshakes_hurt_nobody(
+def test_mutated_handshakes_have_no_effect_on_others(
     rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, version: ssl.TLSVersion
 ) -> None:
     seed = SystemRandom().randrange(2**32)
@@ -268,8 +264,8 @@ def test_mutated_handshakes_hurt_nobody(
         with suppress(OSError), socket.create_connection(address, timeout=0.05) as client:
             received = b""
             for flight in range(4):
-                said = handshake.go_on(received)
-                client.sendall(mutated(random, said) if flight >= number % 3 else said)
+                sent = handshake.proceed(received)
+                client.sendall(mutated(random, sent) if flight >= number % 3 else sent)
                 if handshake.done:
                     break
                 received = client.recv(20_000)
@@ -281,7 +277,7 @@ def test_mutated_handshakes_hurt_nobody(
 
 
 @pytest.mark.parametrize("size", [300, 5_000, 300_000])
-def test_what_is_no_modbus_right_behind_the_handshake_closes_the_connection(
+def test_malformed_data_after_handshake_closes_connection(
     rig: EdgeRig, lab: Lab, caplog: pytest.LogCaptureFixture, size: int
 ) -> None:
     with (
@@ -299,7 +295,7 @@ def test_what_is_no_modbus_right_behind_the_handshake_closes_the_connection(
     assert [record.name for record in caplog.records] == ["hilrig_modbus_edge.server.listener"]
 
 
-def test_a_client_cannot_begin_a_handshake_anew(rig: EdgeRig, lab: Lab) -> None:
+def test_client_cannot_renegotiate(rig: EdgeRig, lab: Lab) -> None:
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl (Debian's package of that name)")
     address = f"localhost:{rig.lab.tls_ports['rig1']}"
@@ -310,7 +306,7 @@ def test_a_client_cannot_begin_a_handshake_anew(rig: EdgeRig, lab: Lab) -> None:
     assert "no renegotiation" in done.stderr
 
 
-def test_a_client_without_tls_is_refused_and_holds_nobody_up(rig: EdgeRig, lab: Lab) -> None:
+def test_client_without_tls_is_refused_without_delay(rig: EdgeRig, lab: Lab) -> None:
     port = rig.lab.tls_ports["rig1"]
     with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
         plain.sendall(READ)
@@ -318,7 +314,7 @@ def test_a_client_without_tls_is_refused_and_holds_nobody_up(rig: EdgeRig, lab: 
         plain.settimeout(5)
         while plain.recv(100):
             pass
-    assert "no TLS" in rig.event(Event.CONNECTION_REFUSED).text
+    assert "TLS handshake failed" in rig.event(Event.CONNECTION_REFUSED).text
 
 
 def test_unfinished_handshakes_count_as_connections(lab: Lab) -> None:
@@ -330,11 +326,11 @@ def test_unfinished_handshakes_count_as_connections(lab: Lab) -> None:
             third = idlers.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
             assert third.recv(1) == b""
             assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
-        # They are gone, and with them what they took.
-        eventually(lambda: answers(rig, lab))
+        # After they have disconnected, connections are available again.
+        eventually(lambda: is_served(rig, lab))
 
 
-def answers(rig: EdgeRig, lab: Lab) -> bool:
+def is_served(rig: EdgeRig, lab: Lab) -> bool:
     try:
         return bool(talk(rig, lab.client("operator"), READ))
     except OSError:
@@ -342,7 +338,7 @@ def answers(rig: EdgeRig, lab: Lab) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion.TLSv1_1")
-def test_old_versions_of_tls_are_refused(rig: EdgeRig, lab: Lab) -> None:
+def test_old_tls_versions_are_refused(rig: EdgeRig, lab: Lab) -> None:
     context = lab.client("operator")
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.maximum_version = ssl.TLSVersion.TLSv1_2
@@ -353,7 +349,7 @@ def test_old_versions_of_tls_are_refused(rig: EdgeRig, lab: Lab) -> None:
         talk(rig, context, READ)
 
 
-def test_requests_right_behind_the_handshake_are_all_answered(rig: EdgeRig, lab: Lab) -> None:
+def test_requests_right_after_handshake_are_answered(rig: EdgeRig, lab: Lab) -> None:
     port = rig.lab.tls_ports["rig1"]
     with (
         socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
@@ -366,7 +362,7 @@ def test_requests_right_behind_the_handshake_are_all_answered(rig: EdgeRig, lab:
     assert len(data) == 17 * 200
 
 
-def test_without_plain_only_tls_listens(lab: Lab) -> None:
+def test_only_tls_listens_without_plain(lab: Lab) -> None:
     [port] = free_ports(1)
     with running_edge(tls=lab.tls(port), plain=False) as rig:
         assert talk(rig, lab.client("operator"), READ)
@@ -374,8 +370,8 @@ def test_without_plain_only_tls_listens(lab: Lab) -> None:
             rig.client()
 
 
-def test_every_rule_of_the_conformance_page_has_its_test() -> None:
-    for _, name in SECURED:
+def test_every_rule_of_the_page_has_a_test() -> None:
+    for _, name in SECURITY_RULES:
         assert callable(globals()[name])
 
 
@@ -397,7 +393,7 @@ def test_openssl_as_a_client(rig: EdgeRig, lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("key", ["certificate", "key", "authority"])
-def test_a_file_that_cannot_be_used_is_named(lab: Lab, tmp_path: Path, key: str) -> None:
+def test_unusable_file_is_reported(lab: Lab, tmp_path: Path, key: str) -> None:
     with pytest.raises(InputError, match=rf"edge\.tls\.{key}.*missing.*can't be read"):
         policy_of(lab, **{key: tmp_path / "missing"})
     wrong = tmp_path / "wrong"
@@ -411,7 +407,7 @@ def policy_of(lab: Lab, **files: Path) -> None:
     TlsPolicy(LabConfig.model_validate({"edge": {"tls": tls}}).edge.tls)
 
 
-def test_an_encrypted_key_is_told_instead_of_asking_at_a_terminal(lab: Lab, tmp_path: Path) -> None:
+def test_encrypted_key_is_rejected_without_prompt(lab: Lab, tmp_path: Path) -> None:
     key = tmp_path / "secret.key"
     encryption = serialization.BestAvailableEncryption(b"secret")
     private = serialization.load_pem_private_key((lab.folder / "edge.key").read_bytes(), None)
@@ -420,7 +416,7 @@ def test_an_encrypted_key_is_told_instead_of_asking_at_a_terminal(lab: Lab, tmp_
         policy_of(lab, key=key)
 
 
-def test_a_key_that_everybody_can_read_is_told_once(lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_world_readable_key_is_logged_once(lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     key = tmp_path / "open.key"
     key.write_bytes((lab.folder / "edge.key").read_bytes())
     key.chmod(0o600)
@@ -434,7 +430,7 @@ def test_a_key_that_everybody_can_read_is_told_once(lab: Lab, tmp_path: Path, ca
     assert "chmod 600" in record.getMessage()
 
 
-def test_the_command_makes_what_the_edge_and_its_clients_need(tmp_path: Path) -> None:
+def test_certs_creates_certificates_of_edge_and_clients(tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     made = hilrig("certs", folder, "--client", "alice=operator", "--client", "bob", "--json")
     assert made.returncode == 0, made.stderr
@@ -445,7 +441,7 @@ def test_the_command_makes_what_the_edge_and_its_clients_need(tmp_path: Path) ->
     assert stat.S_IMODE((folder / "alice.key").stat().st_mode) == 0o600
     assert role_of(ssl.PEM_cert_to_DER_cert((folder / "alice.pem").read_text())) == "operator"
     assert role_of(ssl.PEM_cert_to_DER_cert((folder / "bob.pem").read_text())) == ""
-    # A controller that is added later is signed by the same authority, and nothing else is touched.
+    # A later client is signed by the same authority; no other file is changed.
     added = hilrig("certs", folder, "--client", "carol=observer", "--json")
     assert [Path(path).name for path in json.loads(added.stdout)["written"]] == ["carol.pem", "carol.key"]
     [port] = free_ports(1)
@@ -461,11 +457,11 @@ def written(folder: Path, *arguments: str | Path) -> set[str]:
     return {Path(path).relative_to(folder).with_suffix("").as_posix() for path in json.loads(done.stdout)["written"]}
 
 
-def test_what_is_good_is_kept_and_what_is_not_is_made_anew(tmp_path: Path) -> None:
+def test_certs_recreates_only_invalid_certificates(tmp_path: Path) -> None:
     folder, lab_file = tmp_path / "certs", tmp_path / "lab.toml"
     everything = written(folder)
     assert written(folder) == set()
-    # An address that a certificate does not name, an edge that has none yet, one that is about to end.
+    # A missing host name, an edge without certificate, a certificate that expires soon.
     assert written(folder, "--host", "rig.example") == {"edge", "bus/router"}
     lab_file.write_text('[bus.tls]\nedges = {east = ["rig1"]}\n')
     assert written(folder, "--config", lab_file, "--host", "rig.example") == {"bus/east"}
@@ -475,7 +471,7 @@ def test_what_is_good_is_kept_and_what_is_not_is_made_anew(tmp_path: Path) -> No
     assert written(folder, "--renew") == everything - {"ca", "bus/ca"}
 
 
-def test_what_ends_soon_is_made_anew(tmp_path: Path) -> None:
+def test_expiring_certificate_is_recreated(tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     written(folder)
     soon = issue_client(make_authority("lab", NOW, 30), "observer", "observer", NOW, 20)
@@ -484,7 +480,7 @@ def test_what_ends_soon_is_made_anew(tmp_path: Path) -> None:
     assert written(folder) == {"observer"}
 
 
-def test_hosts_that_a_certificate_names_outlast_its_renewal(tmp_path: Path) -> None:
+def test_renewal_keeps_the_host_names(tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     written(folder, "--host", "rig.example")
     before = {name: names_of(folder / f"{name}.pem") for name in ("edge", "bus/router")}
@@ -498,19 +494,19 @@ def names_of(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("missing", ["ca.key", "bus/ca.key", "bus/ca.pem"])
-def test_where_half_of_an_authority_is_missing_nothing_is_written(tmp_path: Path, missing: str) -> None:
-    """A host has `ca.pem` and not its key: a new authority there would be the end of all trust in the others."""
+def test_incomplete_authority_prevents_any_change(tmp_path: Path, missing: str) -> None:
+    """A host has `ca.pem` without its key: a new authority there would invalidate all other certificates."""
     folder = tmp_path / "certs"
     written(folder)
     (folder / missing).unlink()
     before = {path: path.read_bytes() for path in folder.rglob("*.*")}
     done = hilrig("certs", folder, "--renew")
     assert done.returncode == 2
-    assert f"has no {Path(missing).name} beside it" in done.stderr
+    assert f"has no {Path(missing).name} in the same folder" in done.stderr
     assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
 
 
-def test_a_host_of_the_bus_gets_no_authority_for_controllers_either(tmp_path: Path) -> None:
+def test_host_with_bus_certificates_gets_no_authority(tmp_path: Path) -> None:
     written(tmp_path / "made")
     (tmp_path / "host/bus").mkdir(parents=True)
     for name in ("ca.pem", "sim.pem", "sim.key"):
@@ -519,13 +515,13 @@ def test_a_host_of_the_bus_gets_no_authority_for_controllers_either(tmp_path: Pa
     assert not list((tmp_path / "host").glob("*.*"))
 
 
-def test_files_that_are_no_certificates_are_named(tmp_path: Path) -> None:
+def test_invalid_certificate_files_are_reported(tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     written(folder)
     (folder / "bus/ca.key").write_text("no key")
     done = hilrig("certs", folder)
     assert done.returncode == 2
-    assert "bus/ca.pem and ca.key are no certificate and key" in done.stderr
+    assert "bus/ca.pem, ca.key: not a valid certificate with its key" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -533,7 +529,7 @@ def test_files_that_are_no_certificates_are_named(tmp_path: Path) -> None:
     ("arguments", "what"),
     [(["--client", "a/b"], "--client a/b"), (["--client", "x=king"], "operator or observer")],
 )
-def test_the_command_names_what_is_wrong(tmp_path: Path, arguments: list[str], what: str) -> None:
+def test_invalid_arguments_are_reported(tmp_path: Path, arguments: list[str], what: str) -> None:
     done = hilrig("certs", tmp_path / "certs", *arguments)
     assert done.returncode == 2
     assert what in done.stderr

@@ -27,7 +27,7 @@ def test_played_recording_is_received_like_a_running_rig(tmp_path: Path) -> None
     try:
         with ZenohBus(lab.bus, "tool") as bus:
             bus.subscribe(STATE.key(lab.name, "rig7"), lambda _, payload: received.append((time.monotonic(), payload)))
-            answers = eventually(lambda: bus.ask(CONFIG.key(lab.name, "rig7"), timeout_s=0.5))
+            answers = eventually(lambda: bus.query(CONFIG.key(lab.name, "rig7"), timeout_s=0.5))
             assert RigConfig.FromString(answers[0].payload).urdf
             eventually(lambda: len(received) > 80)
         player.send_signal(signal.SIGINT)
@@ -52,5 +52,5 @@ def test_play_is_rejected_while_a_lab_runs(tmp_path: Path) -> None:
         eventually(lambda: senders.count("rig1"))
         answer = hilrig("play", path, "--config", config)
     assert answer.returncode == 3
-    assert "a lab runs here already" in answer.stderr
+    assert "a lab is already running on this host" in answer.stderr
     assert "Traceback" not in answer.stderr

@@ -94,7 +94,7 @@ def now() -> int:
 def test_session_is_recorded_with_every_published_byte(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
     config = RigConfig(rig="rig1", incarnation=1, step_ns=20_000_000, urdf="<robot/>", lab_toml="name = 'lab'\n")
-    lab.bus.serve(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
+    lab.bus.declare_queryable(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
     sim, edge = FakeSource("sim/1"), FakeSource("edge/1")
     with lab.recorder():
         sim.state("rig1", now())
@@ -181,7 +181,7 @@ def test_write_error_of_one_file_does_not_affect_others(tmp_path: Path, monkeypa
             lab.send(sim)
         eventually(lambda: any("Input/output error" in event.text for event in events))
         assert {event.kind for event in events if event.severity == Event.ERROR} == {Event.RECORDING}
-        eventually(lambda: "Input/output error" in service.counters.trouble)
+        eventually(lambda: "Input/output error" in service.counters.alert)
         edge.end("rig2", f"{SESSION}-rig2", now())
         lab.send(edge)
         for rig in ("rig1", "rig2"):

@@ -47,13 +47,13 @@ def test_latency_of_a_folder_reports_unreadable_runs(run: Path, tmp_path: Path) 
     answer = json.loads(result.stdout)
     assert [each["fit"] for each in answer["runs"]] == [True]
     assert len(answer["unreadable"]) == 1
-    assert "torn" in answer["unreadable"][0]["reason"]
+    assert "truncated" in answer["unreadable"][0]["reason"]
 
 
 @pytest.mark.parametrize("command", [["latency"], ["replay", "--save", "out.rrd"]])
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "no MCAP file")],
+    [(None, "no such file"), (b"", "empty"), (b"something else" * 10, "not an MCAP file")],
 )
 def test_unreadable_file_gives_one_error_line(
     command: list[str], content: bytes | None, message: str, tmp_path: Path
@@ -74,7 +74,7 @@ def test_run_without_a_controller_has_no_latency(tmp_path: Path, run: Path) -> N
     path = write(tmp_path / "alone.mcap", make(script), script=script)
     result = hilrig("latency", path)
     assert (result.returncode, result.stderr) == (1, "")
-    assert "nothing closed a loop, for no controller wrote in this session" in " ".join(result.stdout.split())
+    assert "no closed loop: no controller wrote commands in this session" in " ".join(result.stdout.split())
     assert "jitter" not in result.stdout
     assert json.loads(hilrig("latency", path, "--json").stdout)["loop_ms"] is None
     assert hilrig("latency", path, "--plot", tmp_path / "plot.png").returncode == 2
@@ -84,7 +84,7 @@ def test_run_without_a_controller_has_no_latency(tmp_path: Path, run: Path) -> N
     assert "recorded manually" in page.read_text()
     compared = hilrig("compare", run, path, "--plot", tmp_path / "both.svg")
     assert compared.returncode == 0, compared.stderr
-    assert "no controller commanded, so it is aligned by its start" in " ".join(compared.stdout.split())
+    assert "no command by a controller; aligned by its start instead" in " ".join(compared.stdout.split())
 
 
 def test_compare_excludes_unreadable_runs(tmp_path: Path, run: Path) -> None:
@@ -94,12 +94,12 @@ def test_compare_excludes_unreadable_runs(tmp_path: Path, run: Path) -> None:
     assert done.returncode == 1, done.stderr
     found = json.loads(done.stdout)
     assert (len(found["runs"]), len(found["differences"])) == (2, 1)
-    assert [f"{torn}: torn" in reason for reason in found["left_out"]] == [True]
-    assert f"left out: {torn}: torn" in hilrig("compare", run, run, torn).stderr
+    assert [f"{torn}: truncated" in reason for reason in found["left_out"]] == [True]
+    assert f"skipped: {torn}: truncated" in hilrig("compare", run, run, torn).stderr
     for others in ([run, torn], [torn, run, run], [run, torn, torn]):
         refused = hilrig("compare", *others)
         assert (refused.returncode, refused.stdout) == (2, "")
-        assert f"{torn}: torn" in refused.stderr
+        assert f"{torn}: truncated" in refused.stderr
 
 
 def test_replay_writes_a_file_readable_by_rerun(run: Path, tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_replay_writes_a_file_readable_by_rerun(run: Path, tmp_path: Path) -> No
 def test_replay_rejects_save_with_web(run: Path, tmp_path: Path) -> None:
     result = hilrig("replay", run, "--save", tmp_path / "run.rrd", "--web")
     assert result.returncode == 2
-    assert "choose one" in result.stderr
+    assert "can't be combined" in result.stderr
 
 
 def test_compare_prints_differences_and_writes_plots(run: Path, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_compare_prints_differences_and_writes_plots(run: Path, tmp_path: Path) 
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "both.rrd").stat().st_size > 100_000
     table = hilrig("compare", run, slow)
-    assert "tools apart, rms, mm" in table.stdout
+    assert "tool distance, rms, mm" in table.stdout
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_output_never_replaces_a_recording(run: Path, tmp_path: Path, command: s
     result = hilrig(command, option, other, *inputs)
     assert result.returncode == 2
     if option != "--plot" or name.endswith(".png"):
-        assert f"{other} is a recording: choose another output name" in result.stderr
+        assert f"{other} is a recording and is not overwritten: choose another output name" in result.stderr
     assert other.read_bytes() == run.read_bytes()
 
 

@@ -1,11 +1,11 @@
-"""`hilrig verify` and `hilrig figures` as a user runs them: exit codes, JSON alone on standard output, mistakes."""
+"""`hilrig verify` and `hilrig figures`: exit codes, JSON on standard output, error messages."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from hilrig_replay.io.index import read_verdict
+from hilrig_replay.analysis.index import read_verdict
 from hilrig_schemas import JointState
 from support.labs import hilrig
 from support.recordings import Made, write
@@ -22,52 +22,52 @@ def made() -> list[Made]:
         return rig.recorded()
 
 
-def test_a_true_run_is_verified_with_0_and_a_false_one_with_1_and_its_step(made: list[Made], tmp_path: Path) -> None:
-    true, false = tmp_path / "true.mcap", tmp_path / "false.mcap"
-    write(true, made)
-    done = hilrig("verify", true, "--json", "--tolerance", "0")
+def test_verify_reports_the_first_diverging_step(made: list[Made], tmp_path: Path) -> None:
+    valid, modified = tmp_path / "valid.mcap", tmp_path / "modified.mcap"
+    write(valid, made)
+    done = hilrig("verify", valid, "--json", "--tolerance", "0")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["same"], found["exact"], found["first_diverging_step"]) == (True, True, None)
     assert found["steps"] == 119
-    assert read_verdict(true) is True
+    assert read_verdict(valid) is True
 
     state = [one.message for one in made if isinstance(one.message, JointState)][70]
     state.effort[0] += 0.01
     try:
-        write(false, made)
+        write(modified, made)
     finally:
         state.effort[0] -= 0.01
-    done = hilrig("verify", false, "--json", "--tolerance", "0")
+    done = hilrig("verify", modified, "--json", "--tolerance", "0")
     assert done.returncode == 1
     assert json.loads(done.stdout)["first_diverging_step"] == state.step
-    assert read_verdict(false) is False
+    assert read_verdict(modified) is False
     both = hilrig("verify", tmp_path)
     assert both.returncode == 1
-    assert "true.mcap: 119 steps re-simulated" in both.stdout
+    assert "valid.mcap: 119 steps re-simulated" in both.stdout
     assert f"step {state.step} does not lead" in both.stdout
 
 
-def test_figures_prints_what_is_expected_beside_what_came_out(tmp_path: Path) -> None:
+def test_figures_prints_expected_and_computed_values(tmp_path: Path) -> None:
     done = hilrig("figures", "--json", "--out", tmp_path / "figures")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert all(check["holds"] for check in found["checks"])
     assert [Path(path).stat().st_size > 10_000 for path in found["files"]] == [True] * 3
-    people = hilrig("figures", "--out", tmp_path / "figures")
-    assert "0.05000, 0.19998" in people.stdout
+    table = hilrig("figures", "--out", tmp_path / "figures")
+    assert "0.05000, 0.19998" in table.stdout
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "message"),
     [
         (("verify", "nothing.mcap"), 2, "no such file"),
         (("figures", "--step-ms", "7"), 2, "does not divide a second"),
         (("figures", "--out", "/proc/figures"), 3, "can't be written"),
     ],
 )
-def test_a_mistake_is_one_clear_line(arguments: tuple[str, ...], code: int, says: str, tmp_path: Path) -> None:
+def test_error_is_reported_in_one_line(arguments: tuple[str, ...], code: int, message: str, tmp_path: Path) -> None:
     done = hilrig(*arguments, cwd=tmp_path)
     assert done.returncode == code
-    assert says in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr

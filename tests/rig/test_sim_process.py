@@ -1,4 +1,4 @@
-"""The simulation as a process: it ticks on the bus, answers who it is, obeys commands, and ends when it is told to."""
+"""Tests of the simulation as a process: states, configuration, commands and termination."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.rig
 
 
 class SimProcess:
-    """`hilrig sim` as a user starts it, and a client of its bus."""
+    """A `hilrig sim` process and a bus client."""
 
     def __init__(self, config: Path) -> None:
         self.lab: LabConfig = load_lab(config)
@@ -39,7 +39,7 @@ class SimProcess:
         self._seq = 0
 
     def command(self, *effort: float) -> None:
-        """Command efforts, answering to the newest state."""
+        """Publish a command of efforts, based on the newest state."""
         self._seq += 1
         newest = self.states[-1]
         command = TorqueCommand(
@@ -70,14 +70,14 @@ def sim(tmp_path: Path) -> Iterator[SimProcess]:
         running.close()
 
 
-def test_it_ticks_at_its_step_and_says_what_it_is(sim: SimProcess) -> None:
+def test_publishes_states_at_its_step_and_its_configuration(sim: SimProcess) -> None:
     eventually(lambda: len(sim.states) > 60)
     states = sim.states[:60]
     assert [state.step for state in states] == list(range(states[0].step, states[0].step + 60))
     passed_ns = states[-1].sampled_ns - states[0].sampled_ns
     missed = sum(state.missed_steps for state in states[1:])
     assert passed_ns == pytest.approx((59 + missed) * 20e6, abs=20e6)
-    (answer,) = sim.bus.ask(CONFIG.key(sim.lab.name, "rig1"), timeout_s=5.0)
+    (answer,) = sim.bus.query(CONFIG.key(sim.lab.name, "rig1"), timeout_s=5.0)
     config = RigConfig.FromString(answer.payload)
     assert (config.rig, config.incarnation, config.step_ns) == ("rig1", states[0].incarnation, 20_000_000)
     assert len(RigParameters.from_json(config.parameters_json).scene.parts) == 4
@@ -86,7 +86,7 @@ def test_it_ticks_at_its_step_and_says_what_it_is(sim: SimProcess) -> None:
     assert "numpy" in config.machine
 
 
-def test_a_command_moves_the_arm_closes_the_loop_and_is_missed_when_it_stops(sim: SimProcess) -> None:
+def test_command_moves_the_arm_and_times_out(sim: SimProcess) -> None:
     sim.command(2.0, 0.0, -5.0, 0.0)
     applied = eventually(lambda: next((state for state in sim.states if state.command_seq == 1), None))
     assert list(applied.effort) == [2.0, 0.0, -5.0, 0.0]
@@ -101,15 +101,15 @@ def test_a_command_moves_the_arm_closes_the_loop_and_is_missed_when_it_stops(sim
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-def test_it_ends_with_0_when_it_is_told_to(sim: SimProcess, how: signal.Signals) -> None:
+def test_exits_with_0_on_signal(sim: SimProcess, how: signal.Signals) -> None:
     os.kill(sim.process.pid, how)
     assert sim.process.wait(PATIENT_S) == 0
     assert "Traceback" not in sim.log.read_text()
 
 
-def test_an_unstable_step_is_refused_in_one_line_before_anything_runs(tmp_path: Path) -> None:
+def test_unstable_step_is_rejected_in_one_line(tmp_path: Path) -> None:
     done = hilrig("sim", "--config", write_lab(tmp_path, extra="sim.step_ms = 60"))
     assert done.returncode == 2
     (line,) = [line for line in done.stderr.splitlines() if "unstable" in line]
-    assert "give sim.substeps = 3 or a shorter sim.step_ms" in line
+    assert "set sim.substeps = 3 or a shorter sim.step_ms" in line
     assert "Traceback" not in done.stderr

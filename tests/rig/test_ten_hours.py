@@ -1,6 +1,6 @@
-"""A recording of ten hours: every command answers, and in how much memory.
+"""Commands on a recording of ten hours: each succeeds within its memory limit.
 
-It takes minutes, so it runs with HILRIG_LONG in the environment only; an hour is in `bench/review.py`.
+The test takes minutes, so it runs only if HILRIG_LONG is set; `bench/review.py` measures one hour.
 """
 
 import json
@@ -20,36 +20,36 @@ pytestmark = [
     pytest.mark.alone,
     pytest.mark.rig,
     pytest.mark.timeout(1200),
-    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes: set HILRIG_LONG"),
+    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),
 ]
 
-PIECE_S = 360.0
-PIECES = 100
-LARGEST_MB = 250.0
-"""Of an hour or of ten: what grows with a run is in files, but for rerun's index of the one it writes, 2 MB an hour."""
+SECTION_S = 360.0
+SECTIONS = 100
+MAX_MEMORY_MB = 250.0
+"""Limit for any length: only rerun's index of the file that it writes grows in memory, by 2 MB per hour."""
 PEAK = """
 import json, resource, subprocess, sys
 code = subprocess.run(sys.argv[1:], stdout=subprocess.PIPE, check=False)
 peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (1024 * 1024 if sys.platform == "darwin" else 1024)
-print(json.dumps({"code": code.returncode, "peak_mb": peak, "said": code.stdout.decode()}))
+print(json.dumps({"code": code.returncode, "peak_mb": peak, "stdout": code.stdout.decode()}))
 """
 
 
 def ten_hours() -> Iterator[Made]:
-    """A piece of a run again and again: its messages moved on in time and number each time they are taken."""
-    script = Script(seconds=PIECE_S, poll_ms=20.0, delay_ms=3.0)
+    """Repeat a section of a run; the messages are shifted in time and number for each repetition."""
+    script = Script(seconds=SECTION_S, poll_ms=20.0, delay_ms=3.0)
     made = [one for one in make(script) if not isinstance(one.message, Event)]
     steps = sum(isinstance(one.message, JointState) for one in made)
     commands = sum(isinstance(one.message, TorqueCommand) for one in made)
-    piece_ns = steps * 20 * MS
-    for piece in range(PIECES):
+    section_ns = steps * 20 * MS
+    for section in range(SECTIONS):
         for one in made:
-            if piece:
-                _move(one, piece_ns, steps, commands)
+            if section:
+                _shift(one, section_ns, steps, commands)
             yield one
 
 
-def _move(one: Made, by_ns: int, steps: int, commands: int) -> None:
+def _shift(one: Made, by_ns: int, steps: int, commands: int) -> None:
     one.publish_wall_ns += by_ns
     message = one.message
     if isinstance(message, JointState):
@@ -74,11 +74,11 @@ def _move(one: Made, by_ns: int, steps: int, commands: int) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("long") / "ten.mcap", ten_hours(), script=Script(seconds=PIECE_S * PIECES))
+    return write(tmp_path_factory.mktemp("long") / "ten.mcap", ten_hours(), script=Script(seconds=SECTION_S * SECTIONS))
 
 
 @pytest.mark.parametrize("command", ["latency", "replay", "report", "export", "runs"])
-def test_each_command_answers_within_its_memory(run: Path, command: str) -> None:
+def test_commands_stay_within_their_memory_limit(run: Path, command: str) -> None:
     options = {
         "latency": [run, "--json"],
         "replay": [run, "--save", run.with_suffix(".rrd")],
@@ -86,11 +86,11 @@ def test_each_command_answers_within_its_memory(run: Path, command: str) -> None
         "export": [run, "--csv", run.with_suffix("")],
         "runs": [run.parent, "--loop", "--json"],
     }[command]
-    words = [sys.executable, "-c", PEAK, *HILRIG, command, *map(str, options)]
-    done = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    arguments = [sys.executable, "-c", PEAK, *HILRIG, command, *map(str, options)]
+    done = json.loads(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
     print(f"{command}: {done['peak_mb']:.0f} MB")
     assert done["code"] == 0
-    assert done["peak_mb"] < LARGEST_MB
+    assert done["peak_mb"] < MAX_MEMORY_MB
     if command == "latency":
-        # Where the pieces meet, a command or two of the one do not fit into the other.
-        assert json.loads(done["said"])["samples"] > 0.98 * PIECE_S * PIECES * 50
+        # At the boundaries of sections, one or two commands do not match their states.
+        assert json.loads(done["stdout"])["samples"] > 0.98 * SECTION_S * SECTIONS * 50

@@ -1,4 +1,4 @@
-"""`hilrig up` as a lab uses it: foreign controllers move the arm, and whatever dies, the lab goes on or ends well."""
+"""`hilrig up`: third-party controllers move the arm; services are restarted; a signal stops the lab in order."""
 
 import os
 import signal
@@ -37,7 +37,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-def test_mbpoll_turns_joint_1_reads_it_back_and_friction_stops_it(lab: RunningLab) -> None:
+def test_mbpoll_moves_joint_1_and_friction_stops_it(lab: RunningLab) -> None:
     require_mbpoll()
     start = mbpoll_read(lab.port, register=5, count=4)
     assert start == [0, 0, 0, 0] or start[:2] == [0, 0]
@@ -45,12 +45,12 @@ def test_mbpoll_turns_joint_1_reads_it_back_and_friction_stops_it(lab: RunningLa
     turned = eventually(lambda: (now := mbpoll_read(lab.port, 5, 4))[0] > start[0] + 200 and now)
     mbpoll_write(lab.port, register=1, value=0)
 
-    def stands() -> bool:
+    def is_at_rest() -> bool:
         first = mbpoll_read(lab.port, 5, 4)[0]
         time.sleep(0.1)
         return mbpoll_read(lab.port, 5, 4)[0] == first >= turned[0]
 
-    eventually(stands)
+    eventually(is_at_rest)
 
 
 def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
@@ -66,7 +66,7 @@ def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
     assert not magnet[-1]
 
 
-def test_a_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
+def test_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
     client = build_c_client()
     output = subprocess.run(
         [client, "127.0.0.1", str(lab.port), "2", "5"], check=True, capture_output=True, text=True, timeout=30
@@ -79,19 +79,17 @@ def test_a_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_everything_in_three_seconds_with_a_readable_file(
-    lab: RunningLab, number: signal.Signals
-) -> None:
+def test_signal_stops_the_lab_within_three_seconds(lab: RunningLab, number: signal.Signals) -> None:
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
         client.write_registers(0, registers(500, 0, -4905, 0))
         eventually(lambda: client.read_holding_registers(4, count=4).registers[0] > 0)
         children = lab.service_pids()
         assert len(children) == 3
-        begin = time.monotonic()
+        start = time.monotonic()
         code = lab.stop(number)
-        took = time.monotonic() - begin
+        elapsed = time.monotonic() - start
     assert code == 0, lab.output()
-    assert took < 3.0
+    assert elapsed < 3.0
     assert not any(alive(pid) for pid in children)
     (recording,) = lab.recordings
     run = open_run(recording)
@@ -99,7 +97,7 @@ def test_a_signal_ends_everything_in_three_seconds_with_a_readable_file(
     assert not list(lab.lab.recorder.folder.rglob("*.part"))
 
 
-def test_a_killed_sim_is_restarted_and_the_loop_goes_on(lab: RunningLab) -> None:
+def test_killed_simulation_is_restarted_and_obeys_again(lab: RunningLab) -> None:
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:
 
         def angle(torque: int) -> int:
@@ -108,42 +106,42 @@ def test_a_killed_sim_is_restarted_and_the_loop_goes_on(lab: RunningLab) -> None
 
         eventually(lambda: angle(1000) > 500, every_s=0.02)
         os.kill(lab.service_pid("sim"), signal.SIGKILL)
-        # The new simulation begins at its start pose, and obeys again.
+        # The new simulation starts at its start pose and obeys commands.
         eventually(lambda: angle(1000) < 100, every_s=0.02)
         eventually(lambda: angle(1000) > 500, every_s=0.02)
     assert "sim was killed by signal 9; restarting it" in lab.output()
-    assert "sim is started again" in lab.output()
+    assert "sim restarted" in lab.output()
     assert lab.stop() == 0
 
 
 @pytest.mark.parametrize("name", ["edge", "recorder"])
-def test_any_other_service_is_restarted_too(lab: RunningLab, name: str) -> None:
+def test_killed_edge_or_recorder_is_restarted(lab: RunningLab, name: str) -> None:
     before = lab.service_pid(name)
     os.kill(before, signal.SIGKILL)
 
-    def back() -> bool:
+    def is_restarted() -> bool:
         try:
             return lab.service_pid(name) != before
         except LookupError:
             return False
 
-    eventually(back)
+    eventually(is_restarted)
 
-    def answers() -> bool:
+    def responds() -> bool:
         with ModbusTcpClient("127.0.0.1", port=lab.port, timeout=1, retries=0) as client:
             return client.connected and not client.read_holding_registers(4, count=4).isError()
 
-    eventually(answers, every_s=0.1)
+    eventually(responds, every_s=0.1)
 
 
-def test_services_end_when_up_itself_is_killed(lab: RunningLab) -> None:
+def test_services_stop_when_up_is_killed(lab: RunningLab) -> None:
     children = lab.service_pids()
     lab.process.kill()
     lab.process.wait()
     eventually(lambda: not any(alive(pid) for pid in children))
 
 
-def test_a_modbus_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
+def test_modbus_port_in_use_is_reported_in_one_line(tmp_path: Path) -> None:
     with RunningLab(write_lab(tmp_path)) as first:
         second = tmp_path / "second.toml"
         text = first.config.read_text().replace(
@@ -158,7 +156,7 @@ def test_a_modbus_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
     assert "port" in line
 
 
-def test_a_second_lab_on_the_same_bus_ports_is_one_clear_line(tmp_path: Path) -> None:
+def test_bus_ports_in_use_are_reported_in_one_line(tmp_path: Path) -> None:
     with RunningLab(write_lab(tmp_path)) as first:
         done = hilrig("up", "--config", first.config, timeout_s=60)
     assert done.returncode == 3

@@ -1,4 +1,4 @@
-"""A browser for tests: Debian's Chromium without a screen, driven over its DevTools protocol."""
+"""A browser for tests: Debian's Chromium in headless mode, controlled over its DevTools protocol."""
 
 import base64
 import io
@@ -19,11 +19,11 @@ from support.waiting import eventually
 
 CHROMIUM = shutil.which("chromium")
 GRAPHICS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-"""WebGL in software: what the rerun viewer needs where there is no GPU."""
+"""Software WebGL, which the rerun viewer needs without a GPU."""
 
 
 class Browser:
-    """One page; a context manager that leaves no process behind."""
+    """One page; a context manager that terminates the browser on exit."""
 
     _session: str
 
@@ -37,24 +37,24 @@ class Browser:
         self._number = 0
         self._requests: dict[str, str] = {}
         self.errors: list[str] = []
-        """What the page complained about."""
+        """Errors reported by the page."""
 
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
             [*self._command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         try:
-            # The browser writes there which port it took.
-            told = self._profile / "DevToolsActivePort"
-            eventually(lambda: told.exists() and len(told.read_text().splitlines()) == 2)
-            port, path = told.read_text().splitlines()
+            # The browser writes its port into this file.
+            port_file = self._profile / "DevToolsActivePort"
+            eventually(lambda: port_file.exists() and len(port_file.read_text().splitlines()) == 2)
+            port, path = port_file.read_text().splitlines()
             self._socket = self._closing.enter_context(
                 connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None)
             )
-            (page,) = [target for target in self._ask("Target.getTargets")["targetInfos"] if target["type"] == "page"]
-            self._session = self._ask("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+            (page,) = [target for target in self._call("Target.getTargets")["targetInfos"] if target["type"] == "page"]
+            self._session = self._call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
             for domain in ("Page", "Runtime", "Network", "Log"):
-                self._ask(f"{domain}.enable")
+                self._call(f"{domain}.enable")
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -71,75 +71,75 @@ class Browser:
             self._process.kill()
             self._process.wait()
 
-    def _ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
         self._number += 1
-        question = {"id": self._number, "method": method, "params": parameters}
+        request = {"id": self._number, "method": method, "params": parameters}
         if hasattr(self, "_session"):
-            question["sessionId"] = self._session
-        self._socket.send(json.dumps(question))
+            request["sessionId"] = self._session
+        self._socket.send(json.dumps(request))
         while True:
-            said = json.loads(self._socket.recv(timeout=60))
-            if said.get("id") == self._number:
-                assert "error" not in said, said
-                return dict(said["result"])
-            self._note(said)
+            reply = json.loads(self._socket.recv(timeout=60))
+            if reply.get("id") == self._number:
+                assert "error" not in reply, reply
+                return dict(reply["result"])
+            self._handle_event(reply)
 
-    def _note(self, said: dict[str, Any]) -> None:
-        about = said.get("params", {})
-        match said.get("method"):
+    def _handle_event(self, event: dict[str, Any]) -> None:
+        parameters = event.get("params", {})
+        match event.get("method"):
             case "Network.requestWillBeSent":
-                self._requests[about["requestId"]] = about["request"]["url"]
-            case "Network.loadingFailed" if about.get("blockedReason") == "csp":
-                self._requests.pop(about["requestId"], None)
+                self._requests[parameters["requestId"]] = parameters["request"]["url"]
+            case "Network.loadingFailed" if parameters.get("blockedReason") == "csp":
+                self._requests.pop(parameters["requestId"], None)
             case "Runtime.exceptionThrown":
-                self.errors.append(str(about["exceptionDetails"]))
-            case "Log.entryAdded" if about["entry"]["level"] == "error":
-                self.errors.append(about["entry"]["text"])
+                self.errors.append(str(parameters["exceptionDetails"]))
+            case "Log.entryAdded" if parameters["entry"]["level"] == "error":
+                self.errors.append(parameters["entry"]["text"])
 
     def open(self, address: str, *, width: int = 1200, height: int = 900) -> None:
-        """Open an address in a window of some size, and wait until it is loaded."""
+        """Open a URL in a window of the given size, and wait until it is loaded."""
         self._requests.clear()
         self.errors.clear()
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self._ask("Emulation.setDeviceMetricsOverride", **metrics)
-        self._ask("Page.navigate", url=address)
+        self._call("Emulation.setDeviceMetricsOverride", **metrics)
+        self._call("Page.navigate", url=address)
         eventually(lambda: self.run("document.readyState") == "complete")
 
     @property
     def requests(self) -> list[str]:
-        """Addresses that the page asked for, without those that its policy kept it from."""
+        """URLs requested by the page, without those blocked by its Content-Security-Policy."""
         return list(self._requests.values())
 
     def run(self, script: str) -> Any:
         """Value of a JavaScript expression in the page."""
-        answer = self._ask("Runtime.evaluate", expression=script, returnByValue=True)
-        assert "exceptionDetails" not in answer, answer
-        return answer["result"].get("value")
+        reply = self._call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in reply, reply
+        return reply["result"].get("value")
 
-    def picture(self, save: Path | None = None) -> np.ndarray:
-        """What the window shows, shape (height, width, 3), 0 to 1."""
-        data = base64.b64decode(self._ask("Page.captureScreenshot", format="png")["data"])
+    def screenshot(self, save: Path | None = None) -> np.ndarray:
+        """Screenshot of the window, shape (height, width, 3), values 0 to 1."""
+        data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
         if save is not None:
             save.write_bytes(data)
         return np.asarray(imread(io.BytesIO(data))[..., :3])
 
     def until(self, condition: Callable[[np.ndarray], bool], *, timeout_s: float = 90.0) -> np.ndarray:
-        """Wait until the window shows what `condition` asks for; gives that picture."""
-        seen: list[np.ndarray] = []
+        """Wait until a screenshot satisfies `condition`; returns it."""
+        latest: list[np.ndarray] = []
 
-        def shown() -> bool:
-            seen[:] = [self.picture()]
-            return condition(seen[0])
+        def is_satisfied() -> bool:
+            latest[:] = [self.screenshot()]
+            return condition(latest[0])
 
-        eventually(shown, timeout_s=timeout_s, every_s=0.5)
-        return seen[0]
+        eventually(is_satisfied, timeout_s=timeout_s, every_s=0.5)
+        return latest[0]
 
 
 def share_of(
-    picture: np.ndarray, red: tuple[float, float], green: tuple[float, float], blue: tuple[float, float]
+    image: np.ndarray, red: tuple[float, float], green: tuple[float, float], blue: tuple[float, float]
 ) -> float:
-    """Share of pixels whose channels, 0 to 1, lie in the ranges."""
-    inside = np.ones(picture.shape[:2], dtype=bool)
+    """Share of pixels with all channels, 0 to 1, within the ranges."""
+    inside = np.ones(image.shape[:2], dtype=bool)
     for channel, (low, high) in enumerate((red, green, blue)):
-        inside &= (picture[..., channel] >= low) & (picture[..., channel] <= high)
+        inside &= (image[..., channel] >= low) & (image[..., channel] <= high)
     return float(inside.mean())

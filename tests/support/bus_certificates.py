@@ -3,19 +3,19 @@
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from hilrig_runtime.security.x509 import Identity, issue_client, issue_peer, make_authority
+from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, make_authority
 
 NOW = datetime.now(UTC)
 HOSTS = ["127.0.0.1", "localhost"]
 
 
-def write(folder: Path, name: str, identity: Identity) -> None:
+def write(folder: Path, name: str, identity: Credential) -> None:
     """`<name>.pem` and `<name>.key`."""
     (folder / f"{name}.pem").write_bytes(identity.certificate_pem)
     (folder / f"{name}.key").write_bytes(identity.key_pem)
 
 
-def make_bus_folder(folder: Path, names: list[str], hosts: list[str] = HOSTS) -> Identity:
+def make_bus_folder(folder: Path, names: list[str], hosts: list[str] = HOSTS) -> Credential:
     """A folder for `[bus.tls]` with a certificate for each name; gives the authority."""
     folder.mkdir(parents=True)
     authority = make_authority("bus", NOW, 30)
@@ -25,7 +25,7 @@ def make_bus_folder(folder: Path, names: list[str], hosts: list[str] = HOSTS) ->
     return authority
 
 
-def folder_of_one(folder: Path, authority: Identity, name: str, identity: Identity) -> Path:
+def folder_of_one(folder: Path, authority: Credential, name: str, identity: Credential) -> Path:
     """A folder of somebody who trusts `authority` and has one certificate, under the name `name`."""
     folder.mkdir(parents=True)
     (folder / "ca.pem").write_bytes(authority.certificate_pem)
@@ -33,7 +33,7 @@ def folder_of_one(folder: Path, authority: Identity, name: str, identity: Identi
     return folder
 
 
-def bad_identities(authority: Identity) -> dict[str, Identity]:
+def bad_identities(authority: Credential) -> dict[str, Credential]:
     """Certificates called `operator` that nobody may be let in with, by what is wrong with them."""
     stranger = make_authority("stranger", NOW, 30)
     return {

@@ -1,4 +1,4 @@
-"""A Modbus device on a bench: a clock and a simulation that the test owns, and everything that the device says kept."""
+"""Test bench of a Modbus device: manual clock, states of the test, and a record of all its output."""
 
 import random
 import struct
@@ -8,8 +8,8 @@ from typing import Any
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
-from hilrig_modbus_edge.registers.map import Table
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_modbus_edge.registers.map import RegisterTable
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
 
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 class Bench:
-    """A device on a bench: what it says is kept."""
+    """A device and its recorded output."""
 
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock()
@@ -27,8 +27,8 @@ class Bench:
         self.session_changes = 0
         self.deadlines: list[int] = []
         self.sends: list[int] = []
-        self.arrive: Callable[[Arrival], None] | None = None
-        self.arrival: Arrival | None = None
+        self.arrive: Callable[[TimestampedPayload], None] | None = None
+        self.arrival: TimestampedPayload | None = None
         self.device = Device(
             "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
         )
@@ -51,7 +51,7 @@ class Bench:
     def send_at(self, deadline_ns: int) -> None:
         self.sends.append(deadline_ns)
 
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         self.arrive = arrive
 
     def state(self, step: int, **fields: Any) -> None:
@@ -64,20 +64,22 @@ class Bench:
             effort=fields.pop("effort", (0, 0, 0, 0)),
             **fields,
         )
-        self.arrival = Arrival(message.SerializeToString(), self.clock.monotonic_ns())
+        self.arrival = TimestampedPayload(message.SerializeToString(), self.clock.monotonic_ns())
         if self.arrive is not None:
             self.arrive(self.arrival)
 
-    def connect(self, host: str = "10.0.0.1", port: int = 1000, **rights: bool) -> Client:
-        return self.device.connect(host, port, **rights)
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **permissions: bool) -> Client:
+        return self.device.connect(host, port, **permissions)
 
-    def read(self, client: Client, address: int, count: int, table: Table = Table.HOLDING_REGISTER) -> list[int]:
-        client.heard(self.clock.monotonic_ns())
+    def read(
+        self, client: Client, address: int, count: int, table: RegisterTable = RegisterTable.HOLDING_REGISTER
+    ) -> list[int]:
+        client.record_request(self.clock.monotonic_ns())
         return list(struct.unpack(f">{count}H", self.device.read_registers(client, table, address, count)))
 
     def write(self, client: Client, address: int, *words: int) -> None:
         now_ns = self.clock.monotonic_ns()
-        client.heard(now_ns)
+        client.record_request(now_ns)
         self.device.write_registers(client, address, struct.pack(f">{len(words)}H", *words), now_ns)
 
     def wait(self, ms: float) -> None:

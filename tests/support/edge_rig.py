@@ -1,4 +1,4 @@
-"""The Modbus edge on real sockets, in a thread of the test, with the bus in memory and states made by the test."""
+"""Modbus edge on real sockets, in a thread of the test, with an in-memory bus and states of the test."""
 
 import math
 import socket
@@ -23,7 +23,7 @@ START_POSITION = (0.1, -0.2, 0.05, 3.0)
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that are free now, chosen by the system."""
+    """Return ports that are free now, chosen by the system."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [each.getsockname()[1] for each in sockets]
     for each in sockets:
@@ -33,7 +33,7 @@ def free_ports(count: int) -> list[int]:
 
 @dataclass
 class EdgeRig:
-    """A running edge, seen from the bus."""
+    """A running edge and its recorded output on the bus."""
 
     lab: LabConfig
     hub: MemoryHub
@@ -88,7 +88,7 @@ class EdgeRig:
             self.events.append(Event.FromString(payload))
 
     def free(self) -> bool:
-        """Whether nobody holds a rig, and no session is open."""
+        """Return whether there is no lease holder and no open session."""
         kinds = self.kinds()
         pairs = (("LEASE_GRANTED", "LEASE_LOST"), ("SESSION_START", "SESSION_END"))
         return all(kinds.count(begin) == kinds.count(end) for begin, end in pairs)
@@ -104,7 +104,7 @@ class EdgeRig:
 
 @contextmanager
 def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[EdgeRig]:
-    """Run an edge with these settings; every rig has one state when this is entered."""
+    """Run an edge with these settings; every rig has one state on entry."""
     ports = free_ports(len(rigs))
     settings = [{"name": name, "port": port} for name, port in zip(rigs, ports, strict=True)]
     allow = edge.pop("allow", None)
@@ -131,9 +131,9 @@ def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[Edg
 
             def up() -> bool:
                 for name in rigs:
-                    if not rig.step or not watcher.alive(alive):
+                    if not rig.step or not watcher.get_liveliness(alive):
                         rig.state(name)
-                return bool(watcher.alive(alive)) or bool(failures)
+                return bool(watcher.get_liveliness(alive)) or bool(failures)
 
             eventually(up)
             if not failures:
@@ -147,7 +147,7 @@ def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[Edg
 
 
 class RawClient:
-    """A Modbus client that sends exactly the bytes that it is given."""
+    """Modbus client that sends arbitrary bytes."""
 
     def __init__(self, host: str, port: int) -> None:
         self.socket = socket.create_connection((host, port), timeout=5)
@@ -175,13 +175,13 @@ class RawClient:
         return HEADER.pack(transaction, 0, len(pdu) + 1, unit) + pdu
 
     def receive(self) -> tuple[int, int, bytes]:
-        """Transaction, unit and PDU of the next answer."""
+        """Return transaction, unit and PDU of the next response."""
         transaction, protocol, length, unit = HEADER.unpack(self._exactly(7))
         assert protocol == 0
         return transaction, unit, self._exactly(length - 1)
 
     def ask(self, pdu: bytes | str, *, unit: int = 1) -> bytes:
-        """Send one request's PDU (bytes, or hex) and give the answer's."""
+        """Send the PDU of a request (bytes, or hex); return the PDU of the response."""
         if isinstance(pdu, str):
             pdu = bytes.fromhex(pdu)
         self._transaction = (self._transaction + 1) & 0xFFFF
@@ -191,18 +191,18 @@ class RawClient:
         return reply
 
     def read(self, address: int, count: int, function: int = 3) -> list[int]:
-        """Registers as unsigned words."""
+        """Read registers, as unsigned numbers."""
         reply = self.ask(struct.pack(">BHH", function, address, count))
         assert reply[:2] == bytes((function, 2 * count)), reply.hex()
         return list(struct.unpack(f">{count}H", reply[2:]))
 
     def write(self, address: int, *words: int) -> bytes:
-        """Write registers with function 16; the answer's PDU."""
+        """Write registers with function 16; return the PDU of the response."""
         data = b"".join((word & 0xFFFF).to_bytes(2, "big") for word in words)
         return self.ask(struct.pack(">BHHB", 16, address, len(words), 2 * len(words)) + data)
 
     def closed(self) -> bool:
-        """Whether the other side has closed the connection; waits for it to say something."""
+        """Wait until the peer sends data or closes the connection; return whether it closed it."""
         try:
             return self.socket.recv(1) == b""
         except ConnectionResetError:
@@ -219,7 +219,7 @@ class RawClient:
 
 
 def counts(position: tuple[float, ...] = START_POSITION) -> list[int]:
-    """Position registers of a joint vector, computed otherwise than the edge does, as unsigned words."""
+    """Return the position registers of a joint vector, computed independently of the edge."""
     q1, q2, d3, q4 = position
     values = (math.degrees(q1) * 100, math.degrees(q2) * 100, d3 * 1e5, math.degrees(q4) * 100)
     return [round(value) & 0xFFFF for value in values]

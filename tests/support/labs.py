@@ -148,7 +148,7 @@ class RunningLab:
 
         def up() -> bool:
             assert self.process.poll() is None, self.output()
-            return "running; Ctrl-C ends it" in self.output()
+            return "running; press Ctrl-C to stop" in self.output()
 
         try:
             eventually(up)

@@ -95,11 +95,13 @@ class Senders:
             Service("sim", lab, ZenohBus(lab.bus, "sim"), stopping=self.stopping) as sim,
             Service("edge", lab, ZenohBus(lab.bus, "edge"), stopping=self.stopping) as edge,
         ):
-            states = {rig: sim.sender(STATE, rig) for rig in self.rigs}
-            commands = {rig: edge.sender(COMMAND, rig) for rig in self.rigs}
+            states = {rig: sim.rig_publisher(STATE, rig) for rig in self.rigs}
+            commands = {rig: edge.rig_publisher(COMMAND, rig) for rig in self.rigs}
             for rig in self.rigs:
                 config = RigConfig(rig=rig, incarnation=sim.incarnation, step_ns=20_000_000, urdf="<robot/>")
-                sim.bus.serve(CONFIG.key(lab.name, rig), lambda _, config=config: config.SerializeToString())
+                sim.bus.declare_queryable(
+                    CONFIG.key(lab.name, rig), lambda _, config=config: config.SerializeToString()
+                )
             sim.ready()
             edge.ready()
             rate = Rate(round(self.step_ms * 1e6))
@@ -114,8 +116,8 @@ class Senders:
                     state = JointState(rig=rig, session=session, step=step, sampled_ns=tick.deadline_ns)
                     state.position.extend((step * 1e-3 + number, 0.5, 0.1, 0.2))
                     command = TorqueCommand(rig=rig, session=session, seq=step, effort=(step * 1e-3, 0, 0, 0))
-                    states[rig].send(state)
-                    commands[rig].send(command)
+                    states[rig].publish(state)
+                    commands[rig].publish(command)
                     if session:
                         self.sent[rig] += [
                             ("/state", step, state.SerializeToString()),
@@ -138,7 +140,7 @@ class Senders:
             self.sent.setdefault(rig, [])
         open_sessions.clear()
         open_sessions.update(wanted)
-        edge.log.set_sessions([OpenSession(rig=rig, session=session) for rig, session in wanted.items()])
+        edge.recording_stream.set_sessions([OpenSession(rig=rig, session=session) for rig, session in wanted.items()])
 
 
 @contextmanager
@@ -195,7 +197,7 @@ def wait_ready(lab: LabConfig, recorder: RecorderProcess, instance: str = "*", t
 
         def ready() -> bool:
             assert recorder.process.poll() is None, recorder.log.read_text()
-            return bool(bus.alive(alive_key(lab.name, "recorder", instance), timeout_s=0.2))
+            return bool(bus.get_liveliness(alive_key(lab.name, "recorder", instance), timeout_s=0.2))
 
         eventually(ready, timeout_s=timeout_s)
 

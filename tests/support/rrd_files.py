@@ -1,4 +1,4 @@
-"""A rerun file read back with rerun's own reader: what is in it, by entity path."""
+"""Reads a rerun file with rerun's own reader: its tables by entity path."""
 
 from collections import defaultdict
 from pathlib import Path
@@ -19,7 +19,7 @@ class RrdFile:
             self.timelines.update(chunk.timeline_names)
 
     def column(self, path: str, ending: str) -> np.ndarray:
-        """A column of an entity in the order of `sim_time`, one row a time."""
+        """A column of an entity, one row per time, sorted by `sim_time`."""
         batches = [batch for batch in self.tables[path] if "sim_time" in batch.schema.names]
         rows, times = [], []
         for batch in batches:
@@ -28,8 +28,8 @@ class RrdFile:
                 rows.extend(batch.column(names[0]).to_pylist())
                 times.extend(batch.column("sim_time").cast(pa.int64()).to_pylist())
         order = np.argsort(times, kind="stable")
-        return np.array([rows[at] for at in order])
+        return np.array([rows[number] for number in order])
 
     def rows(self, path: str) -> int:
-        """Rows of an entity that are on a timeline."""
+        """Number of an entity's rows with a time."""
         return sum(batch.num_rows for batch in self.tables[path] if "sim_time" in batch.schema.names)

@@ -1,4 +1,4 @@
-"""The simulation service in virtual time: real ticks, commands, states and events, but no clock and no socket."""
+"""Simulation service in simulated time: real ticks, commands, states and events, with a manual clock and no sockets."""
 
 import importlib.util
 import sys
@@ -22,11 +22,11 @@ from hilrig_sim.parameters import rig_parameters
 from support.recordings import Made
 
 REGISTERS = np.array([18000 / np.pi, 18000 / np.pi, 100_000.0, 18000 / np.pi])
-"""From rad and m to the paper's position registers."""
+"""Factors from rad and m to the position registers."""
 
 
 class VirtualRig:
-    """One lab's simulation; `states` and `events` are all that it has sent."""
+    """Simulation of a lab; `states` and `events` have everything that it has published."""
 
     def __init__(self, lab: LabConfig | None = None) -> None:
         self.lab = lab or LabConfig()
@@ -45,7 +45,7 @@ class VirtualRig:
         self._seq = 0
 
     def tick(self, count: int = 1) -> JointState:
-        """Let steps pass; the last state sent."""
+        """Simulate steps; return the last published state."""
         for _ in range(count):
             self.simulation.pre_encode(self._rate.next_ns)
             self.simulation.tick(self._rate.wait())
@@ -63,7 +63,7 @@ class VirtualRig:
         session: str = "session",
         rig: str = "rig1",
     ) -> None:
-        """Send a command; with `repeat` it has the number of the one before."""
+        """Publish a command; with `repeat` it has the number of the previous one."""
         self._seq += not repeat
         command = TorqueCommand(
             rig=rig,
@@ -78,7 +78,7 @@ class VirtualRig:
         self.send(command.SerializeToString(), rig)
 
     def send(self, payload: bytes, rig: str = "rig1") -> None:
-        """Send any bytes as a rig's command."""
+        """Publish arbitrary bytes as the command of a rig."""
         self._commands.put(RigBatch(source="edge/1", rigs=[rig], messages=[payload]).SerializeToString())
 
     def kinds(self) -> list[str]:
@@ -86,7 +86,7 @@ class VirtualRig:
         return [Event.Kind.Name(event.kind) for event in self.events]
 
     def recorded(self) -> list[Made]:
-        """All that it has sent, as `recordings.write` takes it."""
+        """Return everything that was published, in the format of `recordings.write`."""
         made = [Made("state", state.wall_ns, state) for state in self.states]
         made += [Made("event", event.wall_ns, event) for event in self.events]
         return sorted(made, key=lambda one: one.publish_wall_ns)
@@ -101,22 +101,22 @@ class VirtualRig:
 
 
 def pick_and_place() -> ModuleType:
-    """The example controller as a module."""
+    """Return the example controller as a module."""
     path = Path(__file__).parents[2] / "examples" / "pick_and_place.py"
     spec = importlib.util.spec_from_file_location("pick_and_place", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Its dataclasses look themselves up there.
+    # Dataclasses look up their module there.
     sys.modules["pick_and_place"] = module
     spec.loader.exec_module(module)
     return module
 
 
 def work(rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_delay_ms: int = 0) -> float | None:
-    """Let the example controller work through int16 registers, twice a step; when it was done, s, or None.
+    """Run the example controller with int16 registers, twice per step; return when it was done, s, or None.
 
-    The delays are added on top of the step that a loop through the rig takes anyway.
+    The delays are added to the step that a loop through the rig takes.
     """
     example = pick_and_place()
     controller = example.Controller(example.task_of({}))
@@ -145,11 +145,11 @@ def work(rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_de
     return done_s
 
 
-class FarRig:
-    """A rig at the end of a slow network, in virtual time, for a controller that asks and waits for each answer.
+class RemoteRig:
+    """A rig behind a slow network, in simulated time; the controller waits for each response.
 
-    It stands in for the example's `Rig` and for its `time`: only asking and sleeping let time pass. On one way in
-    `1 / stalls` somebody is held up for 50 to 100 ms: the controller, the rig, or both.
+    It replaces the example's `Rig` and its `time`: only requests and sleeping advance the time. With probability
+    `stalls` per one-way transfer, the controller, the rig, or both stall for 50 to 100 ms.
     """
 
     def __init__(self, rig: VirtualRig, one_way_ms: float, seed: int, *, stalls: float = 0.0) -> None:
@@ -168,47 +168,47 @@ class FarRig:
             self._rig.tick()
             self._next_ms += self._step_ms
 
-    def _way(self) -> None:
+    def _transfer(self) -> None:
         self._pass(self._one_way_ms + 0.1 + self._random.exponential(0.5))
         if self._random.random() < self._stalls:
-            held_up_ms = float(self._random.uniform(50, 100))
+            stall_ms = float(self._random.uniform(50, 100))
             rig, controller = ((True, False), (False, True), (True, True))[self._random.integers(3)]
             if rig:
-                # Its ticks that were due are not made up for.
-                missed = int(np.ceil(held_up_ms / self._step_ms))
+                # The missed ticks are skipped.
+                missed = int(np.ceil(stall_ms / self._step_ms))
                 self._rig.clock.advance(round(missed * self._step_ms * 1e6))
                 self._next_ms += missed * self._step_ms
             if controller:
-                self._pass(held_up_ms)
+                self._pass(stall_ms)
 
     def _command(self) -> None:
         self._rig.command(self._effort, magnet=self._magnet)
 
     def read(self) -> np.ndarray:
-        self._way()
+        self._transfer()
         position = np.rint(np.array(self._rig.states[-1].position) * REGISTERS) / REGISTERS
-        self._way()
+        self._transfer()
         return position
 
     def write(self, effort: np.ndarray) -> None:
-        self._way()
+        self._transfer()
         self._effort = np.rint(effort * 1000) / 1000
         self._command()
-        self._way()
+        self._transfer()
 
     def exchange(self, effort: np.ndarray) -> np.ndarray:
-        self._way()
+        self._transfer()
         self._effort = np.rint(effort * 1000) / 1000
         self._command()
         position = np.rint(np.array(self._rig.states[-1].position) * REGISTERS) / REGISTERS
-        self._way()
+        self._transfer()
         return position
 
     def switch(self, magnet: bool) -> None:
-        self._way()
+        self._transfer()
         self._magnet = magnet
         self._command()
-        self._way()
+        self._transfer()
 
     def monotonic(self) -> float:
         return self._now_ms / 1000

@@ -7,9 +7,9 @@ import pytest
 from hilrig_runtime.bus.acl import RULES, access_control
 from hilrig_runtime.config.bus import BusTlsConfig
 from hilrig_runtime.config.lab import parse_lab
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.messaging.endpoints import LatestOfBatches
-from hilrig_runtime.process.health import Counters
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import RigBatch
 from hilrig_schemas.topics import COMMANDS, all_topics
@@ -68,7 +68,7 @@ def test_every_rule_belongs_to_one_identity() -> None:
 
 def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
     def heard(permitted: dict[str, tuple[str, ...]], instance: str) -> set[str]:
-        commands = LatestOfBatches(ManualClock(), Counters(), permitted)
+        commands = LatestValueCache(ManualClock(), Counters(), permitted)
         batch = RigBatch(rigs=["rig1", "rig3"], messages=[b"one", b"three"])
         commands.on_message(COMMANDS.key("lab", "edge", instance), batch.SerializeToString())
         return {rig for rig in ("rig1", "rig3") if commands.get(rig) is not None}

@@ -1,6 +1,6 @@
-"""A run of three times the length takes no more memory: every command works on blocks, here made small.
+"""Memory of the commands does not depend on the length of a run: they process it in blocks, which are small here.
 
-What Python and numpy hold is counted, the most of it at any time; `tests/rig/test_ten_hours.py` looks at processes.
+Measured is the peak of Python and numpy allocations; `tests/rig/test_ten_hours.py` measures processes.
 """
 
 import gc
@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.analysis import compare, diagnosis, distribution, samples, summary, verify
-from hilrig_replay.analysis import disk_table as spool
+from hilrig_replay.analysis import compare, diagnosis, disk_table, distribution, samples, summary, verify
+from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export import export
-from hilrig_replay.io.index import RunIndex
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots import latency_plot
 from hilrig_replay.plots.latency_plot import latency_figure
@@ -33,10 +32,10 @@ def drawn(path: Path) -> None:
 COMMANDS: dict[str, Callable[[Path], object]] = {
     "latency": lambda path: measure(open_run(path)),
     "latency --plot": drawn,
-    # Without its pictures, which take what their lines are made of: both runs are thinned to the same points.
-    "report": lambda path: summary.summarise(open_run(path)),
+    # Without plots, whose memory depends on the number of points: both trajectories are downsampled to the same number.
+    "report": lambda path: summary.summarize(open_run(path)),
     "compare": lambda path: compare.compare([open_run(path), open_run(path)]),
-    "compare --align": lambda path: compare.origin_of(open_run(path), "SESSION_END"),
+    "compare --align": lambda path: compare.find_origin(open_run(path), "SESSION_END"),
     "replay --save": lambda path: rerun_view.save_rrd(open_run(path), path.with_suffix(".rrd")),
     "verify": verify.verify,
     "export --csv": lambda path: export.export_tables(open_run(path), path.parent / path.stem, "csv"),
@@ -57,15 +56,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     for function, name in (
         (Run.blocks, "rows"),
-        (spool.Spool.__init__, "block"),
-        (distribution.percentiles, "gathered"),
+        (disk_table.DiskTable.__init__, "block"),
+        (distribution.percentiles, "max_sorted"),
     ):
         assert function.__kwdefaults__ is not None
         monkeypatch.setitem(function.__kwdefaults__, name, ROWS)
-    monkeypatch.setattr(samples, "WINDOW", ROWS)
-    monkeypatch.setattr(verify, "PIECE", ROWS)
+    monkeypatch.setattr(samples, "MATCH_WINDOW_ROWS", ROWS)
+    monkeypatch.setattr(verify, "BLOCK_STATES", ROWS)
     monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
-    monkeypatch.setattr(summary, "COURSE_POINTS", ROWS)
+    monkeypatch.setattr(summary, "TRAJECTORY_POINTS", ROWS)
     monkeypatch.setattr(latency_plot, "_MAX_HISTORY_POINTS", ROWS)
     monkeypatch.setattr(diagnosis, "WINDOW_S", 1.0)
 
@@ -81,14 +80,14 @@ def peak(command: Callable[[Path], object], path: Path) -> int:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_memory_does_not_grow_with_the_length(command: str, runs: tuple[Path, Path]) -> None:
-    # What is imported, and what libraries keep once, is not the run's.
+def test_memory_does_not_depend_on_the_length(command: str, runs: tuple[Path, Path]) -> None:
+    # The first call excludes imports and caches of libraries.
     COMMANDS[command](runs[0])
     short, long = (peak(COMMANDS[command], path) for path in runs)
     print(f"{command}: {short / 1e6:.2f} MB, {TIMES} times as long {long / 1e6:.2f} MB")
     assert long < 1.1 * short + 100_000
 
 
-def test_what_holds_a_whole_run_would_be_found(runs: tuple[Path, Path]) -> None:
+def test_detects_a_run_held_in_memory(runs: tuple[Path, Path]) -> None:
     short, long = (peak(lambda path: open_run(path).states, path) for path in runs)
     assert long > 1.5 * short

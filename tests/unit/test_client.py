@@ -1,93 +1,91 @@
-"""A rig that a lab does not have is refused as soon as that is certain, with the names of those that it has."""
+"""`check_rig`: an unknown rig is rejected as soon as all services have replied, with the names of the lab's rigs."""
 
 import pytest
 
-from hilrig_cli import client as asking
+from hilrig_cli import client
 from hilrig_cli.client import check_rig
-from hilrig_runtime.bus.api import Answer
+from hilrig_runtime.bus.api import Reply
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import Roster
-from hilrig_schemas.topics import ROSTER
+from hilrig_schemas import ServiceInfo
+from hilrig_schemas.topics import SERVICE_INFO
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 
 
 class CountingBus(MemoryBus):
-    """Knows how often it was asked; services that come later come before the second time."""
+    """Bus that counts its queries; the services of `late` appear before the second query."""
 
-    def __init__(self, *early: Roster, late: tuple[Roster, ...] = ()) -> None:
+    def __init__(self, *early: ServiceInfo, late: tuple[ServiceInfo, ...] = ()) -> None:
         super().__init__(MemoryHub())
-        self.asked = 0
+        self.queries = 0
         self._late = late
         self._serve(early)
 
-    def _serve(self, rosters: tuple[Roster, ...]) -> None:
-        for one in rosters:
-            answer = one.SerializeToString()
-            self.serve(ROSTER.key(LAB.name, one.service, one.instance), lambda _, answer=answer: answer)
+    def _serve(self, list_services: tuple[ServiceInfo, ...]) -> None:
+        for one in list_services:
+            reply = one.SerializeToString()
+            self.declare_queryable(SERVICE_INFO.key(LAB.name, one.service, one.instance), lambda _, reply=reply: reply)
 
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        self.asked += 1
-        if self.asked == 2:
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
+        self.queries += 1
+        if self.queries == 2:
             self._serve(self._late)
-        return super().ask(key_expr, payload, timeout_s=timeout_s)
+        return super().query(key_expr, payload, timeout_s=timeout_s)
 
 
-def roster(service: str, instance: str, *rigs: str) -> Roster:
-    return Roster(service=service, instance=instance, rigs=rigs)
+def info(service: str, instance: str, *rigs: str) -> ServiceInfo:
+    return ServiceInfo(service=service, instance=instance, rigs=rigs)
 
 
-SIM = roster("sim", "1", "rig1", "rig2", "rig3", "guest")
-FIRST, SECOND = roster("edge", "1", "rig1", "rig2"), roster("edge", "2", "rig3", "guest")
+SIM = info("sim", "1", "rig1", "rig2", "rig3", "guest")
+FIRST, SECOND = info("edge", "1", "rig1", "rig2"), info("edge", "2", "rig3", "guest")
 
 
-def test_a_rig_of_the_file_is_not_asked_for() -> None:
+def test_rig_of_the_file_needs_no_query() -> None:
     bus = CountingBus()
     check_rig(bus, LAB, "rig2")
-    assert bus.asked == 0
+    assert bus.queries == 0
 
 
-def test_a_rig_that_was_added_is_known_from_the_first_who_has_it() -> None:
+def test_added_rig_is_found_at_the_first_service_that_has_it() -> None:
     bus = CountingBus(SECOND)
     check_rig(bus, LAB, "guest")
-    assert bus.asked == 1
+    assert bus.queries == 1
 
 
-def test_once_every_rig_of_the_file_is_served_another_name_is_refused_at_once(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_unknown_rig_is_rejected_once_all_services_reply(capsys: pytest.CaptureFixture[str]) -> None:
     bus = CountingBus(SIM, FIRST, SECOND)
     with pytest.raises(InputError, match=r"^no rig is called 'gest'; this lab has rig1, rig2, rig3, guest$"):
         check_rig(bus, LAB, "gest")
-    assert bus.asked == 1
+    assert bus.queries == 1
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("missing", [SIM, SECOND], ids=["sim", "edge"])
-def test_a_service_that_is_not_linked_yet_is_waited_for(missing: Roster) -> None:
-    there = [one for one in (roster("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
-    bus = CountingBus(*there, late=(missing, roster("edge", "3", "late")))
+def test_waits_for_services_that_are_not_linked_yet(missing: ServiceInfo) -> None:
+    linked = [one for one in (info("sim", "2", "rig1"), FIRST, SIM, SECOND) if one is not missing]
+    bus = CountingBus(*linked, late=(missing, info("edge", "3", "late")))
     check_rig(bus, LAB, "late")
-    assert bus.asked == 2
+    assert bus.queries == 2
 
 
-def test_where_a_service_stays_away_it_is_said_what_is_waited_for(
+def test_prints_a_message_while_waiting_for_a_service(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(asking, "ANSWER_WITHIN_S", 0.2)
-    monkeypatch.setattr(asking, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(client, "QUERY_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(client, "WAIT_MESSAGE_AFTER_S", 0.0)
     with pytest.raises(InputError, match="no rig is called 'gest'; this lab has rig1, rig2, rig3"):
         check_rig(CountingBus(FIRST), LAB, "gest")
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "'gest' is not in lab.toml: looking for a service that it was added to, for up to 0.2 s" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "rig 'gest' is not in lab.toml; waiting up to 0.2 s for a service that it was added to" in message
 
 
-def test_of_many_rigs_some_are_named() -> None:
+def test_error_lists_some_of_many_rigs() -> None:
     lab = parse_lab("[rigs]\ncount = 128\n")
     rigs = [rig.name for rig in lab.rigs]
-    bus = CountingBus(roster("sim", "1", *rigs), roster("edge", "1", *rigs))
+    bus = CountingBus(info("sim", "1", *rigs), info("edge", "1", *rigs))
     with pytest.raises(InputError, match=r"rig1, .* and 112 more \(hilrig rig list\)$"):
         check_rig(bus, lab, "rig129")

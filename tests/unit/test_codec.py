@@ -12,37 +12,37 @@ COUNT = st.integers(-32767, 32767)
 NUMBER = st.floats(allow_nan=True, allow_infinity=True)
 
 
-def test_a_torque_register_is_a_thousandth() -> None:
+def test_torque_register_has_scale_1000() -> None:
     assert codec.effort_of(struct.pack(">4h", 1000, -1, 32767, -32768)) == (1.0, -0.001, 32.767, -32.768)
 
 
 @given(st.tuples(COUNT, COUNT, COUNT, COUNT))
-def test_efforts_come_back_from_their_registers(counts: tuple[int, ...]) -> None:
+def test_efforts_survive_encoding(counts: tuple[int, ...]) -> None:
     words = struct.pack(">4h", *counts)
     assert codec.words_of_effort(codec.effort_of(words)) == (words, False)
 
 
 @given(st.tuples(COUNT, COUNT, COUNT, COUNT))
-def test_positions_come_back_from_their_registers(counts: tuple[int, ...]) -> None:
+def test_positions_survive_encoding(counts: tuple[int, ...]) -> None:
     words = struct.pack(">4h", *counts)
     assert codec.words_of_position(codec.position_of(words)) == (words, False)
 
 
-def test_positions_are_hundredths_of_degrees_and_millimetres() -> None:
+def test_position_registers_have_scale_100() -> None:
     words, saturated = codec.words_of_position((math.pi / 2, -math.pi / 6, 0.2, math.radians(327.67)))
     assert struct.unpack(">4h", words) == (9000, -3000, 20000, 32767)
     assert not saturated
 
 
 @pytest.mark.parametrize(("degrees", "count"), [(360.0, 32767), (-360.0, -32767), (-327.68, -32767)])
-def test_a_position_beyond_the_register_saturates_and_says_so(degrees: float, count: int) -> None:
+def test_position_beyond_register_saturates(degrees: float, count: int) -> None:
     words, saturated = codec.words_of_position((0.0, 0.0, 0.0, math.radians(degrees)))
     assert struct.unpack(">4h", words) == (0, 0, 0, count)
     assert saturated
 
 
 @given(st.tuples(NUMBER, NUMBER, NUMBER, NUMBER))
-def test_whatever_the_simulation_says_fits_into_registers(position: tuple[float, ...]) -> None:
+def test_any_position_is_encoded(position: tuple[float, ...]) -> None:
     words, saturated = codec.words_of_position(position)
     counts = struct.unpack(">4h", words)
     for value, count, scale in zip(position, counts, codec.COUNTS_PER_UNIT, strict=True):
@@ -56,7 +56,7 @@ def test_whatever_the_simulation_says_fits_into_registers(position: tuple[float,
 
 
 @given(st.tuples(*[st.floats(width=32, allow_nan=False)] * 4))
-def test_floats_are_as_pymodbus_reads_them(values: tuple[float, ...]) -> None:
+def test_float_registers_are_decoded_by_pymodbus(values: tuple[float, ...]) -> None:
     registers = list(struct.unpack(">8H", codec.floats_of(values)))
     for index, value in enumerate(values):
         pair = registers[2 * index : 2 * index + 2]

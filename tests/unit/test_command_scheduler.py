@@ -10,8 +10,8 @@ from hilrig_modbus_edge.command_scheduler import (
     CommandScheduler,
 )
 from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
-from hilrig_runtime.messaging.endpoints import LatestOfBatches
-from hilrig_runtime.process.health import Counters
+from hilrig_runtime.counters import Counters
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import RigBatch
 
@@ -35,7 +35,7 @@ class Edge:
 
     def __init__(self, step_ns: int = STEP_NS) -> None:
         self.clock = ManualClock()
-        self.states = LatestOfBatches(self.clock, Counters(), {})
+        self.states = LatestValueCache(self.clock, Counters(), {})
         self.timers: list[Call] = []
         self.sent: list[tuple[int, dict[str, bytes]]] = []
         scheduler = CommandScheduler("edge/1", self._put, self.states.get, step_ns, self.clock, self._call_at)

@@ -1,4 +1,4 @@
-"""Which command acts, how old it is, and from when: decided without clock and bus."""
+"""Unit tests of the command latch: new commands, repetition, timeout, resets, late commands."""
 
 import math
 from dataclasses import dataclass
@@ -7,128 +7,128 @@ import pytest
 
 from hilrig_schemas import TorqueCommand
 from hilrig_sim.arm.model import LARGEST_EFFORT
-from hilrig_sim.commands import ZERO_EFFORT, CommandFollower, StepTimes
+from hilrig_sim.commands import ZERO_EFFORT, CommandLatch, StepTimes
 
 MS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Came:
+class Received:
     payload: bytes
     arrived_ns: int
 
 
-def command(seq: int = 1, at_ms: int = 0, **fields: object) -> Came:
+def command(seq: int = 1, at_ms: int = 0, **fields: object) -> Received:
     fields = {"effort": [1.0, 2.0, 3.0, 4.0], "session": "s", "basis_incarnation": 7, "basis_step": 5} | fields
-    return Came(TorqueCommand(seq=seq, **fields).SerializeToString(), at_ms * MS)
+    return Received(TorqueCommand(seq=seq, **fields).SerializeToString(), at_ms * MS)
 
 
-def follower(timeout_ms: int = 600) -> CommandFollower:
-    return CommandFollower(incarnation=7, timeout_ns=timeout_ms * MS)
+def new_latch(timeout_ms: int = 600) -> CommandLatch:
+    return CommandLatch(incarnation=7, timeout_ns=timeout_ms * MS)
 
 
-def test_before_any_command_the_effort_is_zero_and_nothing_is_said_to_be_lost() -> None:
-    follows = follower()
-    follows.latch(None, 10_000 * MS)
-    assert (follows.effort, follows.safe, follows.seq, follows.lost) == (ZERO_EFFORT, True, 0, False)
+def test_effort_is_zero_before_the_first_command() -> None:
+    latch = new_latch()
+    latch.latch(None, 10_000 * MS)
+    assert (latch.effort, latch.safe, latch.seq, latch.command_lost) == (ZERO_EFFORT, True, 0, False)
 
 
-def test_a_new_command_acts_once_as_new_with_its_basis_and_arrival() -> None:
-    follows = follower()
-    came = command(at_ms=3)
-    follows.latch(came, 20 * MS)
-    assert follows.is_new
-    assert (follows.effort, follows.basis_step, follows.arrived_ns) == ((1.0, 2.0, 3.0, 4.0), 5, 3 * MS)
-    assert not follows.safe
-    assert not follows.back
-    follows.latch(came, 40 * MS)
-    assert not follows.is_new
-    assert (follows.basis_step, follows.arrived_ns, follows.seq) == (0, 0, 1)
-    assert follows.effort == (1.0, 2.0, 3.0, 4.0)
+def test_new_command_has_basis_and_arrival_for_one_tick() -> None:
+    latch = new_latch()
+    received = command(at_ms=3)
+    latch.latch(received, 20 * MS)
+    assert latch.is_new
+    assert (latch.effort, latch.basis_step, latch.arrived_ns) == ((1.0, 2.0, 3.0, 4.0), 5, 3 * MS)
+    assert not latch.safe
+    assert not latch.command_resumed
+    latch.latch(received, 40 * MS)
+    assert not latch.is_new
+    assert (latch.basis_step, latch.arrived_ns, latch.seq) == (0, 0, 1)
+    assert latch.effort == (1.0, 2.0, 3.0, 4.0)
 
 
-def test_a_repeat_refreshes_the_age_but_is_not_new() -> None:
-    follows = follower(timeout_ms=100)
-    follows.latch(command(at_ms=0), 0)
-    follows.latch(command(at_ms=90), 95 * MS)
-    assert not follows.is_new
-    follows.latch(None, 180 * MS)
-    assert not follows.safe
+def test_repetition_restarts_the_timeout_but_is_not_new() -> None:
+    latch = new_latch(timeout_ms=100)
+    latch.latch(command(at_ms=0), 0)
+    latch.latch(command(at_ms=90), 95 * MS)
+    assert not latch.is_new
+    latch.latch(None, 180 * MS)
+    assert not latch.safe
 
 
 @pytest.mark.parametrize("change", [{"seq": 2}, {"session": "t"}])
-def test_new_is_what_has_another_number_or_session(change: dict[str, object]) -> None:
-    follows = follower()
-    follows.latch(command(), 0)
-    follows.latch(command(**{"at_ms": 5, **change}), 20 * MS)  # type: ignore[arg-type]
-    assert follows.is_new
+def test_new_number_or_session_is_a_new_command(change: dict[str, object]) -> None:
+    latch = new_latch()
+    latch.latch(command(), 0)
+    latch.latch(command(**{"at_ms": 5, **change}), 20 * MS)  # type: ignore[arg-type]
+    assert latch.is_new
 
 
-def test_without_commands_the_effort_goes_to_zero_once_and_comes_back() -> None:
-    follows = follower(timeout_ms=100)
-    came = command(magnet=True)
-    follows.latch(came, 0)
-    follows.latch(came, 100 * MS)
-    assert not follows.safe
-    follows.latch(came, 101 * MS)
-    assert follows.safe
-    assert follows.lost
-    assert follows.effort == ZERO_EFFORT
-    assert follows.magnet
-    assert follows.silent_ns == 101 * MS
-    follows.latch(came, 121 * MS)
-    assert follows.safe
-    assert not follows.lost
-    follows.latch(command(at_ms=139), 140 * MS)
-    assert follows.back
-    assert not follows.is_new
-    assert follows.effort == (1.0, 2.0, 3.0, 4.0)
-    follows.latch(command(at_ms=139), 160 * MS)
-    assert not follows.back
+def test_timeout_zeroes_effort_until_the_next_message() -> None:
+    latch = new_latch(timeout_ms=100)
+    received = command(magnet=True)
+    latch.latch(received, 0)
+    latch.latch(received, 100 * MS)
+    assert not latch.safe
+    latch.latch(received, 101 * MS)
+    assert latch.safe
+    assert latch.command_lost
+    assert latch.effort == ZERO_EFFORT
+    assert latch.magnet
+    assert latch.silent_ns == 101 * MS
+    latch.latch(received, 121 * MS)
+    assert latch.safe
+    assert not latch.command_lost
+    latch.latch(command(at_ms=139), 140 * MS)
+    assert latch.command_resumed
+    assert not latch.is_new
+    assert latch.effort == (1.0, 2.0, 3.0, 4.0)
+    latch.latch(command(at_ms=139), 160 * MS)
+    assert not latch.command_resumed
 
 
-def test_with_a_timeout_of_zero_a_command_holds_for_ever() -> None:
-    follows = follower(timeout_ms=0)
-    follows.latch(command(), 0)
-    follows.latch(None, 10**15)
-    assert not follows.safe
+def test_timeout_zero_holds_a_command_forever() -> None:
+    latch = new_latch(timeout_ms=0)
+    latch.latch(command(), 0)
+    latch.latch(None, 10**15)
+    assert not latch.safe
 
 
-def test_a_basis_of_another_run_of_the_simulation_is_none() -> None:
-    follows = follower()
-    follows.latch(command(basis_incarnation=6), 0)
-    assert follows.is_new
-    assert follows.basis_step == 0
+def test_basis_of_another_incarnation_is_ignored() -> None:
+    latch = new_latch()
+    latch.latch(command(basis_incarnation=6), 0)
+    assert latch.is_new
+    assert latch.basis_step == 0
 
 
-def test_efforts_are_cut_to_what_is_finite_and_what_the_drives_give() -> None:
-    follows = follower()
-    follows.latch(command(effort=[math.nan, math.inf, -math.inf, 1e9]), 0)
-    assert follows.effort == (0.0, LARGEST_EFFORT, -LARGEST_EFFORT, LARGEST_EFFORT)
+def test_efforts_are_limited_and_finite() -> None:
+    latch = new_latch()
+    latch.latch(command(effort=[math.nan, math.inf, -math.inf, 1e9]), 0)
+    assert latch.effort == (0.0, LARGEST_EFFORT, -LARGEST_EFFORT, LARGEST_EFFORT)
 
 
-def test_what_is_no_command_changes_nothing_but_is_counted() -> None:
-    follows = follower()
-    follows.latch(command(), 0)
-    follows.latch(Came(b"\xff\xff\xff", MS), 20 * MS)
-    follows.latch(command(seq=9, effort=[1.0]), 40 * MS)
-    assert follows.malformed == 2
-    assert (follows.seq, follows.effort) == (1, (1.0, 2.0, 3.0, 4.0))
+def test_malformed_message_is_counted_and_ignored() -> None:
+    latch = new_latch()
+    latch.latch(command(), 0)
+    latch.latch(Received(b"\xff\xff\xff", MS), 20 * MS)
+    latch.latch(command(seq=9, effort=[1.0]), 40 * MS)
+    assert latch.malformed == 2
+    assert (latch.seq, latch.effort) == (1, (1.0, 2.0, 3.0, 4.0))
 
 
-def test_a_reset_is_asked_for_by_a_count_that_grows() -> None:
-    follows = follower()
-    told = []
+def test_increased_count_requests_a_reset() -> None:
+    latch = new_latch()
+    resets_requested = []
     for seq, resets in enumerate([3, 3, 4, 4, 0, 1], start=1):
-        follows.latch(command(seq=seq, resets=resets), seq * MS)
-        told.append(follows.reset)
-    # The first is only the count that the edge has; one that fell is an edge that was started anew.
-    assert told == [False, False, True, False, False, True]
-    follows.latch(command(seq=6, resets=2), 8 * MS)
-    assert follows.reset
+        latch.latch(command(seq=seq, resets=resets), seq * MS)
+        resets_requested.append(latch.reset)
+    # The first count is only a reference; a lower count is that of a restarted edge.
+    assert resets_requested == [False, False, True, False, False, True]
+    latch.latch(command(seq=6, resets=2), 8 * MS)
+    assert latch.reset
 
 
-def test_times_of_steps_are_kept_for_a_while() -> None:
+def test_step_times_are_kept_up_to_the_capacity() -> None:
     times = StepTimes(capacity=4)
     assert times.get(0) is None
     for step in range(1, 7):
@@ -136,43 +136,43 @@ def test_times_of_steps_are_kept_for_a_while() -> None:
     assert [times.get(step) for step in range(8)] == [None, None, None, 30, 40, 50, 60, None]
 
 
-def test_a_command_that_is_overtaken_before_its_tick_has_never_acted() -> None:
-    follows = follower()
-    follows.latch(command(seq=1, at_ms=15, basis_step=4, effort=[9.0, 0.0, 0.0, 0.0]), 20 * MS)
-    follows.overtake(command(seq=2, at_ms=19, basis_incarnation=8), 20 * MS)
-    assert follows.is_new
-    assert (follows.seq, follows.effort, follows.arrived_ns) == (2, (1.0, 2.0, 3.0, 4.0), 19 * MS)
-    assert follows.basis_step == 0
+def test_command_superseded_before_its_tick_is_not_applied() -> None:
+    latch = new_latch()
+    latch.latch(command(seq=1, at_ms=15, basis_step=4, effort=[9.0, 0.0, 0.0, 0.0]), 20 * MS)
+    latch.relatch(command(seq=2, at_ms=19, basis_incarnation=8), 20 * MS)
+    assert latch.is_new
+    assert (latch.seq, latch.effort, latch.arrived_ns) == (2, (1.0, 2.0, 3.0, 4.0), 19 * MS)
+    assert latch.basis_step == 0
 
 
-def test_what_is_the_same_nothing_or_a_repeat_overtakes_nothing() -> None:
-    follows = follower()
-    came = command(seq=1, at_ms=15)
-    follows.latch(came, 20 * MS)
-    for later in (came, None, command(seq=1, at_ms=19), Came(b"\xff\xff\xff", 19 * MS)):
-        follows.overtake(later, 20 * MS)
-        assert follows.is_new
-        assert (follows.seq, follows.basis_step, follows.arrived_ns) == (1, 5, 15 * MS)
-    assert follows.malformed == 1
+def test_repetition_or_malformed_message_supersedes_nothing() -> None:
+    latch = new_latch()
+    received = command(seq=1, at_ms=15)
+    latch.latch(received, 20 * MS)
+    for later in (received, None, command(seq=1, at_ms=19), Received(b"\xff\xff\xff", 19 * MS)):
+        latch.relatch(later, 20 * MS)
+        assert latch.is_new
+        assert (latch.seq, latch.basis_step, latch.arrived_ns) == (1, 5, 15 * MS)
+    assert latch.malformed == 1
 
 
-def test_a_reset_that_is_overtaken_before_its_tick_is_done_once() -> None:
-    follows = follower()
-    follows.latch(command(seq=1), 20 * MS)
-    follows.latch(command(seq=2, resets=1), 40 * MS)
+def test_reset_of_superseded_command_is_executed_once() -> None:
+    latch = new_latch()
+    latch.latch(command(seq=1), 20 * MS)
+    latch.latch(command(seq=2, resets=1), 40 * MS)
     last = command(seq=3, resets=1)
-    follows.overtake(last, 40 * MS)
-    assert follows.reset
-    follows.latch(last, 60 * MS)
-    assert not follows.reset
+    latch.relatch(last, 40 * MS)
+    assert latch.reset
+    latch.latch(last, 60 * MS)
+    assert not latch.reset
 
 
-def test_a_command_that_comes_just_before_the_tick_that_would_miss_it_was_never_lost() -> None:
-    follows = follower(timeout_ms=100)
-    came = command()
-    follows.latch(came, 0)
-    follows.latch(came, 120 * MS)
-    assert follows.lost
-    follows.overtake(command(seq=2, at_ms=119), 120 * MS)
-    assert (follows.safe, follows.lost, follows.back) == (False, False, False)
-    assert follows.effort == (1.0, 2.0, 3.0, 4.0)
+def test_command_just_before_the_timeout_tick_is_not_lost() -> None:
+    latch = new_latch(timeout_ms=100)
+    received = command()
+    latch.latch(received, 0)
+    latch.latch(received, 120 * MS)
+    assert latch.command_lost
+    latch.relatch(command(seq=2, at_ms=119), 120 * MS)
+    assert (latch.safe, latch.command_lost, latch.command_resumed) == (False, False, False)
+    assert latch.effort == (1.0, 2.0, 3.0, 4.0)

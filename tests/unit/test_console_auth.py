@@ -85,9 +85,9 @@ def test_recognizes_loopback_addresses() -> None:
     ("options", "error", "message"),
     [
         ({"listen": "here"}, InputError, "expected HOST:PORT"),
-        ({"password_file": Path("none")}, InputError, "none can't be read: No such file"),
+        ({"password_file": Path("none")}, InputError, "none: can't be read: No such file"),
         ({"password_file": Path("short")}, InputError, "at least 8 characters"),
-        ({"certificate": Path("invalid.pem")}, InputError, "give both"),
+        ({"certificate": Path("invalid.pem")}, InputError, "must be given together"),
         (
             {"certificate": Path("invalid.pem"), "key": Path("invalid.pem")},
             InputError,

@@ -11,9 +11,9 @@ from hilrig_console.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, pose_of, 
 from hilrig_console.events import MAX_EVENTS, EventBuffer
 from hilrig_console.poses import PoseCache
 from hilrig_console.view_model import ClientState, Frame, ViewModel
-from hilrig_monitoring.lab_view import FORGOTTEN_S, SILENT_S, LabView
+from hilrig_monitoring.lab_view import REMOVED_AFTER_S, SILENT_AFTER_S, LabView
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, Roster
+from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, ServiceInfo
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_sim.parameters import rig_parameters
@@ -35,11 +35,11 @@ def config(parameters: RigParameters = RIG) -> RigConfig:
 
 
 def poses(*rigs: str, now_s: float = 0.0) -> PoseCache:
-    made = PoseCache()
-    made.add([batch(**dict.fromkeys(rigs, state()))], now_s)
+    cache = PoseCache()
+    cache.add([batch(**dict.fromkeys(rigs, state()))], now_s)
     for rig in rigs:
-        made.configure(rig, config())
-    return made
+        cache.configure(rig, config())
+    return cache
 
 
 @pytest.mark.parametrize("joints", [(0.0, 0.0, 0.0, 0.0), (0.5, -0.8, 0.1, 0.2), (-2.0, 2.5, 0.2, -6.0)])
@@ -55,12 +55,12 @@ def test_flags_contain_magnet_part_and_stop() -> None:
     shown = pose_of(ArmParameters(), state(magnet=True, held_part="red", limit_flags=1))
     assert shown is not None
     assert shown[5] == MAGNET_ON | HOLDS_PART | AT_STOP
-    for said, flag in (
+    for fields, flag in (
         ({"magnet": True}, MAGNET_ON),
         ({"held_part": "red"}, HOLDS_PART),
         ({"limit_flags": 256}, AT_STOP),
     ):
-        one = pose_of(ArmParameters(), state(**said))
+        one = pose_of(ArmParameters(), state(**fields))
         assert one is not None
         assert one[5] == flag
     assert pose_of(ArmParameters(), state((math.nan, 0.0, 0.0, 0.0))) is None
@@ -76,69 +76,71 @@ def test_scene_has_parts_in_order_of_states() -> None:
 
 
 def test_pose_needs_configuration_of_rig() -> None:
-    made = PoseCache()
-    made.add([batch(rig1=state())], 0.0)
-    assert made.unconfigured() == ["rig1"]
-    assert made.as_dict(0.0) == {}
-    made.configure("rig1", None)
-    assert made.unconfigured() == ["rig1"]
-    made.configure("rig1", config())
-    assert made.unconfigured() == []
-    made.add([batch(rig1=state())], 0.1)
-    number, pose, parts = made.as_dict(0.1)["rig1"]
+    cache = PoseCache()
+    cache.add([batch(rig1=state())], 0.0)
+    assert cache.unconfigured() == ["rig1"]
+    assert cache.as_dict(0.0) == {}
+    cache.configure("rig1", None)
+    assert cache.unconfigured() == ["rig1"]
+    cache.configure("rig1", config())
+    assert cache.unconfigured() == []
+    cache.add([batch(rig1=state())], 0.1)
+    number, pose, parts = cache.as_dict(0.1)["rig1"]
     assert (number, len(pose), parts) == (0, 6, [])
 
 
 def test_invalid_configuration_is_not_queried_again() -> None:
-    made = PoseCache()
-    made.add([batch(rig1=state())], 0.0)
-    made.configure("rig1", RigConfig(parameters_json="{}"))
-    assert made.unconfigured() == []
+    cache = PoseCache()
+    cache.add([batch(rig1=state())], 0.0)
+    cache.configure("rig1", RigConfig(parameters_json="{}"))
+    assert cache.unconfigured() == []
 
 
 def test_new_incarnation_is_configured_again() -> None:
-    made = poses("rig1", "rig2")
-    assert len(made.scenes) == 1
+    cache = poses("rig1", "rig2")
+    assert len(cache.scenes) == 1
     again = state()
     again.incarnation = 8
-    made.add([batch(rig1=again)], 0.1)
-    assert made.unconfigured() == ["rig1"]
+    cache.add([batch(rig1=again)], 0.1)
+    assert cache.unconfigured() == ["rig1"]
     other = RigParameters(arm=ArmParameters(l2=0.4), scene=RIG.scene)
-    made.configure("rig1", config(other))
-    made.add([batch(rig1=again, rig2=state())], 0.2)
-    assert [drawn[0] for drawn in made.as_dict(0.2).values()] == [1, 0]
+    cache.configure("rig1", config(other))
+    cache.add([batch(rig1=again, rig2=state())], 0.2)
+    assert [drawn[0] for drawn in cache.as_dict(0.2).values()] == [1, 0]
 
 
 def test_parts_keep_their_last_position() -> None:
-    made = poses("rig1")
+    cache = poses("rig1")
     moved = state(parts=[PartState(name="red", x=0.1, y=-0.2, z=0.0, yaw=math.pi / 2)])
-    made.add([batch(rig1=moved)], 0.1)
-    made.add([batch(rig1=state())], 0.2)
-    assert made.as_dict(0.2)["rig1"][2] == [[100, -200, 90]]
+    cache.add([batch(rig1=moved)], 0.1)
+    cache.add([batch(rig1=state())], 0.2)
+    assert cache.as_dict(0.2)["rig1"][2] == [[100, -200, 90]]
 
 
 def test_newest_pose_and_newest_parts_are_used() -> None:
-    made = poses("rig1", "rig2")
+    cache = poses("rig1", "rig2")
 
     def placed(x: float) -> JointState:
         return state((0.0, 0.0, 0.0, 0.0), parts=[PartState(name="red", x=x, y=0.1, z=0.1, yaw=0.1)])
 
-    still, bent = state((0.0, 0.0, 0.0, 0.0)), state((math.pi / 2, 0.0, 0.0, 0.0))
-    made.add([batch(rig1=placed(0.1)), batch(rig1=placed(0.2), rig2=bent), batch(rig1=bent), batch(rig2=still)], 0.1)
-    drawn = made.as_dict(0.1)
+    straight, bent = state((0.0, 0.0, 0.0, 0.0)), state((math.pi / 2, 0.0, 0.0, 0.0))
+    cache.add(
+        [batch(rig1=placed(0.1)), batch(rig1=placed(0.2), rig2=bent), batch(rig1=bent), batch(rig2=straight)], 0.1
+    )
+    drawn = cache.as_dict(0.1)
     assert [drawn[rig][1][2:4] for rig in ("rig1", "rig2")] == [[0, 600], [600, 0]]
     assert drawn["rig1"][2] == [[200, 100, 6]]
     # Also after the length of a state with parts is known.
-    made.add([batch(rig1=placed(0.3)), batch(rig1=still)], 0.2)
-    assert made.as_dict(0.2)["rig1"][2] == [[300, 100, 6]]
+    cache.add([batch(rig1=placed(0.3)), batch(rig1=straight)], 0.2)
+    assert cache.as_dict(0.2)["rig1"][2] == [[300, 100, 6]]
 
 
 def test_silent_rig_expires_and_invalid_batch_is_ignored() -> None:
-    made = poses("rig1")
-    made.add([batch(rig1=state())], 1.0)
-    made.add([b"\xff\xff garbage"], 1.0)
-    assert "rig1" in made.as_dict(1.0 + SILENT_S)
-    assert made.as_dict(1.1 + SILENT_S) == {}
+    cache = poses("rig1")
+    cache.add([batch(rig1=state())], 1.0)
+    cache.add([b"\xff\xff garbage"], 1.0)
+    assert "rig1" in cache.as_dict(1.0 + SILENT_AFTER_S)
+    assert cache.as_dict(1.1 + SILENT_AFTER_S) == {}
 
 
 def test_events_are_numbered_and_old_ones_evicted() -> None:
@@ -176,20 +178,23 @@ def test_browser_receives_updates_and_all_events() -> None:
     assert "id: 7" in returned
 
 
-def model() -> ViewModel:
-    made = ViewModel("lab", ("rig1", "rig2"), 0)
+def lab_model() -> ViewModel:
+    model = ViewModel("lab", ("rig1", "rig2"), 0)
     sim = [RigReport(rig="rig1", loop_us=[20_000, 30_000]), RigReport(rig="rig2", safe=True)]
     edge = [RigReport(rig="rig1", controller="192.0.2.7:9", session="s"), RigReport(rig="rig2")]
-    made.view.hear(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
-    made.view.hear(Health(service="edge", instance="1", rig_reports=edge), 0.0)
-    made.view.hear(Health(service="recorder", instance="1", rig_reports=[RigReport(rig="rig1", recording=True)]), 0.0)
-    made.set_addresses([Roster(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])])
-    return made
+    model.view.update(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
+    model.view.update(Health(service="edge", instance="1", rig_reports=edge), 0.0)
+    recorder = [RigReport(rig="rig1", recording=True)]
+    model.view.update(Health(service="recorder", instance="1", rig_reports=recorder), 0.0)
+    model.set_addresses(
+        [ServiceInfo(service="edge", instance="1", rigs=["rig1", "rig2"], addresses=["h:5020", "h:5021"])]
+    )
+    return model
 
 
 def test_lab_message_has_state_of_each_rig() -> None:
-    lab = json.loads(model().frame(0.0, {"runs": 4}).lab)
-    assert (lab["lab"], lab["link"], lab["runs"], lab["scenes"]) == ("lab", "", 4, 0)
+    lab = json.loads(lab_model().frame(0.0, {"runs": 4}).lab)
+    assert (lab["lab"], lab["bus_error"], lab["runs"], lab["scenes"]) == ("lab", "", 4, 0)
     first, second = lab["rigs"]
     assert first["state"] == "in use"
     assert (first["address"], first["controller"], first["session"], first["recording"]) == (
@@ -203,25 +208,25 @@ def test_lab_message_has_state_of_each_rig() -> None:
 
 
 def test_lab_message_has_bus_error_without_lab() -> None:
-    made = ViewModel("lab", ("rig1",), 0)
-    made.set_bus_error("no zenoh router answers")
-    lab = json.loads(made.frame(0.0, {}).lab)
-    assert (lab["services"], lab["link"]) == ([], "no zenoh router answers")
+    model = ViewModel("lab", ("rig1",), 0)
+    model.set_bus_error("no zenoh router answers")
+    lab = json.loads(model.frame(0.0, {}).lab)
+    assert (lab["services"], lab["bus_error"]) == ([], "no zenoh router answers")
     assert [rig["state"] for rig in lab["rigs"]] == ["no edge"]
-    assert made.frame(0.0, {}).poses == "{}"
+    assert model.frame(0.0, {}).poses == "{}"
 
 
 def test_lab_message_changes_once_per_second() -> None:
-    made = model()
-    first = made.frame(0.0, {})
-    assert made.frame(0.9, {}).lab is first.lab
-    assert made.frame(1.0, {}).lab != first.lab
+    model = lab_model()
+    first = model.frame(0.0, {})
+    assert model.frame(0.9, {}).lab is first.lab
+    assert model.frame(1.0, {}).lab != first.lab
 
 
 def test_lab_message_is_sent_without_changes() -> None:
-    made, client = ViewModel("lab", (), 0), ClientState()
+    model, client = ViewModel("lab", (), 0), ClientState()
     for second in range(3):
-        text, client = made.frame(float(second), {}).updates(client)
+        text, client = model.frame(float(second), {}).updates(client)
         assert text.startswith("event: lab\n")
 
 
@@ -243,14 +248,14 @@ def test_lab_message_is_sent_without_changes() -> None:
 def test_rig_state_text(edge: RigReport | None, sim: RigReport | None, state: str) -> None:
     view = LabView(("r",))
     for service, report in (("edge", edge), ("sim", sim)):
-        view.hear(Health(service=service, instance="1", rig_reports=[] if report is None else [report]), 0.0)
+        view.update(Health(service=service, instance="1", rig_reports=[] if report is None else [report]), 0.0)
     assert view.rigs(0.0)[0].state == state
 
 
 def test_service_is_removed_after_timeout() -> None:
     view = LabView(())
-    view.hear(Health(service="edge", instance="old"), 0.0)
-    view.hear(Health(service="edge", instance="new"), FORGOTTEN_S)
+    view.update(Health(service="edge", instance="old"), 0.0)
+    view.update(Health(service="edge", instance="new"), REMOVED_AFTER_S)
     assert len(view.services()) == 2
-    view.hear(Health(service="edge", instance="new"), FORGOTTEN_S + 1)
+    view.update(Health(service="edge", instance="new"), REMOVED_AFTER_S + 1)
     assert [service.name for service in view.services()] == ["edge/new"]

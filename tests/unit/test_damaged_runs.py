@@ -1,4 +1,4 @@
-"""Recordings that were damaged and recovered: what is missing is said to be missing where it was lost."""
+"""Damaged and recovered recordings: each lost message is counted at the place where it was lost."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import pytest
 
 from hilrig_recorder.mcap_format.recover import recover
 from hilrig_recorder.mcap_format.scan import Chunk, Message, read_chunk, scan
+from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.io.index import RunIndex
 from hilrig_replay.io.run import open_run
 from support import recordings
 from support.labs import hilrig
@@ -16,10 +16,10 @@ RECORDED = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
 
 
 def damage(source: Path, damaged: Path, number: int) -> int:
-    """Copy a recording, with a chunk of it destroyed; how many messages that had."""
+    """Copy a recording and destroy one of its chunks; returns the number of messages in the chunk."""
     data = bytearray(source.read_bytes())
     chunk = [item for _, item in scan(bytes(data)) if isinstance(item, Chunk)][number]
-    # Behind the head of its record, which says how long it is.
+    # After the record header, which contains the length.
     middle = chunk.offset + 60 + len(chunk.data) // 2
     data[middle : middle + 20] = bytes(20)
     damaged.write_bytes(data)
@@ -27,20 +27,20 @@ def damage(source: Path, damaged: Path, number: int) -> int:
 
 
 @pytest.mark.parametrize("number", [0, 1, -1])
-def test_what_was_in_a_damaged_chunk_was_lost_in_the_file(tmp_path: Path, number: int) -> None:
+def test_counts_messages_of_a_damaged_chunk_as_lost_in_file(tmp_path: Path, number: int) -> None:
     damaged, whole = tmp_path / "run.mcap", tmp_path / "lab" / "rig1" / "whole.mcap"
     whole.parent.mkdir(parents=True)
     messages = damage(RECORDED, damaged, number)
     recover(damaged, whole)
     report = measure(open_run(whole))
     assert (report.lost.transport, report.lost.recorder, report.lost.file) == (0, 0, messages)
-    assert any(f"{messages} messages lost in the file, which was damaged" in reason for reason in report.reasons)
+    assert any(f"{messages} messages lost in the damaged file" in reason for reason in report.reasons)
     [entry] = RunIndex(tmp_path / "lab").load()
     assert (entry.lost_transport, entry.lost_recorder, entry.lost_file) == (0, 0, messages)
     assert f", {messages} in the file" in hilrig("latency", whole).stdout.replace("\n", " ")
 
 
-def test_where_nobody_counted_the_gaps_tell(tmp_path: Path) -> None:
+def test_counts_sequence_gaps_of_a_recovered_file(tmp_path: Path) -> None:
     damaged, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
     made = recordings.record(tmp_path / "made.mcap", recordings.Script(seconds=6.0, lost_transport=2))
     assert damage(made, damaged, 1) > 50
@@ -50,7 +50,7 @@ def test_where_nobody_counted_the_gaps_tell(tmp_path: Path) -> None:
     assert lost.file > 50
 
 
-def test_a_gap_in_a_file_that_is_only_torn_was_lost_before(tmp_path: Path) -> None:
+def test_gap_in_a_truncated_file_was_lost_in_transport(tmp_path: Path) -> None:
     script = recordings.Script(seconds=6.0)
     made = recordings.write(
         tmp_path / "made.mcap", recordings.make(script), script=script, finish=False, missing={"state": {77, 78}}

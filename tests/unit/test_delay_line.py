@@ -1,4 +1,4 @@
-"""Messages on an impaired way: held up, lost, overtaken; and which impairment is in force when."""
+"""Unit tests of the delay lines (delay, loss, superseded messages) and of the impairment schedule."""
 
 import itertools
 
@@ -6,114 +6,114 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.impairment.delay_line import Line, StateWay
-from hilrig_modbus_edge.impairment.schedule import Course
+from hilrig_modbus_edge.impairment.delay_line import DelayedStates, DelayLine
+from hilrig_modbus_edge.impairment.schedule import ImpairmentSchedule
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentConfig
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 MS = 1_000_000
 
 
-def line(*fates: tuple[int, bool]) -> Line[str]:
-    return Line(iter(fates))
+def delay_line(*samples: tuple[int, bool]) -> DelayLine[str]:
+    return DelayLine(iter(samples))
 
 
-def test_each_message_arrives_after_its_own_delay() -> None:
-    way = line((30, False), (30, False))
-    assert way.put("a", 100)
-    assert way.put("b", 110)
-    assert way.next_ns == 130
-    assert way.take(129) is None
-    assert way.take(130) == ("a", 30)
-    assert way.take(139) is None
-    assert way.take(200) == ("b", 30)
-    assert way.next_ns is None
+def test_each_message_has_its_own_delay() -> None:
+    line = delay_line((30, False), (30, False))
+    assert line.put("a", 100)
+    assert line.put("b", 110)
+    assert line.next_ns == 130
+    assert line.pop_due(129) is None
+    assert line.pop_due(130) == ("a", 30)
+    assert line.pop_due(139) is None
+    assert line.pop_due(200) == ("b", 30)
+    assert line.next_ns is None
 
 
-def test_what_is_lost_does_not_arrive_and_overtakes_nobody() -> None:
-    way = line((50, False), (1, True))
-    assert way.put("a", 0)
-    assert not way.put("b", 10)
-    assert way.take(50) == ("a", 50)
-    assert (way.count, way.lost, way.overtaken) == (2, 1, 0)
+def test_lost_message_supersedes_no_other() -> None:
+    line = delay_line((50, False), (1, True))
+    assert line.put("a", 0)
+    assert not line.put("b", 10)
+    assert line.pop_due(50) == ("a", 50)
+    assert (line.count, line.lost, line.superseded) == (2, 1, 0)
 
 
-def test_what_is_overtaken_is_dropped() -> None:
-    way = line((100, False), (90, False), (10, False))
+def test_superseded_message_is_dropped() -> None:
+    line = delay_line((100, False), (90, False), (10, False))
     for start, item in enumerate("abc"):
-        way.put(item, start)
-    assert way.take(1000) == ("c", 10)
-    assert way.take(1000) is None
-    assert way.overtaken == 2
+        line.put(item, start)
+    assert line.pop_due(1000) == ("c", 10)
+    assert line.pop_due(1000) is None
+    assert line.superseded == 2
 
 
-def test_when_the_way_is_freed_the_newest_arrives_at_once() -> None:
-    way = line((100, False), (100, False))
-    way.put("a", 0)
-    way.put("b", 20)
-    assert way.take_newest(50) == ("b", 30)
-    assert (way.next_ns, way.overtaken) == (None, 1)
-    assert way.take_newest(50) is None
+def test_release_newest_delivers_at_once() -> None:
+    line = delay_line((100, False), (100, False))
+    line.put("a", 0)
+    line.put("b", 20)
+    assert line.release_newest(50) == ("b", 30)
+    assert (line.next_ns, line.superseded) == (None, 1)
+    assert line.release_newest(50) is None
 
 
 @given(
     messages=st.lists(st.tuples(st.integers(0, 50), st.integers(0, 300), st.booleans()), max_size=60),
-    looks=st.lists(st.integers(0, 3000), max_size=30),
+    read_times=st.lists(st.integers(0, 3000), max_size=30),
 )
-def test_a_reader_sees_the_newest_state_that_has_arrived_and_never_an_older_one(
-    messages: list[tuple[int, int, bool]], looks: list[int]
+def test_reader_gets_newest_delivered_state_never_older(
+    messages: list[tuple[int, int, bool]], read_times: list[int]
 ) -> None:
-    """Held against the definition: of all whose release time has passed, the one that set out last."""
-    way = StateWay(iter([(delay, lost) for _, delay, lost in messages]), None)
+    """Compared with the definition: the last sent one of all messages whose delay has passed."""
+    states = DelayedStates(iter([(delay, lost) for _, delay, lost in messages]), None)
     starts = list(itertools.accumulate(gap for gap, _, _ in messages))
     for start, number in zip(starts, range(len(messages)), strict=True):
-        way.arrive(Arrival(bytes([number]), start))
+        states.arrive(TimestampedPayload(bytes([number]), start))
     seen = -1
-    # What is read before all have come is no other case: a message is drawn for by its number.
-    for now in sorted(looks):
+    # Reading before all messages were sent is no special case: each message has the sample of its number.
+    for now in sorted(read_times):
         released = [
             number
             for number, (start, (_, delay, lost)) in enumerate(zip(starts, messages, strict=True))
             if not lost and start + delay <= now
         ]
-        shown = way.newest(now)
+        newest = states.newest(now)
         if not released:
-            assert shown is None
+            assert newest is None
             continue
-        assert shown is not None
-        assert shown.payload[0] == max(released)
-        assert shown.injected_ns == messages[max(released)][1]
-        assert shown.payload[0] >= seen
-        seen = shown.payload[0]
+        assert newest is not None
+        assert newest.payload[0] == max(released)
+        assert newest.injected_ns == messages[max(released)][1]
+        assert newest.payload[0] >= seen
+        seen = newest.payload[0]
 
 
-def test_a_state_that_was_shown_stays_until_a_newer_one_has_arrived() -> None:
-    first = Arrival(b"first", 0)
-    way = StateWay(itertools.repeat((100, False)), first)
-    assert way.newest(10) is first
-    way.arrive(Arrival(b"second", 20))
-    assert way.newest(119) is first
-    second = way.newest(120)
-    assert second == Arrival(b"second", 20, 100)
-    assert way.newest(500) is second
+def test_served_state_stays_until_newer_one_is_delivered() -> None:
+    first = TimestampedPayload(b"first", 0)
+    states = DelayedStates(itertools.repeat((100, False)), first)
+    assert states.newest(10) is first
+    states.arrive(TimestampedPayload(b"second", 20))
+    assert states.newest(119) is first
+    second = states.newest(120)
+    assert second == TimestampedPayload(b"second", 20, 100)
+    assert states.newest(500) is second
 
 
 @given(delays=st.lists(st.integers(0, 1000), min_size=1, max_size=200))
-def test_commands_leave_in_the_order_of_their_numbers(delays: list[int]) -> None:
-    way = Line(iter([(delay, False) for delay in delays]))
-    left: list[int] = []
+def test_commands_are_delivered_in_order(delays: list[int]) -> None:
+    line = DelayLine(iter([(delay, False) for delay in delays]))
+    delivered: list[int] = []
     for number, _ in enumerate(delays):
-        way.put(number, 10 * number)
-        while (arrived := way.take(10 * number)) is not None:
-            left.append(arrived.item)
-    while (arrived := way.take(10**6)) is not None:
-        left.append(arrived.item)
-    assert left == sorted(left)
-    assert left[-1] == len(delays) - 1
-    assert len(left) + way.overtaken == len(delays)
+        line.put(number, 10 * number)
+        while (message := line.pop_due(10 * number)) is not None:
+            delivered.append(message.item)
+    while (message := line.pop_due(10**6)) is not None:
+        delivered.append(message.item)
+    assert delivered == sorted(delivered)
+    assert delivered[-1] == len(delays) - 1
+    assert len(delivered) + line.superseded == len(delays)
 
 
-# -- which one is in force
+# -- active impairment
 
 
 def scheduled() -> ImpairmentConfig:
@@ -121,45 +121,45 @@ def scheduled() -> ImpairmentConfig:
     return ImpairmentConfig.model_validate({"preset": "mobile", "seed": 9, "schedule": entries})
 
 
-def test_a_schedule_runs_from_the_start_of_each_session() -> None:
-    course = Course(scheduled())
-    assert not course.check(10**12)
-    assert (course.ways, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
+def test_schedule_restarts_with_each_session() -> None:
+    schedule = ImpairmentSchedule(scheduled())
+    assert not schedule.check(10**12)
+    assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["mobile"], "lab.toml", 9)
     for start_ns in (5_000 * MS, 50_000 * MS):
-        course.begin_session(start_ns)
-        assert not course.check(start_ns + 499 * MS)
-        assert course.ways == PRESETS["mobile"]
-        assert course.check(start_ns + 500 * MS)
-        assert (course.ways, course.source) == (PRESETS["vpn"], "schedule")
-        assert not course.check(start_ns + 501 * MS)
-        # A check that comes late goes straight to what holds by then.
-        assert course.check(start_ns + 3_100 * MS)
-        assert course.ways.describe() == "state way constant delay 7 ms; command way none"
+        schedule.start_session(start_ns)
+        assert not schedule.check(start_ns + 499 * MS)
+        assert schedule.links == PRESETS["mobile"]
+        assert schedule.check(start_ns + 500 * MS)
+        assert (schedule.links, schedule.source) == (PRESETS["vpn"], "schedule")
+        assert not schedule.check(start_ns + 501 * MS)
+        # A late check applies the entry that is active by then.
+        assert schedule.check(start_ns + 3_100 * MS)
+        assert schedule.links.describe() == "state link constant delay 7 ms; command link none"
 
 
-def test_what_is_set_by_hand_holds_until_it_is_taken_back() -> None:
-    course = Course(scheduled())
-    course.begin_session(0)
-    course.set_by_hand(ImpairmentConfig(preset="wired", seed=3))
-    assert not course.check(600 * MS)
-    course.begin_session(10_000 * MS)
-    assert not course.check(11_000 * MS)
-    assert (course.ways, course.source, course.seed) == (PRESETS["wired"], "hand", 3)
-    course.set_as_lab()
-    assert (course.ways, course.source, course.seed) == (PRESETS["mobile"], "lab.toml", 9)
-    assert not course.check(12_000 * MS), "the schedule waits for the next session"
-    course.begin_session(20_000 * MS)
-    assert course.check(20_600 * MS)
+def test_override_is_active_until_cleared() -> None:
+    schedule = ImpairmentSchedule(scheduled())
+    schedule.start_session(0)
+    schedule.set_override(ImpairmentConfig(preset="wired", seed=3))
+    assert not schedule.check(600 * MS)
+    schedule.start_session(10_000 * MS)
+    assert not schedule.check(11_000 * MS)
+    assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["wired"], "override", 3)
+    schedule.clear_override()
+    assert (schedule.links, schedule.source, schedule.seed) == (PRESETS["mobile"], "lab.toml", 9)
+    assert not schedule.check(12_000 * MS), "the schedule must restart with the next session only"
+    schedule.start_session(20_000 * MS)
+    assert schedule.check(20_600 * MS)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_presets_are_quick_enough_for_a_watchdog(preset: str) -> None:
-    """A mean delay of both ways far below its second, and losses that are not the rule."""
+def test_presets_do_not_trip_the_watchdog(preset: str) -> None:
+    """The mean delay of both links is far below the watchdog timeout of 1 s, and losses are rare."""
     from hilrig_modbus_edge.impairment.model import Impairment
 
     total_ms = 0.0
-    for way in (PRESETS[preset].state, PRESETS[preset].command):
-        delay_ns, lost = Impairment(way, 1).draw(20_000)
+    for link in (PRESETS[preset].state, PRESETS[preset].command):
+        delay_ns, lost = Impairment(link, 1).draw(20_000)
         total_ms += delay_ns.mean() / 1e6
         assert lost.mean() < 0.03
     assert total_ms < 100

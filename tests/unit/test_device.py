@@ -1,13 +1,19 @@
-"""One rig as a Modbus device, with a clock and a simulation that the test owns."""
+"""Unit tests of `Device` with a manual clock and states of the test."""
 
 import struct
 
 import pytest
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
-from hilrig_modbus_edge.registers import map as registers
-from hilrig_modbus_edge.registers.map import Status, Table
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_modbus_edge.registers.map import (
+    ECHO_ADDRESS,
+    MAGNET_COIL,
+    RESET_COIL,
+    WATCHDOG_ADDRESS,
+    RegisterTable,
+    Status,
+)
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
 
@@ -19,10 +25,10 @@ def bench() -> Bench:
     return bench
 
 
-# -- commands and their stamps
+# -- commands and their timestamps
 
 
-def test_a_write_goes_out_as_one_command(bench: Bench) -> None:
+def test_write_is_published_as_one_command(bench: Bench) -> None:
     bench.write(bench.connect(), 0, 1000, 0xFFFF, 0, 4)
     [command] = bench.commands
     assert list(command.effort) == [1.0, -0.001, 0.0, 0.004]
@@ -30,7 +36,7 @@ def test_a_write_goes_out_as_one_command(bench: Bench) -> None:
     assert command.session == bench.device.session.id
 
 
-def test_registers_that_are_not_written_keep_their_torque(bench: Bench) -> None:
+def test_unwritten_registers_keep_their_torque(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1, 2, 3, 4)
     bench.write(client, 2, 30)
@@ -38,7 +44,7 @@ def test_registers_that_are_not_written_keep_their_torque(bench: Bench) -> None:
     assert bench.read(client, 0, 4) == [1, 2, 30, 4]
 
 
-def test_the_basis_is_the_state_that_was_last_served_to_this_connection(bench: Bench) -> None:
+def test_basis_is_last_state_served_to_the_connection(bench: Bench) -> None:
     client, other = bench.connect(), bench.connect(port=2000)
     bench.state(5)
     arrived_ns = bench.clock.monotonic_ns()
@@ -56,7 +62,7 @@ def test_the_basis_is_the_state_that_was_last_served_to_this_connection(bench: B
 
 
 @pytest.mark.parametrize("reconnects", [True, False])
-def test_basis_never_comes_from_an_earlier_session(reconnects: bool) -> None:
+def test_basis_is_never_from_an_earlier_session(reconnects: bool) -> None:
     bench = Bench(lease_ns=1_000 * MS, grace_ns=2_000 * MS)
     bench.state(5)
     client = bench.connect()
@@ -80,7 +86,7 @@ def test_basis_never_comes_from_an_earlier_session(reconnects: bool) -> None:
     assert bench.commands[-1].basis_step == 6
 
 
-def test_read_of_the_next_controller_is_its_basis(bench: Bench) -> None:
+def test_read_before_lease_change_is_basis_of_next_writer(bench: Bench) -> None:
     holder, next_one = bench.connect(), bench.connect(host="10.0.0.2")
     bench.read(holder, 4, 4)
     bench.write(holder, 0, 1)
@@ -91,7 +97,7 @@ def test_read_of_the_next_controller_is_its_basis(bench: Bench) -> None:
     assert bench.commands[-1].controller == next_one.address
 
 
-def test_a_connection_that_reads_nothing_is_based_on_what_its_host_was_served(bench: Bench) -> None:
+def test_writer_without_reads_uses_basis_of_its_host(bench: Bench) -> None:
     reader, writer, stranger = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
     bench.state(9)
     bench.read(reader, 4, 1)
@@ -111,29 +117,29 @@ def test_one_shot_connections_of_a_host_are_one_loop(bench: Bench) -> None:
     assert bench.commands[-1].basis_step == 11
 
 
-def test_a_write_in_the_segment_of_a_read_is_not_based_on_that_read(bench: Bench) -> None:
-    """It was sent before the read was answered."""
+def test_pipelined_write_is_not_based_on_preceding_read(bench: Bench) -> None:
+    """The write was sent before the response to the read."""
     client = bench.connect()
     bench.state(2)
     bench.read(client, 4, 4)
     bench.clock.advance(1)
     bench.state(3)
     now_ns = bench.clock.monotonic_ns()
-    client.heard(now_ns)
-    bench.device.read_registers(client, Table.HOLDING_REGISTER, 4, 4)
+    client.record_request(now_ns)
+    bench.device.read_registers(client, RegisterTable.HOLDING_REGISTER, 4, 4)
     bench.device.write_registers(client, 0, b"\0\1", now_ns)
     assert bench.commands[-1].basis_step == 2
     assert bench.commands[-1].state_served_ns < bench.commands[-1].write_arrived_ns
 
 
-def test_reading_torques_serves_no_state(bench: Bench) -> None:
+def test_read_of_torques_serves_no_state(bench: Bench) -> None:
     client = bench.connect()
     bench.read(client, 0, 4)
     bench.write(client, 0, 1)
     assert bench.commands[-1].basis_step == 0
 
 
-def test_the_standing_command_is_repeated_with_its_number(bench: Bench) -> None:
+def test_held_command_is_repeated_with_its_number(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 7)
     bench.wait(199)
@@ -144,37 +150,37 @@ def test_the_standing_command_is_repeated_with_its_number(bench: Bench) -> None:
     assert len(bench.commands) == 1
 
 
-def test_the_echo_word_comes_back_in_the_next_command(bench: Bench) -> None:
+def test_next_command_carries_the_echo_value(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1)
-    bench.write(client, registers.ECHO, 4711)
+    bench.write(client, ECHO_ADDRESS, 4711)
     assert len(bench.commands) == 1
     bench.write(client, 0, 1)
     assert bench.commands[-1].echo == 4711
 
 
-def test_a_reset_zeroes_the_torques_and_is_counted(bench: Bench) -> None:
+def test_reset_zeroes_torques_and_is_counted(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1000)
     now_ns = bench.clock.monotonic_ns()
-    bench.device.write_coil(client, registers.RESET, True, now_ns)
+    bench.device.write_coil(client, RESET_COIL, True, now_ns)
     assert (list(bench.commands[-1].effort), bench.commands[-1].resets) == ([0, 0, 0, 0], 1)
-    bench.device.write_coil(client, registers.RESET, False, now_ns)
+    bench.device.write_coil(client, RESET_COIL, False, now_ns)
     assert len(bench.commands) == 2
-    assert bench.device.read_bits(client, Table.COIL, registers.RESET, 1) == 0
+    assert bench.device.read_bits(client, RegisterTable.COIL, RESET_COIL, 1) == 0
 
 
-def test_the_magnet_is_a_coil(bench: Bench) -> None:
+def test_coil_switches_the_magnet(bench: Bench) -> None:
     client = bench.connect()
-    bench.device.write_coil(client, registers.MAGNET, True, bench.clock.monotonic_ns())
+    bench.device.write_coil(client, MAGNET_COIL, True, bench.clock.monotonic_ns())
     assert bench.commands[-1].magnet
-    assert bench.device.read_bits(client, Table.COIL, registers.MAGNET, 1) == 1
+    assert bench.device.read_bits(client, RegisterTable.COIL, MAGNET_COIL, 1) == 1
 
 
 # -- lease
 
 
-def test_the_first_writer_holds_the_rig_and_others_are_refused_with_06(bench: Bench) -> None:
+def test_first_writer_acquires_lease_and_others_get_06(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)
     with pytest.raises(ModbusError) as refusal:
@@ -184,10 +190,13 @@ def test_the_first_writer_holds_the_rig_and_others_are_refused_with_06(bench: Be
     refused = bench.events[-1]
     assert refused.kind == Event.LEASE_REFUSED
     assert (refused.controller_data.controller, refused.controller_data.holder) == ("10.0.0.2:1000", "10.0.0.1:1000")
-    assert refused.text == "10.0.0.2:1000 may not write to rig1: 10.0.0.1:1000 holds it"
+    assert refused.text == (
+        "10.0.0.2:1000: write to rig1 denied: 10.0.0.1:1000 holds the lease; stop that client, or run: "
+        "hilrig lease rig1 --release"
+    )
 
 
-def test_a_write_that_is_wrong_takes_no_lease(bench: Bench) -> None:
+def test_invalid_write_acquires_no_lease(bench: Bench) -> None:
     client = bench.connect()
     for address in (4, 8, 99, 102):
         with pytest.raises(ModbusError) as refusal:
@@ -197,7 +206,7 @@ def test_a_write_that_is_wrong_takes_no_lease(bench: Bench) -> None:
     assert not bench.events
 
 
-def test_refusals_are_told_once_a_second_with_their_number(bench: Bench) -> None:
+def test_denials_are_reported_once_per_second_with_count(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)
     for _ in range(100):
@@ -210,7 +219,7 @@ def test_refusals_are_told_once_a_second_with_their_number(bench: Bench) -> None
     assert "(67 times)" in refusals[1]
 
 
-def test_a_host_that_is_refused_with_a_new_connection_each_time_is_told_of_once_a_second(bench: Bench) -> None:
+def test_denials_of_new_connections_are_limited_per_host(bench: Bench) -> None:
     bench.write(bench.connect(), 0, 5)
     for number in range(100):
         bench.clock.advance(15 * MS)
@@ -220,80 +229,80 @@ def test_a_host_that_is_refused_with_a_new_connection_each_time_is_told_of_once_
         bench.device.disconnect(other, "done")
     refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
     assert len(refusals) == 2
-    assert "10.0.0.2:67 may not write" in refusals[1]
+    assert "10.0.0.2:67: write to rig1 denied" in refusals[1]
     assert "(67 times)" in refusals[1]
 
 
 def one_shot(bench: Bench, port: int, host: str = "10.0.0.1") -> int:
-    """A connection for one write; the exception that this gets, or 0."""
+    """Open a connection for one write; return the exception code, or 0."""
     client = bench.connect(host=host, port=port)
     try:
         bench.write(client, 0, port)
     except ModbusError as error:
         return error.code
     finally:
-        bench.device.disconnect(client, "it closed the connection")
+        bench.device.disconnect(client, "connection closed by the client")
     return 0
 
 
-def test_a_chain_of_one_shot_connections_is_told_of_once_a_second(bench: Bench) -> None:
+def test_one_shot_connections_are_reported_once_per_second(bench: Bench) -> None:
     for port in range(100):
         one_shot(bench, port)
         bench.wait(20)
-    told = [event.text for event in bench.events if event.kind in (Event.LEASE_GRANTED, Event.LEASE_LOST)]
-    assert told == [
-        "10.0.0.1:0 holds rig1",
-        "10.0.0.1:0 holds rig1 no more: it closed the connection",
-        "10.0.0.1:50 holds rig1 (50 times)",
-        "10.0.0.1:50 holds rig1 no more: it closed the connection",
+    texts = [event.text for event in bench.events if event.kind in (Event.LEASE_GRANTED, Event.LEASE_LOST)]
+    assert texts == [
+        "10.0.0.1:0 acquired the lease of rig1",
+        "10.0.0.1:0 released the lease of rig1: connection closed by the client",
+        "10.0.0.1:50 acquired the lease of rig1 (50 times)",
+        "10.0.0.1:50 released the lease of rig1: connection closed by the client",
     ]
 
 
-def test_who_stays_is_told_though_his_host_was_told_of_a_moment_ago(bench: Bench) -> None:
+def test_suppressed_acquisition_is_reported_after_one_second(bench: Bench) -> None:
     one_shot(bench, 1)
     stays = bench.connect(port=2)
     bench.write(stays, 0, 5)
     bench.wait(999)
     assert bench.kinds()[-1] == "LEASE_LOST"
     bench.wait(1)
-    assert bench.events[-1].text == "10.0.0.1:2 holds rig1"
+    assert bench.events[-1].text == "10.0.0.1:2 acquired the lease of rig1"
     bench.wait(1000)
     assert bench.kinds().count("LEASE_GRANTED") == 2
-    bench.device.disconnect(stays, "it closed the connection")
+    bench.device.disconnect(stays, "connection closed by the client")
     assert bench.kinds()[-1] == "LEASE_LOST"
 
 
-def test_what_a_teacher_takes_is_told_in_any_case(bench: Bench) -> None:
+def test_revocation_is_always_reported(bench: Bench) -> None:
     one_shot(bench, 1)
     bench.write(bench.connect(port=2), 0, 5)
-    bench.device.release("by the teacher")
+    bench.device.release("revoked by an operator")
     assert [event.text for event in bench.events[-2:]] == [
-        "10.0.0.1:2 holds rig1",
-        "10.0.0.1:2 holds rig1 no more: by the teacher",
+        "10.0.0.1:2 acquired the lease of rig1",
+        "10.0.0.1:2 lost the lease of rig1: revoked by an operator",
     ]
 
 
-def test_two_hosts_that_take_turns_do_not_make_a_session_of_each_write(bench: Bench) -> None:
+def test_alternating_hosts_do_not_get_a_session_per_write(bench: Bench) -> None:
     codes = set()
     for number in range(150):
         codes.add(one_shot(bench, number, host=f"10.0.0.{1 + number % 2}"))
         bench.wait(20)
     assert codes == {0, 6}
     assert bench.kinds().count("SESSION_START") == 4
-    assert any("took it less than a second ago" in event.text for event in bench.events)
+    assert any("acquired the lease less than 1 s ago" in event.text for event in bench.events)
 
 
-def test_the_lease_ends_with_the_connection(bench: Bench) -> None:
+def test_disconnect_releases_the_lease(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)
-    bench.device.disconnect(holder, "it closed the connection")
+    bench.device.disconnect(holder, "connection closed by the client")
     assert bench.kinds()[-1] == "LEASE_LOST"
     bench.write(other, 1, 6)
-    # The torque of the one before stands until the watchdog says otherwise.
+    # The torque of the previous holder stays applied until the watchdog trips.
     assert list(bench.commands[-1].effort) == [0.005, 0.006, 0, 0]
 
 
-def test_the_lease_ends_with_silence_but_not_with_reading(bench: Bench) -> None:
+def test_lease_expires_without_requests_but_not_with_reads(bench: Bench) -> None:
     holder = bench.connect()
     bench.write(holder, 0, 5)
     for _ in range(8):
@@ -307,19 +316,19 @@ def test_the_lease_ends_with_silence_but_not_with_reading(bench: Bench) -> None:
     assert "no request for 5 s" in bench.events[-1].text
 
 
-def test_the_teacher_can_free_a_rig(bench: Bench) -> None:
-    assert bench.device.release("by the teacher") == ""
+def test_operator_can_revoke_the_lease(bench: Bench) -> None:
+    assert bench.device.release("revoked by an operator") == ""
     holder = bench.connect()
     bench.write(holder, 0, 5)
-    assert bench.device.release("by the teacher") == "10.0.0.1:1000"
+    assert bench.device.release("revoked by an operator") == "10.0.0.1:1000"
     assert bench.device.lease.holder is None
-    assert bench.events[-1].controller_data.reason == "by the teacher"
+    assert bench.events[-1].controller_data.reason == "revoked by an operator"
 
 
-def test_a_controller_that_lost_the_rig_to_the_teacher_does_not_get_it_back_at_once(bench: Bench) -> None:
+def test_revoked_holder_cannot_acquire_lease_during_cooldown(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)
-    bench.device.release("by the teacher")
+    bench.device.release("revoked by an operator")
     with pytest.raises(ModbusError) as refusal:
         bench.write(holder, 0, 6)
     assert refusal.value.code == 6
@@ -334,7 +343,7 @@ def test_a_controller_that_lost_the_rig_to_the_teacher_does_not_get_it_back_at_o
     assert bench.device.lease.holder is holder
 
 
-def test_an_observer_reads_and_its_writes_are_an_illegal_function(bench: Bench) -> None:
+def test_write_of_read_only_client_gets_01(bench: Bench) -> None:
     observer = bench.connect(may_write=False)
     assert bench.read(observer, 0, 1) == [0]
     with pytest.raises(ModbusError) as refusal:
@@ -347,7 +356,7 @@ def test_an_observer_reads_and_its_writes_are_an_illegal_function(bench: Bench) 
 # -- watchdog
 
 
-def test_torque_goes_to_zero_when_the_writes_stop(bench: Bench) -> None:
+def test_watchdog_zeroes_torque_when_writes_stop(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1000, 1000, 1000, 1000)
     assert bench.deadlines == [bench.clock.monotonic_ns() + 1000 * MS]
@@ -363,7 +372,7 @@ def test_torque_goes_to_zero_when_the_writes_stop(bench: Bench) -> None:
     assert (trip.watchdog_data.silent_ns, trip.watchdog_data.timeout_ns) == (1000 * MS, 1000 * MS)
 
 
-def test_the_trip_says_why(bench: Bench) -> None:
+def test_trip_event_has_the_cause(bench: Bench) -> None:
     def trip_text() -> str:
         assert bench.events[-1].kind == Event.WATCHDOG_TRIP
         return bench.events[-1].text
@@ -371,69 +380,69 @@ def test_the_trip_says_why(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1)
     bench.wait(1000)
-    assert "10.0.0.1:1000 is silent" in trip_text()
+    assert "10.0.0.1:1000 sends no requests" in trip_text()
     bench.write(client, 0, 1)
     bench.wait(900)
     bench.read(client, 4, 4)
     bench.wait(100)
     assert "reads but does not write" in trip_text()
     bench.write(client, 0, 1)
-    bench.device.disconnect(client, "it closed the connection")
+    bench.device.disconnect(client, "connection closed by the client")
     bench.wait(1000)
-    assert "10.0.0.1:1000 is gone" in trip_text()
+    assert "10.0.0.1:1000 no longer holds the lease" in trip_text()
 
 
-def test_the_next_write_rearms(bench: Bench) -> None:
+def test_next_write_rearms_the_watchdog(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1)
     bench.wait(1000)
-    tripped = bench.read(client, 1, 1, Table.INPUT_REGISTER)[0]
+    tripped = bench.read(client, 1, 1, RegisterTable.INPUT_REGISTER)[0]
     assert tripped & Status.WATCHDOG_TRIPPED
     bench.write(client, 1, 2)
     assert bench.kinds()[-1] == "WATCHDOG_REARM"
-    # What stood before the trip does not come back.
+    # The torque before the trip is not restored.
     assert list(bench.commands[-1].effort) == [0, 0.002, 0, 0]
-    assert not bench.read(client, 1, 1, Table.INPUT_REGISTER)[0] & Status.WATCHDOG_TRIPPED
+    assert not bench.read(client, 1, 1, RegisterTable.INPUT_REGISTER)[0] & Status.WATCHDOG_TRIPPED
 
 
-def test_a_rig_that_is_left_without_torque_needs_no_watchdog(bench: Bench) -> None:
+def test_watchdog_does_not_trip_without_torque(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1)
     bench.write(client, 0, 0)
-    bench.device.disconnect(client, "it closed the connection")
+    bench.device.disconnect(client, "connection closed by the client")
     bench.wait(2000)
     assert "WATCHDOG_TRIP" not in bench.kinds()
 
 
-def test_the_time_out_is_set_by_register_within_bounds(bench: Bench) -> None:
+def test_watchdog_timeout_register_is_bounded(bench: Bench) -> None:
     client = bench.connect()
-    assert bench.read(client, registers.WATCHDOG, 1) == [1000]
-    bench.write(client, registers.WATCHDOG, 150)
-    assert bench.read(client, registers.WATCHDOG, 1) == [150]
+    assert bench.read(client, WATCHDOG_ADDRESS, 1) == [1000]
+    bench.write(client, WATCHDOG_ADDRESS, 150)
+    assert bench.read(client, WATCHDOG_ADDRESS, 1) == [150]
     bench.write(client, 0, 1)
     bench.wait(150)
     assert bench.commands[-1].safe
     for wrong in (0, 99, 10_001, 65535):
         with pytest.raises(ModbusError) as refusal:
-            bench.write(client, registers.ECHO, 42, wrong)
+            bench.write(client, ECHO_ADDRESS, 42, wrong)
         assert refusal.value.code == 4
-    assert bench.read(client, registers.ECHO, 2) == [0, 150]
+    assert bench.read(client, ECHO_ADDRESS, 2) == [0, 150]
 
 
-def test_a_new_session_starts_with_the_labs_time_out_and_no_echo_word(bench: Bench) -> None:
+def test_new_session_restores_timeout_and_echo_defaults(bench: Bench) -> None:
     one, other = bench.connect(), bench.connect(host="10.0.0.2")
-    bench.write(one, registers.ECHO, 4711, 150)
+    bench.write(one, ECHO_ADDRESS, 4711, 150)
     bench.write(one, 0, 1)
     bench.device.disconnect(one, "done")
     bench.write(other, 0, 1)
-    assert bench.read(other, registers.ECHO, 2) == [0, 1000]
+    assert bench.read(other, ECHO_ADDRESS, 2) == [0, 1000]
     assert [command.echo for command in bench.commands if command.controller] == [4711, 0]
 
 
 # -- sessions
 
 
-def test_a_session_begins_with_the_lease_and_ends_after_its_grace(bench: Bench) -> None:
+def test_session_starts_with_lease_and_ends_after_grace(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 0)
     session = bench.device.session
@@ -452,13 +461,13 @@ def test_a_session_begins_with_the_lease_and_ends_after_its_grace(bench: Bench) 
     assert (last.session, last.seq, last.basis_step, last.safe) == ("", 2, 0, True)
 
 
-def test_a_session_that_begins_with_a_write_that_moves_nothing_is_told_too(bench: Bench) -> None:
-    bench.write(bench.connect(), registers.ECHO, 1)
+def test_session_started_without_torque_is_published(bench: Bench) -> None:
+    bench.write(bench.connect(), ECHO_ADDRESS, 1)
     [command] = bench.commands
     assert (command.session, command.safe, command.controller) == (bench.device.session.id, True, "")
 
 
-def test_the_same_host_goes_on_with_its_session_and_another_begins_its_own(bench: Bench) -> None:
+def test_same_host_continues_session_another_starts_one(bench: Bench) -> None:
     first, again, other = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
     bench.write(first, 0, 0)
     session = bench.device.session
@@ -476,29 +485,29 @@ def test_the_same_host_goes_on_with_its_session_and_another_begins_its_own(bench
     assert [k for k in bench.kinds() if k.startswith("SESSION")] == ["SESSION_START", "SESSION_END", "SESSION_START"]
 
 
-def test_shutting_leaves_no_torque_no_lease_and_no_session(bench: Bench) -> None:
+def test_stop_ends_torque_lease_and_session(bench: Bench) -> None:
     bench.write(bench.connect(), 0, 1000)
-    bench.device.shut("the edge stops")
+    bench.device.stop("edge stopped")
     assert bench.kinds()[-2:] == ["LEASE_LOST", "SESSION_END"]
     last = bench.commands[-1]
     assert (list(last.effort), last.safe, last.session) == ([0] * 4, True, "")
     assert bench.device.session is None
 
 
-# -- what registers show
+# -- register contents
 
 
-def test_positions_before_the_first_state_are_a_device_failure() -> None:
+def test_positions_before_first_state_get_04() -> None:
     bench = Bench()
     client = bench.connect()
     with pytest.raises(ModbusError) as refusal:
         bench.read(client, 4, 1)
     assert refusal.value.code == 4
     assert bench.read(client, 0, 4) == [0] * 4
-    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 0
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 1) == 0
 
 
-def test_the_extended_map_shows_the_whole_state(bench: Bench) -> None:
+def test_extended_map_contains_the_whole_state(bench: Bench) -> None:
     client = bench.connect()
     bench.state(
         70_000,
@@ -512,7 +521,7 @@ def test_the_extended_map_shows_the_whole_state(bench: Bench) -> None:
     )
     bench.write(client, 0, 1)
     bench.clock.advance(12 * MS)
-    data = struct.pack(">36H", *bench.read(client, 0, 36, Table.INPUT_REGISTER))
+    data = struct.pack(">36H", *bench.read(client, 0, 36, RegisterTable.INPUT_REGISTER))
     version, status, step, latency, lease, watchdog, timeout, session, stops, age = struct.unpack_from(
         ">HHIIHHHHHH", data
     )
@@ -534,58 +543,58 @@ def test_the_extended_map_shows_the_whole_state(bench: Bench) -> None:
     assert floats[:4] == pytest.approx([85.9437, -57.2958, 125.0, 355.2338], abs=1e-4)
     assert floats[4:8] == pytest.approx([28.6479, 0.0, -250.0, 0.0], abs=1e-4)
     assert floats[8:] == (1.0, 2.0, -3.5, 0.25)
-    bits = bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 16)
+    bits = bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 16)
     assert Status(bits) == wanted
 
 
-def test_the_lease_and_the_right_to_write_look_different_to_each_reader(bench: Bench) -> None:
+def test_lease_and_read_only_bits_depend_on_the_client(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(port=2, may_write=False)
     bench.write(holder, 0, 1)
-    assert bench.read(holder, 6, 1, Table.INPUT_REGISTER) == [1]
-    assert bench.read(other, 6, 1, Table.INPUT_REGISTER) == [2]
-    bits = bench.device.read_bits(other, Table.DISCRETE_INPUT, 0, 16)
+    assert bench.read(holder, 6, 1, RegisterTable.INPUT_REGISTER) == [1]
+    assert bench.read(other, 6, 1, RegisterTable.INPUT_REGISTER) == [2]
+    bits = bench.device.read_bits(other, RegisterTable.DISCRETE_INPUT, 0, 16)
     assert bits & Status.READ_ONLY
     assert not bits & Status.LEASE_IS_YOURS
 
 
-def test_a_state_that_grows_old_is_said_not_to_be_alive(bench: Bench) -> None:
+def test_old_state_clears_the_alive_bit(bench: Bench) -> None:
     client = bench.connect()
-    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 1
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 1) == 1
     bench.clock.advance(1000 * MS)
-    assert bench.device.read_bits(client, Table.DISCRETE_INPUT, 0, 1) == 0
-    # Its age says how old, up to what the register holds.
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 1) == 0
+    # The age register saturates at its maximum.
     age = len(struct.pack(">HHIIHHHHH", *[0] * 9)) // 2
-    assert bench.read(client, age, 1, Table.INPUT_REGISTER) == [1000]
+    assert bench.read(client, age, 1, RegisterTable.INPUT_REGISTER) == [1000]
     bench.clock.advance(100_000 * MS)
-    assert bench.read(client, age, 1, Table.INPUT_REGISTER) == [0xFFFF]
+    assert bench.read(client, age, 1, RegisterTable.INPUT_REGISTER) == [0xFFFF]
 
 
-def test_the_last_loop_latency_stands_until_there_is_another(bench: Bench) -> None:
+def test_latency_register_keeps_the_last_value(bench: Bench) -> None:
     client = bench.connect()
 
-    def shown_us() -> int:
-        high, low = bench.read(client, 4, 2, Table.INPUT_REGISTER)
+    def latency_us() -> int:
+        high, low = bench.read(client, 4, 2, RegisterTable.INPUT_REGISTER)
         return high << 16 | low
 
     for step, loop_ms, expected_us in ((1, 0, 0), (2, 40, 40_000), (3, 0, 40_000), (4, 20, 20_000), (5, 0, 20_000)):
         bench.state(step, loop_latency_ns=loop_ms * MS)
-        assert shown_us() == expected_us
+        assert latency_us() == expected_us
 
 
-def test_a_message_that_is_no_state_is_left_out(bench: Bench) -> None:
+def test_invalid_state_message_is_ignored(bench: Bench) -> None:
     client = bench.connect()
     before = bench.read(client, 4, 4)
     for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
-        bench.arrival = Arrival(payload, bench.clock.monotonic_ns())
+        bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
 
 
-def test_one_read_shows_one_step(bench: Bench) -> None:
-    """Each state has its step in every float: a mix of two would be seen."""
+def test_one_read_contains_one_step(bench: Bench) -> None:
+    """Each state has its step in every float, so that a mix of two would be detected."""
     client = bench.connect()
     for step in range(1, 200):
         bench.state(step, position=(0, 0, step / 1000, 0), velocity=(0, 0, step / 1000, 0), effort=(step,) * 4)
-        data = struct.pack(">36H", *bench.read(client, 0, 36, Table.INPUT_REGISTER))
+        data = struct.pack(">36H", *bench.read(client, 0, 36, RegisterTable.INPUT_REGISTER))
         floats = struct.unpack_from(">12f", data, 24)
         assert struct.unpack_from(">I", data, 4) == (step,)
         assert (floats[2], floats[6], floats[8:]) == (step, step, (step,) * 4)

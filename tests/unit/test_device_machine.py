@@ -1,6 +1,6 @@
-"""Any sequence of requests, connections and silences, held against a model of what a device must be.
+"""Stateful test of `Device`: random requests, connections and pauses, compared with a simple reference model.
 
-The model knows registers, lease and watchdog in the plainest form; requests go through the protocol's own bytes.
+The model has registers, lease and watchdog in the simplest form; requests are encoded as PDUs.
 """
 
 import struct
@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.protocol.pdu import answer
+from hilrig_modbus_edge.protocol.pdu import execute
 from support.device_bench import MS, Bench
 
-WATCHDOG_MS, LEASE_MS, GRACE_MS, HANDOVER_MS = 1000, 5000, 5000, 1000
+WATCHDOG_MS, LEASE_MS, GRACE_MS, HOST_CHANGE_MS = 1000, 5000, 5000, 1000
 WORD = st.integers(0, 0xFFFF)
 
 
@@ -28,32 +28,32 @@ class Model:
     holder: Client | None = None
     fed_ms: int | None = None
     tripped: bool = False
-    heard_ms: dict[int, int] = field(default_factory=dict)
+    last_request_ms: dict[int, int] = field(default_factory=dict)
     session_host: str | None = None
-    handover_due_ms: int = 0
-    gone_ms: int = 0
+    host_change_ms: int = 0
+    released_ms: int = 0
 
     def pass_time(self) -> None:
-        """What has become due at this millisecond, in the order of the device."""
+        """Do everything that is due at this millisecond, in the order of the device."""
         if self.fed_ms is not None and self.now_ms - self.fed_ms >= self.timeout_ms:
             self.torque, self.tripped, self.fed_ms = [0, 0, 0, 0], True, None
-        if self.holder is not None and self.now_ms - self.heard_ms[id(self.holder)] >= LEASE_MS:
-            self.lose()
-        if self.session_host is not None and self.holder is None and self.now_ms - self.gone_ms >= GRACE_MS:
+        if self.holder is not None and self.now_ms - self.last_request_ms[id(self.holder)] >= LEASE_MS:
+            self.release()
+        if self.session_host is not None and self.holder is None and self.now_ms - self.released_ms >= GRACE_MS:
             self.session_host = None
 
-    def lose(self) -> None:
-        self.holder, self.gone_ms = None, self.now_ms
+    def release(self) -> None:
+        self.holder, self.released_ms = None, self.now_ms
         if not any(self.torque):
             self.fed_ms = None
 
     def write(self, client: Client) -> bool:
-        """Whether a right write of this client is done."""
+        """Return whether a valid write of this client is accepted."""
         if self.holder is None:
             if self.session_host not in (None, client.host.address):
-                if self.now_ms < self.handover_due_ms:
+                if self.now_ms < self.host_change_ms:
                     return False
-                self.handover_due_ms = self.now_ms + HANDOVER_MS
+                self.host_change_ms = self.now_ms + HOST_CHANGE_MS
             self.holder = client
             if self.session_host != client.host.address:
                 self.timeout_ms, self.echo = WATCHDOG_MS, 0
@@ -67,7 +67,7 @@ class Model:
 @settings(max_examples=40, stateful_step_count=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 class DeviceMachine(RuleBasedStateMachine):
     @initialize()
-    def begin(self) -> None:
+    def start(self) -> None:
         self.bench = Bench()
         self.bench.state(1)
         self.model = Model()
@@ -76,9 +76,9 @@ class DeviceMachine(RuleBasedStateMachine):
 
     def ask(self, client: Client, pdu: bytes) -> bytes:
         now_ns = self.bench.clock.monotonic_ns()
-        client.heard(now_ns)
-        self.model.heard_ms[id(client)] = self.model.now_ms
-        return answer(self.bench.device, client, pdu, now_ns)
+        client.record_request(now_ns)
+        self.model.last_request_ms[id(client)] = self.model.now_ms
+        return execute(self.bench.device, client, pdu, now_ns)
 
     @rule(host=st.sampled_from(["10.0.0.1", "10.0.0.2"]))
     @precondition(lambda self: len(self.clients) < 4)
@@ -86,15 +86,15 @@ class DeviceMachine(RuleBasedStateMachine):
         self.port += 1
         client = self.bench.connect(host, self.port)
         self.clients.append(client)
-        self.model.heard_ms[id(client)] = self.model.now_ms
+        self.model.last_request_ms[id(client)] = self.model.now_ms
 
     @rule(data=st.data())
     @precondition(lambda self: self.clients)
     def disconnect(self, data: st.DataObject) -> None:
         client = self.clients.pop(data.draw(st.integers(0, len(self.clients) - 1)))
-        self.bench.device.disconnect(client, "it closed the connection")
+        self.bench.device.disconnect(client, "connection closed by the client")
         if self.model.holder is client:
-            self.model.lose()
+            self.model.release()
 
     @rule(data=st.data(), address=st.integers(0, 9), words=st.lists(WORD, min_size=1, max_size=5))
     @precondition(lambda self: self.clients)
@@ -151,8 +151,8 @@ class DeviceMachine(RuleBasedStateMachine):
 
     @rule(data=st.data(), pdu=st.binary(min_size=1, max_size=20))
     @precondition(lambda self: self.clients)
-    def read_or_nonsense(self, data: st.DataObject, pdu: bytes) -> None:
-        """Whatever it is, it is answered; functions that write are left to the rules above."""
+    def read_or_send_random_bytes(self, data: st.DataObject, pdu: bytes) -> None:
+        """Every request gets a response; functions that write are tested by the rules above."""
         client = data.draw(st.sampled_from(self.clients))
         if pdu[0] in (5, 6, 15, 16, 22, 23):
             pdu = b"\x03" + pdu[1:]
@@ -165,7 +165,7 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.now_ms += 1
             self.model.pass_time()
         for part in (ms // 2, ms - ms // 2):
-            # The device is looked after at its deadlines, as the edge does it.
+            # The device is checked at its deadlines, as the edge does.
             end_ns = self.bench.clock.monotonic_ns() + part * MS
             while (deadline_ns := self.bench.device.watchdog.deadline_ns) is not None and deadline_ns < end_ns:
                 self.bench.wait((deadline_ns - self.bench.clock.monotonic_ns()) / MS)
@@ -173,7 +173,7 @@ class DeviceMachine(RuleBasedStateMachine):
                 self.bench.wait(1)
 
     @invariant()
-    def the_device_is_as_the_model(self) -> None:
+    def device_equals_model(self) -> None:
         model, device = self.model, self.bench.device
         assert device.lease.holder is model.holder
         assert device.watchdog.tripped == model.tripped
@@ -186,7 +186,7 @@ class DeviceMachine(RuleBasedStateMachine):
             device.disconnect(reader, "done")
 
     @invariant()
-    def the_last_command_says_what_stands(self) -> None:
+    def last_command_equals_model(self) -> None:
         if self.bench.commands:
             command = self.bench.commands[-1]
             assert list(command.effort) == [_signed(word) / 1000 for word in self.model.torque]

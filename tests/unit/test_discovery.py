@@ -7,45 +7,45 @@ import pytest
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.process.discovery import ClockOffset, conflict, rosters, worst_offset
+from hilrig_runtime.process.discovery import ClockOffset, conflict, list_services, worst_offset
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import ManualClock
-from hilrig_schemas import Health, Roster
+from hilrig_schemas import Health, ServiceInfo
 from hilrig_schemas.topics import HEALTH, alive_key
 from support.waiting import eventually
 
 LAB = parse_lab("[rigs]\ncount = 6\n")
 
 
-def roster(service: str = "edge", instance: str = "1", age: int = 5, rigs: tuple[str, ...] = ("rig1",)) -> Roster:
-    return Roster(service=service, instance=instance, incarnation=100 - age, rigs=rigs, host="there")
+def info(service: str = "edge", instance: str = "1", age: int = 5, rigs: tuple[str, ...] = ("rig1",)) -> ServiceInfo:
+    return ServiceInfo(service=service, instance=instance, incarnation=100 - age, rigs=rigs, host="there")
 
 
 def test_an_elder_with_one_of_the_rigs_is_given_way_to() -> None:
-    own = roster(instance="2", age=1, rigs=("rig1", "rig2"))
-    assert conflict(own, [roster()]) == "edge/1 on there serves rig1 already; a rig has one edge (--rigs)"
+    own = info(instance="2", age=1, rigs=("rig1", "rig2"))
+    assert conflict(own, [info()]) == "edge/1 on there serves rig1 already; a rig has one edge (--rigs)"
     many = tuple(f"rig{number}" for number in range(1, 7))
-    assert "rig1, rig2, rig3 and 3 more" in conflict(roster(instance="2", age=1, rigs=many), [roster(rigs=many)])
+    assert "rig1, rig2, rig3 and 3 more" in conflict(info(instance="2", age=1, rigs=many), [info(rigs=many)])
 
 
 def test_an_elder_of_the_same_name_is_given_way_to() -> None:
-    own = roster(age=1, rigs=("rig2",))
-    assert "another edge is called '1' already: edge/1 on there" in conflict(own, [roster()])
+    own = info(age=1, rigs=("rig2",))
+    assert "another edge is called '1' already: edge/1 on there" in conflict(own, [info()])
 
 
 def test_nobody_else_is() -> None:
-    own = roster(age=3)
-    others = [own, roster("sim", age=9), roster(instance="2", age=9, rigs=("rig2",)), roster(instance="3", age=1)]
+    own = info(age=3)
+    others = [own, info("sim", age=9), info(instance="2", age=9, rigs=("rig2",)), info(instance="3", age=1)]
     assert conflict(own, others) == ""
 
 
 def test_of_two_of_the_same_age_exactly_one_goes_on() -> None:
-    one, other = roster(instance="1"), roster(instance="2")
+    one, other = info(instance="1"), info(instance="2")
     assert bool(conflict(one, [other])) != bool(conflict(other, [one]))
 
 
 def test_the_clock_that_differs_most_is_the_one_that_is_told() -> None:
-    near, far = roster("sim"), roster("recorder")
+    near, far = info("sim"), info("recorder")
     near.wall_ns, far.wall_ns = 1_010, 400
     assert worst_offset([near, far], 1, 1_000, 1_020) == ClockOffset("recorder/1", -610, 10)
     assert worst_offset([near], near.incarnation, 1_000, 1_020) == ClockOffset()
@@ -60,7 +60,7 @@ def test_services_with_rigs_of_their_own_run_side_by_side() -> None:
     with service(hub, "1", ("rig1", "rig2"), 1_000) as one, service(hub, "2", ("rig3",), 2_000) as other:
         one.ready()
         other.ready()
-        found = rosters(MemoryBus(hub), LAB.name)
+        found = list_services(MemoryBus(hub), LAB.name)
         assert [(each.instance, list(each.rigs)) for each in found] == [("1", ["rig1", "rig2"]), ("2", ["rig3"])]
         assert all(each.host and each.software_version for each in found)
 
@@ -71,13 +71,13 @@ def test_the_second_of_two_refuses_before_it_is_there() -> None:
         one.ready()
         with service(hub, "2", ("rig1",), 2_000) as other, pytest.raises(OperationError, match=r"edge/1 on .* serves"):
             other.ready()
-        assert MemoryBus(hub).alive(alive_key(LAB.name, "edge", "*")) == [alive_key(LAB.name, "edge", "1")]
+        assert MemoryBus(hub).get_liveliness(alive_key(LAB.name, "edge", "*")) == [alive_key(LAB.name, "edge", "1")]
 
 
 def test_an_elder_that_is_linked_a_moment_later_is_found_before_a_word_is_said() -> None:
     hub = MemoryHub()
     bus = MemoryBus(hub)
-    bus.settling_s = 2.0
+    bus.settle_timeout_s = 2.0
     later = Service("edge", LAB, bus, instance="2", rigs=("rig1",), clock=ManualClock(wall_ns=2_000))
     elders: list[Service] = []
     timer = threading.Timer(0.15, lambda: elders.append(service(hub, "1", ("rig1",), 1_000)))

@@ -1,4 +1,4 @@
-"""A table in a file gives back what was put in, in its order, and says where there is no room for it."""
+"""Disk-backed table: returns the rows in their order, and reports a full disk with the folder."""
 
 import errno
 import tempfile
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.disk_table import Spool
+from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.io.columns import Rows
 from hilrig_runtime.errors import OperationError
 
@@ -25,59 +25,59 @@ def rows(count: int, start: int = 0) -> Rows:
 
 
 @pytest.mark.parametrize("pieces", [(0,), (5,), (10,), (11,), (3, 4, 5, 6), (100,), (1,) * 35, (25, 0, 25)])
-def test_what_was_put_in_comes_back(pieces: tuple[int, ...]) -> None:
-    spool = Spool(ROW, block=10)
+def test_returns_the_rows_that_were_added(pieces: tuple[int, ...]) -> None:
+    table = DiskTable(ROW, block=10)
     whole = rows(sum(pieces))
     at = 0
     for piece in pieces:
-        spool.add(whole[at : at + piece])
+        table.add(whole[at : at + piece])
         at += piece
-        assert len(spool) == at
-    np.testing.assert_array_equal(spool[:], whole)
-    np.testing.assert_array_equal(spool[5:-5:2], whole[5:-5:2])
+        assert len(table) == at
+    np.testing.assert_array_equal(table[:], whole)
+    np.testing.assert_array_equal(table[5:-5:2], whole[5:-5:2])
     for name in ROW.names or ():
-        np.testing.assert_array_equal(spool[name], whole[name])
-        assert spool[name].dtype == ROW[name]
-    for block in spool.blocks("when", "small"):
+        np.testing.assert_array_equal(table[name], whole[name])
+        assert table[name].dtype == ROW[name]
+    for block in table.blocks("when", "small"):
         assert len(block) <= 10
         assert block.dtype.names == ("when", "small")
 
 
-def test_columns_can_be_gone_through_side_by_side_and_again() -> None:
-    spool, whole = Spool(ROW, block=7), rows(50)
-    spool.add(whole)
-    number, when = spool.column("number"), spool.column("when")
+def test_iterates_columns_in_parallel_and_repeatedly() -> None:
+    table, whole = DiskTable(ROW, block=7), rows(50)
+    table.add(whole)
+    number, when = table.column("number"), table.column("when")
     for _ in range(2):
         pairs = list(zip(number(), when(), strict=True))
         np.testing.assert_array_equal(np.concatenate([one for one, _ in pairs]), whole["number"])
         np.testing.assert_array_equal(np.concatenate([other for _, other in pairs]), whole["when"])
 
 
-def test_a_short_table_never_touches_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "TemporaryFile", lambda: pytest.fail("made a file"))
-    spool = Spool(ROW, block=10)
-    spool.add(rows(9))
-    assert len(spool["number"]) == 9
+def test_a_short_table_is_not_written_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda: pytest.fail("created a file"))
+    table = DiskTable(ROW, block=10)
+    table.add(rows(9))
+    assert len(table["number"]) == 9
 
 
-def test_no_room_is_said_with_the_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_a_full_disk_with_the_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
-    with pytest.raises(OperationError, match=r"No space left on device; TMPDIR names another") as said:
-        Spool(ROW, block=10).add(rows(30))
+    with pytest.raises(OperationError, match=r"No space left on device; set TMPDIR to another folder") as said:
+        DiskTable(ROW, block=10).add(rows(30))
     assert str(said.value).startswith(tempfile.gettempdir())
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
-def test_the_file_ends_with_the_table() -> None:
+def test_closes_the_file_with_the_table() -> None:
     def files() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))
 
     before = files()
-    spool = Spool(ROW, block=10)
-    spool.add(rows(30))
+    table = DiskTable(ROW, block=10)
+    table.add(rows(30))
     assert files() == before + 1
-    del spool
+    del table
     assert files() == before

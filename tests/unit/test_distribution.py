@@ -1,4 +1,4 @@
-"""Percentiles, means and deviations over blocks are those of all values together, exactly, whatever their number."""
+"""Statistics over blocks: percentiles, means and deviations equal those of all values together."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.disk_table import Blocks
-from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles, tail
+from hilrig_replay.analysis.distribution import Statistics, complementary_cdf, differences, median, percentiles
 
 SHARES = (0, 1, 5, 25, 50, 75, 95, 99, 99.9, 100)
 
@@ -23,7 +23,7 @@ def samples(kind: str, count: int) -> NDArray[np.int64]:
     random = np.random.default_rng(seed=count)
     values = {
         "spread": random.integers(0, 20_000_000, count),
-        # As loop latencies are: nearly all within microseconds of a step, and a stall.
+        # Like loop latencies: nearly all within microseconds of a step, and one stall.
         "crowded": np.append(20_000_000 + random.normal(0, 3000, count - 1), 4e9),
         "few": random.choice([0, 20_000_000, 40_000_000], count, p=[0.01, 0.98, 0.01]),
         "same": np.full(count, 12_500_000),
@@ -34,20 +34,20 @@ def samples(kind: str, count: int) -> NDArray[np.int64]:
 
 @pytest.mark.parametrize("count", [2, 3, 999, 20_000])
 @pytest.mark.parametrize("kind", ["spread", "crowded", "few", "same", "negative"])
-def test_percentiles_are_those_of_numpy_however_few_values_are_sorted_at_once(kind: str, count: int) -> None:
+def test_percentiles_equal_numpy_for_any_sorting_limit(kind: str, count: int) -> None:
     values = samples(kind, count)
     expected = np.percentile(values, SHARES)
-    for gathered in (1, 40, 3000, 1 << 18):
-        found = percentiles(in_blocks(values, 700), SHARES, gathered=gathered)
-        np.testing.assert_array_equal(found, expected, err_msg=f"{gathered} at once")
+    for max_sorted in (1, 40, 3000, 1 << 18):
+        found = percentiles(in_blocks(values, 700), SHARES, max_sorted=max_sorted)
+        np.testing.assert_array_equal(found, expected, err_msg=f"{max_sorted} sorted at once")
 
 
-def test_one_value_is_all_of_its_percentiles() -> None:
+def test_percentiles_of_one_value() -> None:
     assert percentiles(in_blocks(np.array([7]), 10), SHARES).tolist() == [7.0] * len(SHARES)
 
 
 @pytest.mark.parametrize("kind", ["spread", "crowded", "few", "same"])
-def test_statistics_of_blocks_are_those_of_all_values(kind: str) -> None:
+def test_statistics_of_blocks_equal_those_of_all_values(kind: str) -> None:
     values = samples(kind, 5000)
     whole, found = Statistics.of(values), Statistics.of(in_blocks(values, 333))
     assert (found.p50, found.p95, found.p99, found.p999, found.max) == (
@@ -61,7 +61,7 @@ def test_statistics_of_blocks_are_those_of_all_values(kind: str) -> None:
     assert found.std == pytest.approx(values.std() / 1e6, rel=1e-9, abs=1e-12)
 
 
-def test_differences_go_on_across_blocks_and_empty_ones() -> None:
+def test_differences_cross_block_boundaries() -> None:
     values = samples("spread", 100)
     pieces = [values[:1], values[1:1], values[1:60], values[60:60], values[60:]]
     found = np.concatenate(list(differences(lambda: iter(pieces))()))
@@ -71,9 +71,9 @@ def test_differences_go_on_across_blocks_and_empty_ones() -> None:
 
 
 @pytest.mark.parametrize("kind", ["spread", "crowded", "few"])
-def test_a_tail_says_which_share_is_not_below(kind: str) -> None:
+def test_ccdf_is_the_share_of_values_not_below(kind: str) -> None:
     values = samples(kind, 5000)
-    at, share = tail(in_blocks(values, 700))
+    at, share = complementary_cdf(in_blocks(values, 700))
     assert (at[0], at[-1]) == (values.min(), values.max())
     assert (share[0], share[-1]) == (1.0, 1 / len(values))
     assert (np.diff(share) <= 0).all()
@@ -81,6 +81,6 @@ def test_a_tail_says_which_share_is_not_below(kind: str) -> None:
         assert share[number] == pytest.approx((values >= at[number]).mean(), abs=1 / len(values)), at[number]
 
 
-def test_a_tail_of_values_that_are_the_same_is_a_point() -> None:
-    at, share = tail(in_blocks(samples("same", 10), 3))
+def test_ccdf_of_equal_values_is_a_point() -> None:
+    at, share = complementary_cdf(in_blocks(samples("same", 10), 3))
     assert (at.tolist(), share.tolist()) == ([12_500_000.0], [1.0])

@@ -1,4 +1,4 @@
-"""The arm's physics against engines that others wrote, MuJoCo and Pinocchio, on the URDF that hilrig generates."""
+"""Tests of the dynamics against the independent engines MuJoCo and Pinocchio, with the generated URDF."""
 
 from dataclasses import replace
 from typing import Any
@@ -67,7 +67,7 @@ class MuJoCo:
 
 
 class Pinocchio:
-    """The same by Pinocchio."""
+    """Forward dynamics, tool pose and Jacobian by Pinocchio."""
 
     def __init__(self, arm: ArmParameters) -> None:
         self._arm = arm
@@ -102,7 +102,7 @@ class Pinocchio:
 
 
 @pytest.mark.parametrize("engine", [MuJoCo, Pinocchio])
-def test_reduced_form_and_recursion_accelerate_as_the_engine_does(engine: type[MuJoCo] | type[Pinocchio]) -> None:
+def test_both_dynamics_models_equal_the_engine(engine: type[MuJoCo] | type[Pinocchio]) -> None:
     rng = np.random.default_rng(20211209)
     worst_reduced = worst_general = 0.0
     for case in range(CASES):
@@ -124,20 +124,20 @@ def test_reduced_form_and_recursion_accelerate_as_the_engine_does(engine: type[M
 
 
 def plant_on_a_stop(rng: np.random.Generator, joint: int, step_ns: int) -> tuple[Plant, Any, Floats]:
-    """A plant that holds something, joint 1 or 2 at its upper stop; Pinocchio's model of it; and an effort."""
+    """Return a plant with payload and joint 1 or 2 at its upper stop, its Pinocchio model, and an effort."""
     arm, payload = replace(random_arm(rng), external_force_z=0.0, external_torque_z=0.0), rng.uniform(0, 2)
     peer = Pinocchio(arm)
     peer.hold(payload)
     position, velocity, effort = random_state(rng, arm)
     position[joint] = arm.upper[joint]
     plant = Plant([RigParameters(arm=arm, sim=StepParameters(step_ns=step_ns), scene=NOTHING_BELOW)])
-    plant.place(0, position, velocity)
+    plant.set_state(0, position, velocity)
     plant.dynamics.set_payload(np.array([payload]))
     return plant, peer, effort
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-def test_an_impact_at_a_stop_is_pinocchios_inelastic_impact_along_that_joint(joint: int) -> None:
+def test_impact_at_stop_equals_pinocchio_impulse_dynamics(joint: int) -> None:
     rng = np.random.default_rng(1914)
     for _ in range(50):
         plant, peer, effort = plant_on_a_stop(rng, joint, step_ns=1)
@@ -150,7 +150,7 @@ def test_an_impact_at_a_stop_is_pinocchios_inelastic_impact_along_that_joint(joi
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-def test_what_is_pressed_onto_a_stop_leaves_the_rest_an_arm_with_that_joint_locked(joint: int) -> None:
+def test_joint_pressed_at_stop_equals_locked_joint(joint: int) -> None:
     rng, step_ns, pressed = np.random.default_rng(1687), 100, 0
     for _ in range(50):
         plant, peer, effort = plant_on_a_stop(rng, joint, step_ns)
@@ -173,7 +173,7 @@ def test_what_is_pressed_onto_a_stop_leaves_the_rest_an_arm_with_that_joint_lock
     assert pressed > 30
 
 
-def test_reduced_form_is_the_recursion_with_point_masses() -> None:
+def test_reduced_model_equals_recursion_with_point_masses() -> None:
     rng = np.random.default_rng(31)
     for _ in range(CASES):
         arm, payload = random_arm(rng), rng.uniform(0, 2)
@@ -185,7 +185,7 @@ def test_reduced_form_is_the_recursion_with_point_masses() -> None:
         )
 
 
-def test_recursion_with_any_masses_and_inertias_is_pinocchios() -> None:
+def test_recursion_with_any_inertia_equals_pinocchio() -> None:
     rng = np.random.default_rng(5)
     for case in range(CASES):
         if case % 10 == 0:
@@ -194,9 +194,9 @@ def test_recursion_with_any_masses_and_inertias_is_pinocchios() -> None:
         links = []
         for index, link in enumerate(newton_euler.scara_links(arm)):
             root = rng.normal(size=(3, 3))
-            mass, centre, inertia = rng.uniform(0.1, 3), rng.normal(size=3) * 0.1, root @ root.T * 0.01
-            links.append(replace(link, mass=mass, centre=centre, inertia=inertia, friction=0.0))
-            model.inertias[index + 1] = pinocchio.Inertia(mass, centre, inertia)
+            mass, center, inertia = rng.uniform(0.1, 3), rng.normal(size=3) * 0.1, root @ root.T * 0.01
+            links.append(replace(link, mass=mass, center=center, inertia=inertia, friction=0.0))
+            model.inertias[index + 1] = pinocchio.Inertia(mass, center, inertia)
         position, velocity, _ = random_state(rng, arm)
         acceleration = rng.uniform(-10, 10, 4)
         expected = pinocchio.rnea(model, model.createData(), position, velocity, acceleration)
@@ -207,19 +207,19 @@ def test_recursion_with_any_masses_and_inertias_is_pinocchios() -> None:
 
 
 @pytest.mark.parametrize("engine", [MuJoCo, Pinocchio])
-def test_tool_is_where_the_engine_has_it(engine: type[MuJoCo] | type[Pinocchio]) -> None:
+def test_tool_pose_equals_the_engine(engine: type[MuJoCo] | type[Pinocchio]) -> None:
     rng = np.random.default_rng(7)
     for _ in range(20):
         arm = random_arm(rng)
         position, _, _ = random_state(rng, arm)
         x, y, z, yaw = kinematics.forward(arm, position)
-        place, rotation = engine(arm).tool(position)
-        np.testing.assert_allclose((x, y, z), place, atol=1e-12)
+        expected_position, rotation = engine(arm).tool(position)
+        np.testing.assert_allclose((x, y, z), expected_position, atol=1e-12)
         expected = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
         np.testing.assert_allclose(rotation, expected, atol=1e-12)
 
 
-def test_jacobian_is_pinocchios() -> None:
+def test_jacobian_equals_pinocchio() -> None:
     rng = np.random.default_rng(11)
     for _ in range(20):
         arm = random_arm(rng)
@@ -227,7 +227,7 @@ def test_jacobian_is_pinocchios() -> None:
         np.testing.assert_allclose(kinematics.jacobian(arm, position), Pinocchio(arm).jacobian(position), atol=1e-12)
 
 
-def test_urdf_says_limits_friction_and_masses_of_the_arm() -> None:
+def test_urdf_has_limits_friction_and_masses_of_the_arm() -> None:
     arm = ArmParameters()
     model = Pinocchio(arm).model
     np.testing.assert_allclose(model.lowerPositionLimit, arm.lower)

@@ -209,7 +209,7 @@ def test_command_prints_paths_and_does_not_overwrite(recording: Path, tmp_path: 
     assert "exists" in again.stderr
     nothing = hilrig("export", recording)
     assert nothing.returncode == 2
-    assert "nothing to write" in nothing.stderr
+    assert "no output given" in nothing.stderr
 
 
 def test_runs_json_lists_existing_paths(recording: Path) -> None:

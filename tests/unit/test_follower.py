@@ -35,7 +35,7 @@ class Watched:
 
     def serve(self) -> None:
         config = RigConfig(rig="rig1", step_ns=20_000_000, parameters_json=PARAMETERS.to_json(), urdf=urdf(PARAMETERS))
-        self.bus.serve(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
+        self.bus.declare_queryable(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
 
     def send(self, made: list[Made]) -> None:
         for one in made:

@@ -1,4 +1,4 @@
-"""Grades of motions that are known: a step response, a path with a known distance, parts placed in and out of time."""
+"""Grades of known motions: a step response, a path with a known distance, parts placed in time and late."""
 
 import math
 from pathlib import Path
@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.summary import summarise
+from hilrig_replay.analysis.summary import summarize
 from hilrig_replay.grading.grade import Grade, Grader
-from hilrig_replay.grading.placement import PlacedPart, TaskResult
-from hilrig_replay.grading.task_loading import check_task, read_task, task_of
+from hilrig_replay.grading.placement import PartPlacement, PlacementReport
+from hilrig_replay.grading.task_loading import load_task, recorded_task, validate_task
 from hilrig_replay.io.run import open_run
 from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.lab import parse_lab
@@ -26,7 +26,7 @@ STEP_RESPONSE = {"poses": [{"name": "a", "position_mm": [400, 0, 0], "tolerance_
 def graded(
     task: dict, tip: np.ndarray, *, pieces: int = 1, quiet: int = 0, drops: dict[str, float] | None = None
 ) -> Grade:
-    """Grade a way of the tool, m, (n, 3), one state a step; the first `quiet` states are before any command."""
+    """Grade a tool path, m, (n, 3), one state per step; the first `quiet` states are before the first command."""
     grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
     time_s = STEP_S * np.arange(len(tip))
     pose = np.column_stack((tip, np.zeros(len(tip))))
@@ -35,12 +35,14 @@ def graded(
         grader.add_states(time_s[rows], pose[rows], commanded[rows])
     for part, at_s in (drops or {}).items():
         grader.add_drop(part, at_s)
-    stood = TaskResult((PlacedPart("red", 0, 0.5), PlacedPart("blue", 1, 3.0), PlacedPart("green", None, None)))
-    return grader.grade(stood)
+    placement = PlacementReport(
+        (PartPlacement("red", 0, 0.5), PartPlacement("blue", 1, 3.0), PartPlacement("green", None, None))
+    )
+    return grader.grade(placement)
 
 
 def second_order(damping: float, rate: float, seconds: float, goal: float = 0.4, start: float = 0.2) -> np.ndarray:
-    """Step response along x from `start` to `goal`, m: the textbook's."""
+    """Step response along x from `start` to `goal`, m."""
     t = np.arange(0, seconds, STEP_S)
     damped = rate * math.sqrt(1 - damping**2)
     wave = np.cos(damped * t) + damping / math.sqrt(1 - damping**2) * np.sin(damped * t)
@@ -49,7 +51,7 @@ def second_order(damping: float, rate: float, seconds: float, goal: float = 0.4,
 
 
 @pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
-def test_overshoot_and_settling_time_are_the_textbooks(damping: float) -> None:
+def test_overshoot_and_settling_time_match_theory(damping: float) -> None:
     rate = 5.0
     (pose,) = graded(STEP_RESPONSE, second_order(damping, rate, 8.0)).poses
     overshoot = math.exp(-math.pi * damping / math.sqrt(1 - damping**2))
@@ -57,7 +59,7 @@ def test_overshoot_and_settling_time_are_the_textbooks(damping: float) -> None:
     assert pose.overshoot_mm == pytest.approx(200 * overshoot, abs=2)
     assert pose.settling_s is not None
     assert pose.reached_s == pytest.approx(pose.settling_s + 0.3, abs=STEP_S + 1e-9)
-    # From then on the response stays within 2 % (4 mm of 200 mm); one step before it did not.
+    # The response stays within 2 % (4 mm of 200 mm) from the settling time on, but not one step earlier.
     apart = np.abs(second_order(damping, rate, 8.0)[:, 0] - 0.4)
     settled = round(pose.settling_s / STEP_S)
     assert (apart[settled:] <= 0.004).all()
@@ -71,7 +73,7 @@ def test_time_counts_from_the_first_command() -> None:
     assert graded(STEP_RESPONSE, way, quiet=len(way)).poses[0].turn_s is None
 
 
-def test_poses_have_their_turns_one_after_the_other() -> None:
+def test_poses_are_targets_in_sequence() -> None:
     poses = [
         {"name": name, "position_mm": [x, 0, 0], "hold_s": 0.2} for name, x in (("a", 300), ("b", 200), ("c", 250))
     ]
@@ -85,7 +87,7 @@ def test_poses_have_their_turns_one_after_the_other() -> None:
     assert grade.done_s is None
 
 
-def test_a_yaw_that_is_asked_for_counts_and_turns_are_the_same() -> None:
+def test_checks_yaw_modulo_a_full_turn() -> None:
     task = {"poses": [{"name": "a", "position_mm": [200, 0, 0], "yaw_deg": 370, "hold_s": 0.1}]}
     grader = Grader(TaskConfig.model_validate(task), PARAMETERS)
     pose = np.tile([0.2, 0, 0, math.radians(-180.0)], (50, 1))
@@ -99,7 +101,7 @@ SQUARE = [[200, 0, 0], [300, 0, 0], [300, 100, 0], [200, 100, 0], [200, 0, 0]]
 
 
 def along(points_mm: list[list[float]], speed: float, aside_mm: float = 0.0) -> np.ndarray:
-    """A way of the tool along a polyline, `aside_mm` above it."""
+    """A tool path along a polyline, `aside_mm` above it."""
     points = np.array(points_mm) / 1000
     from_start = np.concatenate(([0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     at = np.append(np.arange(0, from_start[-1], speed * STEP_S), from_start[-1])
@@ -107,7 +109,7 @@ def along(points_mm: list[list[float]], speed: float, aside_mm: float = 0.0) -> 
     return np.asarray(way + np.array([0, 0, aside_mm / 1000]))
 
 
-def test_the_tracking_error_of_a_path_is_the_distance_from_it() -> None:
+def test_tracking_error_is_the_distance_from_the_path() -> None:
     grade = graded({"path": {"points_mm": SQUARE}}, along(SQUARE, 0.1, aside_mm=2.0))
     assert grade.path is not None
     assert grade.path.length_m == pytest.approx(0.4)
@@ -116,22 +118,22 @@ def test_the_tracking_error_of_a_path_is_the_distance_from_it() -> None:
     assert grade.path.done_s == pytest.approx(4.0, abs=0.1)
 
 
-def test_a_path_that_is_left_or_cut_short_is_not_followed() -> None:
+def test_unfinished_path_counts_by_its_covered_share() -> None:
     half = along(SQUARE[:3], 0.1)
     grade = graded({"path": {"points_mm": SQUARE}}, half)
     assert grade.path is not None
     assert grade.path.covered == pytest.approx(0.5, abs=0.02)
     assert (grade.path.done_s, grade.score) == (None, grade.path.covered)
-    # Back to the beginning across the middle: at its last point, but half of it was never passed.
+    # Back to the start across the middle: at the last point, but half of the path is not covered.
     across = np.concatenate((half, np.linspace(half[-1], half[0], 20)))
     assert graded({"path": {"points_mm": SQUARE}}, across).path.done_s is None
     never = graded({"path": {"points_mm": SQUARE}}, half + np.array([0, 0, 0.05])).path
     assert (never.began_s, never.rms_mm) == (None, None)
 
 
-def test_where_a_path_comes_back_to_itself_nothing_is_passed_by_standing_there() -> None:
+def test_waiting_at_a_closed_path_covers_nothing() -> None:
     corner = np.array(SQUARE[0]) / 1000
-    # A little off its beginning the tool is nearest to the first side, or to the last one.
+    # Close to the start, the nearest point is on the first side or on the last side.
     sides = [(np.array(SQUARE[1]) / 1000 - corner) * 0.01, (np.array(SQUARE[-2]) / 1000 - corner) * 0.01]
     standing = np.array([corner + sides[state % 2] for state in range(40)])
     path = graded({"path": {"points_mm": SQUARE}}, standing).path
@@ -141,7 +143,7 @@ def test_where_a_path_comes_back_to_itself_nothing_is_passed_by_standing_there()
     assert path.done_s is None
 
 
-def test_the_tracking_error_ends_where_the_tool_leaves_the_path_for_good() -> None:
+def test_tracking_error_ignores_motion_after_the_path() -> None:
     away = np.linspace([0.3, 0.1, 0.002], [0.3, 0.5, 0.3], 40)
     way = np.concatenate((along(SQUARE[:3], 0.1, aside_mm=2.0), away))
     path = graded({"path": {"points_mm": SQUARE}}, way).path
@@ -151,7 +153,7 @@ def test_the_tracking_error_ends_where_the_tool_leaves_the_path_for_good() -> No
     assert path.largest_mm < 6.0
 
 
-def test_a_short_path_may_be_passed_in_a_few_states() -> None:
+def test_covers_a_short_path_in_a_few_states() -> None:
     short = [[376, 137, 25], [376, 137, -28]]
     way = along(short, 0.7)
     assert len(way) < 6
@@ -160,14 +162,14 @@ def test_a_short_path_may_be_passed_in_a_few_states() -> None:
     assert path.done_s is not None
 
 
-def test_nothing_less_than_all_is_a_hundred_per_cent() -> None:
+def test_only_a_complete_task_is_100_percent() -> None:
     poses = [{"name": f"p{number}", "position_mm": [200 + number, 0, 0], "hold_s": 0.02} for number in range(99)]
     grade = graded({"poses": poses, "path": {"points_mm": SQUARE}}, np.tile([0.2, 0.0, 0.0], (30, 1)))
     assert grade.percent < 100
     assert graded({"poses": poses[:1]}, np.tile([0.2, 0.0, 0.0], (30, 1))).percent == 100
 
 
-def test_a_grade_does_not_depend_on_the_pieces_in_which_a_run_is_read() -> None:
+def test_grade_does_not_depend_on_the_block_size() -> None:
     task = {
         "poses": [
             {"name": "a", "position_mm": [300, 0, 0]},
@@ -186,7 +188,7 @@ def test_a_grade_does_not_depend_on_the_pieces_in_which_a_run_is_read() -> None:
         assert parts.rank == pytest.approx(whole.rank)
 
 
-def test_parts_count_when_they_were_let_go_in_time_and_stand_right() -> None:
+def test_parts_count_if_placed_correctly_in_time() -> None:
     way, task = np.zeros((10, 3)), {"place": {"parts": ["red", "blue", "green"]}, "time_limit_s": 10}
     in_time = graded(task, way, drops={"red": 4.0, "blue": 5.0, "green": 6.0})
     assert [part.placed for part in in_time.parts] == [True, False, False]
@@ -197,7 +199,7 @@ def test_parts_count_when_they_were_let_go_in_time_and_stand_right() -> None:
     assert only.headline() == "passed in 4.0 s of 10 s"
 
 
-def test_what_comes_after_the_time_limit_does_not_count() -> None:
+def test_motion_after_the_time_limit_does_not_count() -> None:
     task = STEP_RESPONSE | {"time_limit_s": 0.5}
     grade = graded(task, second_order(0.7, 5.0, 6.0))
     assert (grade.score, grade.headline()) == (0.0, "0 of 1 goals within 0.5 s")
@@ -215,12 +217,12 @@ parts = ["red"]
 """
 
 
-def test_a_recording_is_graded_by_the_task_that_it_carries(tmp_path: Path) -> None:
+def test_grades_by_the_recorded_task(tmp_path: Path) -> None:
     script = Script(seconds=6.0)
     made = make(script)
     text = TASK.format(x=400, y=100, z=50)
     path = write(tmp_path / "run.mcap", made, script=script, lab_toml=text)
-    summary = summarise(open_run(path))
+    summary = summarize(open_run(path))
     assert summary.grade is not None
     assert summary.grade.poses[0].reached_s is not None
     assert summary.grade.score == 0.5
@@ -229,15 +231,15 @@ def test_a_recording_is_graded_by_the_task_that_it_carries(tmp_path: Path) -> No
     page = build_report([path]).html
     assert "Two corners" in page
     assert "1 of 2 goals" in page
-    # A teacher's other task, given afterwards.
+    # Another task, given later.
     lab = tmp_path / "other.toml"
     lab.write_text("[[task.poses]]\nname = 'far'\nposition_mm = [-300, 0, 0]\n")
-    other = summarise(open_run(path), read_task(lab)).grade
+    other = summarize(open_run(path), load_task(lab)).grade
     assert other is not None
     assert other.score == 0.0
 
 
-def test_runs_of_a_class_are_ranked_by_their_grades(tmp_path: Path) -> None:
+def test_ranks_runs_by_grade(tmp_path: Path) -> None:
     script = Script(seconds=4.0)
     paths = []
     for name, x in (("never", -400), ("first", 400)):
@@ -263,31 +265,34 @@ def test_runs_of_a_class_are_ranked_by_their_grades(tmp_path: Path) -> None:
         ("[task.path]\npoints_mm = [[1, 2, 3], [1, 2, 3]]", "points 1 and 2 of the path are the same"),
         ("[task.place]\ntolerance_mm = 0", "task.place.tolerance_mm: expected greater than 0, found 0"),
         ("[task]\nlimit = 3\n[task.place]", "task.limit: unknown key"),
-        ("[[task.poses]]\nname = 'a'\nposition_mm = [900, 0, 0]", "task: pose 'a' can't be reached: "),
+        ("[[task.poses]]\nname = 'a'\nposition_mm = [900, 0, 0]", "task: pose 'a' is out of reach: "),
         ("[task.path]\npoints_mm = [[300, 0, 0], [700, 0, 0]]", "point 2 of the path, (700, 0, 0) mm, is out of reach"),
         ("[task.path]\npoints_mm = [[300, 0, 0], [300, 0, 400]]", "point 2 of the path, (300, 0, 400) mm, is out of"),
-        ("[task.place]\nparts = ['pink']", "no part 'pink' that the magnet holds is in the scene; it has red, blue"),
+        (
+            "[task.place]\nparts = ['pink']",
+            "no ferromagnetic part 'pink' in the scene; its ferromagnetic parts: red",
+        ),
     ],
 )
-def test_a_task_that_can_not_be_done_is_named_with_its_place(text: str, says: str) -> None:
+def test_rejects_an_invalid_task_with_its_key(text: str, says: str) -> None:
     def check() -> None:
         task = parse_lab(text).task
         assert task is not None
-        check_task(task, PARAMETERS)
+        validate_task(task, PARAMETERS)
 
     with pytest.raises(InputError) as refused:
         check()
     assert says in str(refused.value)
 
 
-def test_a_recorded_task_that_is_not_understood_is_said(tmp_path: Path) -> None:
+def test_reports_an_invalid_recorded_task(tmp_path: Path) -> None:
     script = Script(seconds=1.0)
-    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml="[task]\ncolour = 'red'\n[task.place]\n")
-    with pytest.raises(InputError, match=r"the task in its lab.toml is not understood: colour: unknown key"):
-        task_of(open_run(path))
+    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml="[task]\nshade = 'red'\n[task.place]\n")
+    with pytest.raises(InputError, match=r"recorded lab\.toml: invalid task: shade: unknown key"):
+        recorded_task(open_run(path))
 
 
-def test_a_run_that_can_not_be_read_does_not_hide_the_others(tmp_path: Path) -> None:
+def test_report_skips_an_unreadable_run(tmp_path: Path) -> None:
     script, silent = Script(seconds=1.0), Script(seconds=1.0, controllers=False)
     good = write(tmp_path / "good.mcap", make(script), script=script)
     torn = tmp_path / "torn.mcap"
@@ -302,7 +307,7 @@ def test_a_run_that_can_not_be_read_does_not_hide_the_others(tmp_path: Path) -> 
         build_report([torn, torn])
 
 
-def test_where_nobody_wrote_no_goal_is_reached(tmp_path: Path) -> None:
+def test_no_goal_is_reached_without_commands(tmp_path: Path) -> None:
     silent = Script(seconds=1.0, controllers=False)
     path = write(tmp_path / "alone.mcap", make(silent), script=silent)
     task = parse_lab("[[task.poses]]\nname = 'a'\nposition_mm = [300, 0, 0]\n").task

@@ -1,4 +1,4 @@
-"""A device whose loop is impaired, in virtual time: stamps that add up, and a watchdog that nothing holds up."""
+"""Unit tests of a device with network impairment, in simulated time: timestamps, delays, losses and safety."""
 
 import json
 import struct
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, MAGNET_COIL
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_schemas import Event, TorqueCommand
 from support.device_bench import MS, Bench
@@ -25,15 +26,15 @@ KINDS = {
 
 
 def impaired(**impairment: Any) -> Bench:
-    """A device with a state, that is impaired so from its start."""
+    """Return a device with a state and this impairment from its start."""
     bench = Bench(impairment=ImpairmentConfig.model_validate(impairment))
     bench.state(1)
-    bench.device.begin()
+    bench.device.start()
     return bench
 
 
-def let_pass(bench: Bench, ms: float) -> None:
-    """Let time pass as the edge does: commands leave at their moments."""
+def advance(bench: Bench, ms: float) -> None:
+    """Advance the clock as the edge does: delayed commands are sent at their deadlines."""
     end_ns = bench.clock.monotonic_ns() + round(ms * MS)
     while bench.sends and min(bench.sends) <= end_ns:
         bench.clock.sleep_until_ns(min(bench.sends))
@@ -43,54 +44,54 @@ def let_pass(bench: Bench, ms: float) -> None:
     bench.device.check(end_ns)
 
 
-def words_of(bench: Bench) -> list[TorqueCommand]:
-    """Commands of controllers, the edge's own word left out."""
+def client_commands(bench: Bench) -> list[TorqueCommand]:
+    """Return the commands of clients, without internal commands."""
     return [command for command in bench.commands if command.controller]
 
 
 def run_loop(bench: Bench, client: Client, steps: int, step_ms: float = 20.0) -> None:
-    """A state a step, and a controller that reads a moment later and writes what it read as a torque."""
+    """Publish one state per step; the client reads it a moment later and writes it as a torque."""
     for step in range(2, steps + 2):
         bench.state(step, position=(step * 1e-4, 0, 0, 0))
-        let_pass(bench, 0.3)
+        advance(bench, 0.3)
         positions = bench.read(client, 4, 4)
-        let_pass(bench, 0.2)
+        advance(bench, 0.2)
         bench.write(client, 0, positions[0] & 0x7FFF, 0, 0, 0)
-        let_pass(bench, step_ms - 0.5)
-    let_pass(bench, 1000)
+        advance(bench, step_ms - 0.5)
+    advance(bench, 1000)
 
 
-def assert_stages_hold(command: TorqueCommand) -> None:
-    """Each stage of docs/timing.md that the edge measures is no less than nothing."""
+def assert_stages_not_negative(command: TorqueCommand) -> None:
+    """Check that each latency stage of docs/timing.md that the edge measures is not negative."""
     assert command.state_served_ns - command.state_arrived_ns - command.state_injected_ns >= 0
     assert command.write_arrived_ns - command.state_served_ns >= 0
     assert command.sent_ns - command.write_arrived_ns - command.command_injected_ns >= 0
 
 
-# -- injected is what was asked for
+# -- distribution of the injected delay
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("way", ["state", "command"])
-def test_injected_is_distributed_as_asked(kind: str, way: str) -> None:
-    """At a step of 100 ms nothing is overtaken, so what is measured is the whole distribution.
+@pytest.mark.parametrize("link", ["state", "command"])
+def test_injected_delay_has_configured_distribution(kind: str, link: str) -> None:
+    """At a step of 100 ms no message is superseded, so the measured distribution is complete.
 
-    A state is shown when its delay has passed; the controller here looks 99 ms after each, so that all have.
+    A state is served when its delay has passed; the client reads 99 ms after each state, later than any delay.
     """
-    bench = impaired(**{way: kind}, seed=4)
+    bench = impaired(**{link: kind}, seed=4)
     client = bench.connect()
     for step in range(2, 1002):
         bench.state(step)
-        let_pass(bench, 99)
+        advance(bench, 99)
         bench.read(client, 4, 4)
         bench.write(client, 0, step & 0x7FFF, 0, 0, 0)
-        let_pass(bench, 1)
-    let_pass(bench, 100)
-    commands = words_of(bench)
+        advance(bench, 1)
+    advance(bench, 100)
+    commands = client_commands(bench)
     for command in commands:
-        assert_stages_hold(command)
-    injected = np.array([getattr(command, f"{way}_injected_ns") for command in commands]) / 1e6
-    other = "command" if way == "state" else "state"
+        assert_stages_not_negative(command)
+    injected = np.array([getattr(command, f"{link}_injected_ns") for command in commands]) / 1e6
+    other = "command" if link == "state" else "state"
     assert not any(getattr(command, f"{other}_injected_ns") for command in commands)
     assert len(injected) == 1000
     if KINDS[kind] is None:
@@ -101,47 +102,47 @@ def test_injected_is_distributed_as_asked(kind: str, way: str) -> None:
         assert len(set(injected)) > 900
 
 
-def test_a_trace_is_injected_in_its_order() -> None:
+def test_trace_is_injected_in_its_order() -> None:
     trace = [3.0, 11.0, 5.5, 9.25, 1.0, 30.0, 2.0]
     bench = impaired(command={"delay": {"kind": "trace", "delays_ms": trace}})
     client = bench.connect()
     run_loop(bench, client, 21, step_ms=50)
-    injected = [command.command_injected_ns / 1e6 for command in words_of(bench)]
+    injected = [command.command_injected_ns / 1e6 for command in client_commands(bench)]
     start = trace.index(injected[0])
     assert injected == [trace[(start + index) % len(trace)] for index in range(21)]
 
 
-def test_a_command_leaves_at_the_end_of_its_delay_and_not_before() -> None:
+def test_command_is_sent_exactly_after_its_delay() -> None:
     bench = impaired(command="constant:30")
     client = bench.connect()
     bench.write(client, 0, 1000)
-    asked_ns = bench.clock.monotonic_ns()
-    let_pass(bench, 29)
-    assert not words_of(bench)
-    let_pass(bench, 2)
-    [command] = words_of(bench)
-    assert (command.sent_ns, command.command_injected_ns) == (asked_ns + 30 * MS, 30 * MS)
+    written_ns = bench.clock.monotonic_ns()
+    advance(bench, 29)
+    assert not client_commands(bench)
+    advance(bench, 2)
+    [command] = client_commands(bench)
+    assert (command.sent_ns, command.command_injected_ns) == (written_ns + 30 * MS, 30 * MS)
     assert list(command.effort) == [1.0, 0.0, 0.0, 0.0]
 
 
-def test_the_controller_reads_back_what_it_wrote_at_once() -> None:
+def test_client_reads_back_its_delayed_write_at_once() -> None:
     bench = impaired(command="constant:30")
     client = bench.connect()
     bench.write(client, 0, 1000)
     assert bench.read(client, 0, 1) == [1000]
 
 
-def test_a_reader_is_shown_the_newest_state_that_has_arrived() -> None:
+def test_reader_is_served_the_newest_delivered_state() -> None:
     bench = impaired(state="constant:45")
     client = bench.connect()
     for step in range(2, 8):
         bench.state(step, position=(step * 1e-2, 0, 0, 0))
-        let_pass(bench, 20)
-    # Step 7 came 20 ms ago, 6 40 ms, 5 60 ms.
+        advance(bench, 20)
+    # Step 7 arrived 20 ms ago, step 6 40 ms ago, step 5 60 ms ago.
     [first, *_] = bench.read(client, 4, 4)
     assert first == round(np.degrees(5e-2) * 100)
     bench.write(client, 0, 1)
-    [command] = words_of(bench)
+    [command] = client_commands(bench)
     assert command.basis_step == 5
     assert command.state_injected_ns == 45 * MS
     assert command.state_served_ns - command.state_arrived_ns == 60 * MS
@@ -153,24 +154,24 @@ def test_a_reader_is_shown_the_newest_state_that_has_arrived() -> None:
     seed=st.integers(0, 1000),
     step_ms=st.sampled_from([1.0, 5.0, 20.0]),
 )
-def test_whatever_happens_stages_hold_and_numbers_grow(preset: str, seed: int, step_ms: float) -> None:
+def test_stages_not_negative_and_numbers_increase(preset: str, seed: int, step_ms: float) -> None:
     bench = impaired(preset=preset, seed=seed)
     client = bench.connect()
     run_loop(bench, client, 60, step_ms)
     numbers = [command.seq for command in bench.commands]
     assert numbers == sorted(set(numbers))
-    for command in words_of(bench):
-        assert_stages_hold(command)
-    status = bench.device.impaired.status()
+    for command in client_commands(bench):
+        assert_stages_not_negative(command)
+    status = bench.device.impairment.status()
     assert status.commands == 60
-    assert len(words_of(bench)) == status.commands - status.commands_lost - status.commands_overtaken
+    assert len(client_commands(bench)) == status.commands - status.commands_lost - status.commands_superseded
 
 
-def test_the_same_seed_gives_the_same_delays_in_each_session() -> None:
+def test_same_seed_gives_same_delays_in_each_session() -> None:
     def injected(bench: Bench, client: Client) -> list[tuple[int, int]]:
-        before = len(words_of(bench))
+        before = len(client_commands(bench))
         run_loop(bench, client, 30)
-        return [(command.state_injected_ns, command.command_injected_ns) for command in words_of(bench)[before:]]
+        return [(command.state_injected_ns, command.command_injected_ns) for command in client_commands(bench)[before:]]
 
     bench = impaired(command="gamma:8,2", seed=11)
     first, second = bench.connect(host="10.0.0.1"), bench.connect(host="10.0.0.2", port=2)
@@ -185,160 +186,156 @@ def test_the_same_seed_gives_the_same_delays_in_each_session() -> None:
 # -- safety
 
 
-def test_the_watchdogs_zero_is_not_held_up_and_voids_what_is_on_its_way() -> None:
+def test_watchdog_zero_is_not_delayed_and_drops_commands() -> None:
     bench = impaired(command="constant:1500")
     client = bench.connect()
     bench.write(client, 0, 1000)
     tripped_at_ns = bench.clock.monotonic_ns() + 1000 * MS
-    let_pass(bench, 999)
+    advance(bench, 999)
     assert "WATCHDOG_TRIP" not in bench.kinds()
-    let_pass(bench, 1)
+    advance(bench, 1)
     last = bench.commands[-1]
     assert (list(last.effort), last.safe, last.sent_ns) == ([0.0] * 4, True, tripped_at_ns)
     assert last.command_injected_ns == 0
-    let_pass(bench, 3000)
-    assert not words_of(bench), "the torque of a controller that is gone comes no more"
-    assert bench.device.impaired.status().commands_overtaken == 1
+    advance(bench, 3000)
+    assert not client_commands(bench), "the delayed torque must not be sent after the trip"
+    assert bench.device.impairment.status().commands_superseded == 1
 
 
-def test_a_controller_whose_words_are_all_lost_is_silent_to_the_watchdog() -> None:
+def test_watchdog_trips_when_all_commands_are_lost() -> None:
     bench = impaired(command="constant:0")
     client = bench.connect()
     bench.write(client, 0, 1000)
-    bench.device.impaired.set(ImpairmentConfig.model_validate({"command": {"loss": "bernoulli:1"}}))
+    bench.device.impairment.set(ImpairmentConfig.model_validate({"command": {"loss": "bernoulli:1"}}))
     for _ in range(50):
-        let_pass(bench, 20)
+        advance(bench, 20)
         bench.write(client, 0, 2000)
     assert bench.kinds().count("WATCHDOG_TRIP") == 1
     assert list(bench.commands[-1].effort) == [0.0] * 4
-    assert [list(command.effort) for command in words_of(bench)] == [[1.0, 0.0, 0.0, 0.0]]
+    assert [list(command.effort) for command in client_commands(bench)] == [[1.0, 0.0, 0.0, 0.0]]
 
 
-def test_what_is_repeated_is_what_the_simulation_was_told() -> None:
+def test_repeated_command_is_the_last_published_one() -> None:
     bench = impaired(command="constant:500")
     client = bench.connect()
     bench.write(client, 0, 1000)
-    let_pass(bench, 450)
+    advance(bench, 450)
     assert {tuple(repeat.effort) for repeat in bench.repeats} == {(0.0, 0.0, 0.0, 0.0)}
-    let_pass(bench, 100)
+    advance(bench, 100)
     bench.repeats.clear()
-    let_pass(bench, 300)
+    advance(bench, 300)
     assert {(tuple(repeat.effort), repeat.seq) for repeat in bench.repeats} == {
-        ((1.0, 0.0, 0.0, 0.0), words_of(bench)[-1].seq)
+        ((1.0, 0.0, 0.0, 0.0), client_commands(bench)[-1].seq)
     }
 
 
-def test_a_trip_leaves_the_magnet_as_the_simulation_has_it() -> None:
-    from hilrig_modbus_edge.registers import map as registers
-
+def test_trip_keeps_the_published_magnet_command() -> None:
     bench = impaired(command="constant:1500")
     client = bench.connect()
-    client.heard(bench.clock.monotonic_ns())
-    bench.device.write_coil(client, registers.MAGNET, True, bench.clock.monotonic_ns())
+    client.record_request(bench.clock.monotonic_ns())
+    bench.device.write_coil(client, MAGNET_COIL, True, bench.clock.monotonic_ns())
     bench.write(client, 0, 1000)
-    let_pass(bench, 1000)
+    advance(bench, 1000)
     assert bench.commands[-1].safe
-    assert not bench.commands[-1].magnet, "it was asked for, but never arrived"
+    assert not bench.commands[-1].magnet, "it was written, but never published"
 
 
-def test_the_teachers_reset_is_not_held_up() -> None:
+def test_operator_reset_is_not_delayed() -> None:
     bench = impaired(command="constant:300")
     bench.write(bench.connect(), 0, 1000)
     bench.device.reset()
     assert (bench.commands[-1].resets, list(bench.commands[-1].effort)) == (1, [0.0] * 4)
-    let_pass(bench, 400)
-    assert not words_of(bench), "the torque of before comes no more"
+    advance(bench, 400)
+    assert not client_commands(bench), "the earlier torque must not be sent after the reset"
 
 
-def test_a_session_that_ends_does_not_bring_the_last_torque_early() -> None:
+def test_session_end_does_not_send_delayed_torque_early() -> None:
     bench = impaired(command="constant:300")
     first = bench.connect(host="10.0.0.1")
     bench.write(first, 0, 1000)
-    let_pass(bench, 350)
+    advance(bench, 350)
     bench.write(first, 0, 5000)
     bench.device.disconnect(first, "gone")
     second = bench.connect(host="10.0.0.2", port=2)
     bench.write(second, 1, 7)
-    own_words = [command for command in bench.commands if not command.controller]
-    assert list(own_words[-1].effort) == [1.0, 0.0, 0.0, 0.0]
-    let_pass(bench, 400)
+    internal = [command for command in bench.commands if not command.controller]
+    assert list(internal[-1].effort) == [1.0, 0.0, 0.0, 0.0]
+    advance(bench, 400)
     assert list(bench.commands[-1].effort) == [1.0, 0.007, 0.0, 0.0]
 
 
-# -- changed while it runs
+# -- changes at run time
 
 
-def test_every_change_is_told_with_what_is_set() -> None:
+def test_every_change_is_reported_with_its_setting() -> None:
     bench = Bench()
-    bench.device.begin()
+    bench.device.start()
     bench.state(1)
     bench.write(bench.connect(), 0, 1)
     assert "IMPAIRMENT_CHANGED" not in bench.kinds()
-    bench.device.impaired.set(ImpairmentConfig.model_validate({"preset": "vpn", "seed": 5}))
-    bench.device.impaired.set(ImpairmentConfig())
+    bench.device.impairment.set(ImpairmentConfig.model_validate({"preset": "vpn", "seed": 5}))
+    bench.device.impairment.set(ImpairmentConfig())
     texts = [event for event in bench.events if event.kind == Event.IMPAIRMENT_CHANGED]
-    assert texts[0].text.startswith("impairment of rig1: state way gamma mean 3 ms")
-    assert texts[0].text.endswith("seed 5 (by hand)")
+    assert texts[0].text.startswith("impairment of rig1: state link gamma mean 3 ms")
+    assert texts[0].text.endswith("seed 5 (source: override)")
     assert json.loads(texts[0].configuration_data.text)["command"]["delay"]["offset_ms"] == 15
     assert texts[0].session == bench.device.session.id
-    assert texts[1].text == "impairment of rig1: none (by hand)"
+    assert texts[1].text == "impairment of rig1: none (source: override)"
 
 
-def test_a_schedule_is_followed_and_told() -> None:
+def test_schedule_is_followed_and_reported() -> None:
     schedule = [{"at_s": 0.2, "command": "constant:5"}, {"at_s": 0.4, "preset": "none"}]
     bench = impaired(schedule=schedule)
     client = bench.connect()
     for _ in range(30):
         bench.write(client, 0, 1)
-        let_pass(bench, 20)
-    injected = [command.command_injected_ns for command in words_of(bench)]
+        advance(bench, 20)
+    injected = [command.command_injected_ns for command in client_commands(bench)]
     assert injected == [0] * 10 + [5 * MS] * 10 + [0] * 10
     assert bench.kinds().count("IMPAIRMENT_CHANGED") == 2
 
 
-def test_the_recording_of_an_impaired_session_says_so_from_its_start() -> None:
+def test_impaired_session_starts_with_impairment_event() -> None:
     bench = impaired(preset="wired")
     bench.write(bench.connect(), 0, 1)
     kinds = bench.kinds()
     assert kinds[kinds.index("SESSION_START") :].count("IMPAIRMENT_CHANGED") == 1
-    told = [event for event in bench.events if event.kind == Event.IMPAIRMENT_CHANGED][-1]
-    assert told.session == bench.device.session.id
+    change = [event for event in bench.events if event.kind == Event.IMPAIRMENT_CHANGED][-1]
+    assert change.session == bench.device.session.id
 
 
-def test_when_it_is_turned_off_what_is_on_its_way_arrives_and_the_newest_state_is_shown() -> None:
+def test_removed_impairment_delivers_messages_in_flight() -> None:
     bench = impaired(state="constant:200", command="constant:200")
     client = bench.connect()
-    let_pass(bench, 250)
+    advance(bench, 250)
     bench.state(50, position=(0.5, 0, 0, 0))
     bench.write(client, 0, 1000)
     bench.clock.advance(3 * MS)
-    bench.device.impaired.set(ImpairmentConfig())
-    [command] = words_of(bench)
+    bench.device.impairment.set(ImpairmentConfig())
+    [command] = client_commands(bench)
     assert (command.command_injected_ns, list(command.effort)) == (3 * MS, [1.0, 0, 0, 0])
     assert bench.read(client, 4, 1) == [round(np.degrees(0.5) * 100)]
-    assert bench.arrive is None, "states are followed no more"
+    assert bench.arrive is None, "states must not be subscribed any more"
     bench.write(client, 0, 2000)
     assert bench.commands[-1].command_injected_ns == 0
     assert bench.commands[-1].sent_ns == bench.clock.monotonic_ns()
 
 
-def test_states_that_nobody_reads_do_not_pile_up() -> None:
+def test_states_without_reader_do_not_accumulate() -> None:
     bench = impaired(state="constant:100")
     assert bench.arrive is not None
     for step in range(2, 500):
         bench.state(step)
-        let_pass(bench, 20)
-    line = bench.device.impaired._state_way.line  # type: ignore[union-attr]
+        advance(bench, 20)
+    line = bench.device.impairment._delayed_states.line  # type: ignore[union-attr]
     assert line.count == 498
-    assert len(line._waiting) <= 6
+    assert len(line._in_flight) <= 6
 
 
-def test_words_without_a_torque_are_not_held_up() -> None:
-    """The echo word and the time-out are the edge's own registers: they hold at once."""
-    from hilrig_modbus_edge.registers import map as registers
-
+def test_writes_of_edge_registers_are_not_delayed() -> None:
+    """Echo value and watchdog timeout are registers of the edge: they are set at once."""
     bench = impaired(command="constant:100")
     client = bench.connect()
-    client.heard(bench.clock.monotonic_ns())
-    bench.device.write_registers(client, registers.ECHO, struct.pack(">HH", 7, 2000), bench.clock.monotonic_ns())
+    client.record_request(bench.clock.monotonic_ns())
+    bench.device.write_registers(client, ECHO_ADDRESS, struct.pack(">HH", 7, 2000), bench.clock.monotonic_ns())
     assert bench.device.watchdog.timeout_ns == 2000 * MS

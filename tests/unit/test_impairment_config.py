@@ -11,10 +11,10 @@ from hilrig_runtime.config.impairment import (
     GammaDelay,
     GilbertElliottLoss,
     ImpairmentConfig,
+    LinkImpairment,
     NormalDelay,
     TraceDelay,
     UniformDelay,
-    WayImpairment,
 )
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
@@ -22,8 +22,8 @@ from hilrig_runtime.errors import InputError
 
 def test_without_it_the_loop_is_as_it_is() -> None:
     lab = parse_lab("")
-    assert lab.impairment_of(lab.rigs[0]).ways.do_nothing
-    assert lab.impairment.ways.describe() == "none"
+    assert lab.impairment_of(lab.rigs[0]).links.is_inactive
+    assert lab.impairment.links.describe() == "none"
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ def test_without_it_the_loop_is_as_it_is() -> None:
     ],
 )
 def test_a_delay_is_a_kind_and_its_numbers(text: str, delay: object) -> None:
-    assert WayImpairment.model_validate(text).delay == delay
+    assert LinkImpairment.model_validate(text).delay == delay
 
 
 def test_text_and_table_say_the_same() -> None:
@@ -48,16 +48,16 @@ def test_text_and_table_say_the_same() -> None:
         '[impairment.command.loss]\nkind = "gilbert"\nto_bad = 0.01\nto_good = 0.2\n'
     )
     assert as_text.impairment == as_table.impairment
-    assert as_text.impairment.ways.command.loss == GilbertElliottLoss(to_bad=0.01, to_good=0.2)
-    assert as_text.impairment.ways.describe() == (
-        "state way none; command way gamma mean 20 ms, std 8 ms, loss gilbert to bad 0.01, to good 0.2"
+    assert as_text.impairment.links.command.loss == GilbertElliottLoss(to_bad=0.01, to_good=0.2)
+    assert as_text.impairment.links.describe() == (
+        "state link none; command link gamma mean 20 ms, std 8 ms, loss gilbert to bad 0.01, to good 0.2"
     )
 
 
 def test_what_is_said_of_a_way_stands_before_its_preset() -> None:
-    ways = ImpairmentConfig.model_validate({"preset": "vpn", "state": {"loss": "bernoulli:0.5"}}).ways
-    assert ways.command == PRESETS["vpn"].command
-    assert ways.state == WayImpairment(loss=BernoulliLoss(rate=0.5))
+    links = ImpairmentConfig.model_validate({"preset": "vpn", "state": {"loss": "bernoulli:0.5"}}).links
+    assert links.command == PRESETS["vpn"].command
+    assert links.state == LinkImpairment(loss=BernoulliLoss(rate=0.5))
 
 
 def test_a_rig_can_have_its_own() -> None:
@@ -73,8 +73,8 @@ def test_a_lab_says_in_words_what_is_done_to_its_loops() -> None:
         {"command": "constant:5", "schedule": [{"at_s": 2.5, "state": "uniform:1,2"}, {"at_s": 9}]}
     )
     assert config.describe() == (
-        "state way none; command way constant delay 5 ms, then at 2.5 s state way uniform low 1 ms, high 2 ms; "
-        "command way none, then at 9 s none"
+        "state link none; command link constant delay 5 ms, then at 2.5 s state link uniform low 1 ms, high 2 ms; "
+        "command link none, then at 9 s none"
     )
 
 
@@ -89,7 +89,7 @@ def test_a_setting_goes_through_json_unchanged() -> None:
 def test_a_trace_is_a_file_with_a_delay_a_line(tmp_path: Path) -> None:
     trace = tmp_path / "trace.txt"
     trace.write_text("# delays of a session, ms\n12.5\n3\n1e1\n")
-    way = WayImpairment.model_validate(f"trace:{trace}")
+    way = LinkImpairment.model_validate(f"trace:{trace}")
     assert way.delay == TraceDelay(delays_ms=(12.5, 3.0, 10.0))
     assert way.describe() == "trace of 3 delays, mean 8.5 ms"
 
@@ -145,7 +145,9 @@ def test_the_page_says_what_the_models_say() -> None:
     section = page.partition("## Delay and loss in the live loop")[2]
     example = section.partition("```toml\n")[2].partition("```")[0]
     impairment = parse_lab(example).impairment
-    assert impairment.ways.command == WayImpairment.model_validate({"delay": "gamma:20,8", "loss": "gilbert:0.01,0.3"})
+    assert impairment.links.command == LinkImpairment.model_validate(
+        {"delay": "gamma:20,8", "loss": "gilbert:0.01,0.3"}
+    )
     assert [entry.preset for entry in impairment.schedule] == ["mobile", "none"]
     for name in ("constant", "uniform", "normal", "gamma", "exponential", "trace", "none", "bernoulli", "gilbert"):
         assert f"| `{name}` |" in section

@@ -1,4 +1,4 @@
-"""The list of recordings: complete, right about each, quick the second time, and not to be stopped by bad files."""
+"""Index of recordings: complete, correct, cached, and robust against unusable files."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.records import Metadata
 
 from hilrig_recorder.mcap_format.writer import RecordingWriter
-from hilrig_replay.io.index import INDEX_NAME, RECORDING, RunIndex, read_entry, read_verdict, write_verdict
+from hilrig_replay.analysis.index import IN_PROGRESS, INDEX_NAME, RunIndex, read_entry, read_verdict, write_verdict
 from hilrig_runtime.errors import InputError
 from support import recordings
 from support.labs import hilrig
@@ -25,7 +25,7 @@ def make(folder: Path, name: str = "20260101T000000Z-rig1-abcd", **options: obje
     return recordings.write(path, recordings.make(script, session=name), script=script, session=name)
 
 
-def test_an_entry_says_what_the_file_says(tmp_path: Path) -> None:
+def test_entry_has_the_metadata_of_the_file(tmp_path: Path) -> None:
     path = make(tmp_path, lost_transport=3, lost_recorder=2)
     [entry] = RunIndex(tmp_path).load()
     assert (tmp_path / entry.path) == path
@@ -36,7 +36,7 @@ def test_an_entry_says_what_the_file_says(tmp_path: Path) -> None:
     assert entry.trouble == ""
 
 
-def test_loop_latency_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measures_the_loop_latency_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(tmp_path)
     index = RunIndex(tmp_path)
     [entry] = index.measure(index.load())
@@ -44,13 +44,13 @@ def test_loop_latency_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert entry.loop_p99_ms is not None
     assert entry.loop_p99_ms >= entry.loop_p50_ms
     index.save()
-    monkeypatch.setattr("hilrig_replay.io.index.read_entry", lambda *_: pytest.fail("was read again"))
-    monkeypatch.setattr("hilrig_replay.io.index.measure_entry", lambda *_: pytest.fail("was measured again"))
+    monkeypatch.setattr("hilrig_replay.analysis.index.read_entry", lambda *_: pytest.fail("was read again"))
+    monkeypatch.setattr("hilrig_replay.analysis.index.measure_entry", lambda *_: pytest.fail("was measured again"))
     again = RunIndex(tmp_path)
     assert again.measure(again.load()) == [entry]
 
 
-def test_a_file_that_is_damaged_between_good_ends_is_named_when_it_is_measured(tmp_path: Path) -> None:
+def test_measuring_reports_damage_inside_a_file(tmp_path: Path) -> None:
     path = make(tmp_path)
     data = bytearray(path.read_bytes())
     with path.open("rb") as stream:
@@ -66,12 +66,12 @@ def test_a_file_that_is_damaged_between_good_ends_is_named_when_it_is_measured(t
     assert "hilrig recover" in entry.trouble
     assert (entry.fit, entry.loop_p50_ms) == (False, None)
     index.save()
-    # It is known from then on.
+    # The damage is stored in the index.
     assert RunIndex(tmp_path).load() == [entry]
     assert "damaged" in hilrig("runs", tmp_path).stdout
 
 
-def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
+def test_reads_a_changed_file_again(tmp_path: Path) -> None:
     path = make(tmp_path)
     index = RunIndex(tmp_path)
     [before] = index.load()
@@ -81,7 +81,7 @@ def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
     assert after.duration_s > before.duration_s + 0.5
 
 
-def test_a_damaged_index_is_made_again(tmp_path: Path) -> None:
+def test_rebuilds_a_damaged_index(tmp_path: Path) -> None:
     make(tmp_path)
     for content in ("", "{", '{"version": 1}', json.dumps({"version": 1, "fields": [], "runs": [[1, 2]]})):
         (tmp_path / INDEX_NAME).write_text(content)
@@ -92,12 +92,12 @@ def test_a_damaged_index_is_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "trouble"),
     [
-        (b"", "empty"),
-        (b"not an mcap file at all, but long enough to be one", "no MCAP file"),
-        (None, "torn"),
+        (b"", "the file is empty"),
+        (b"not an mcap file, but long enough to be one", "not an MCAP file (bad magic)"),
+        (None, "truncated (no footer)"),
     ],
 )
-def test_a_bad_file_is_listed_with_the_reason(tmp_path: Path, content: bytes | None, trouble: str) -> None:
+def test_lists_an_unusable_file_with_the_reason(tmp_path: Path, content: bytes | None, trouble: str) -> None:
     path = make(tmp_path)
     good = path.read_bytes()
     path.write_bytes(good[:-100] if content is None else content)
@@ -105,7 +105,7 @@ def test_a_bad_file_is_listed_with_the_reason(tmp_path: Path, content: bytes | N
     assert trouble in entry.trouble
 
 
-def test_no_cut_of_a_file_stops_the_list(tmp_path: Path) -> None:
+def test_lists_files_truncated_or_changed_anywhere(tmp_path: Path) -> None:
     path = make(tmp_path)
     good = path.read_bytes()
     for length in range(0, len(good), 97):
@@ -117,16 +117,16 @@ def test_no_cut_of_a_file_stops_the_list(tmp_path: Path) -> None:
         read_entry(tmp_path, "lab/rig1/" + path.name, path.stat())
 
 
-def test_a_file_that_is_being_written_is_listed_as_such(tmp_path: Path) -> None:
+def test_lists_a_file_that_is_being_written(tmp_path: Path) -> None:
     path = make(tmp_path)
     path.rename(path.with_name(path.name + ".part"))
     index = RunIndex(tmp_path)
     [entry] = index.load()
-    assert (entry.ended, entry.rig, entry.session) == (RECORDING, "rig1", "20260101T000000Z-rig1-abcd")
+    assert (entry.ended, entry.rig, entry.session) == (IN_PROGRESS, "rig1", "20260101T000000Z-rig1-abcd")
     assert index.measure([entry]) == [entry]
 
 
-def test_a_verdict_stands_beside_the_recording_and_holds_for_that_file_only(tmp_path: Path) -> None:
+def test_verdict_is_valid_for_the_verified_file_only(tmp_path: Path) -> None:
     path = make(tmp_path)
     assert read_verdict(path) is None
     write_verdict(path, True)
@@ -136,14 +136,12 @@ def test_a_verdict_stands_beside_the_recording_and_holds_for_that_file_only(tmp_
     assert read_verdict(path) is None
 
 
-def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
+def test_reports_a_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         RunIndex(tmp_path / "nowhere").load()
 
 
-def test_a_folder_that_cannot_be_written_is_listed_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lists_a_folder_without_write_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(tmp_path)
 
     def refuse(*_: object, **__: object) -> None:
@@ -157,7 +155,7 @@ def test_a_folder_that_cannot_be_written_is_listed_all_the_same(
     assert not (tmp_path / INDEX_NAME).exists()
 
 
-def test_ten_thousand_files_are_listed_quickly_the_second_time(tmp_path: Path) -> None:
+def test_lists_ten_thousand_indexed_files_quickly(tmp_path: Path) -> None:
     good = make(tmp_path)
     folder = good.parent
     for number in range(9_999):
@@ -169,11 +167,11 @@ def test_ten_thousand_files_are_listed_quickly_the_second_time(tmp_path: Path) -
 
     begin_s = time.process_time()
     assert len(RunIndex(tmp_path).load()) == 10_000
-    # Measured: 0.2 s of processor time; it is more where caches are shared with a busy neighbour.
+    # Measured: 0.2 s of processor time; more if caches are shared with another busy process.
     assert time.process_time() - begin_s < 2
 
 
-def test_the_command_lists_filters_and_sorts(tmp_path: Path) -> None:
+def test_command_lists_filters_and_sorts(tmp_path: Path) -> None:
     make(tmp_path, "20260101T000000Z-rig1-abcd")
     make(tmp_path, "20260101T000000Z-rig1-long", seconds=2.0)
     (tmp_path / "lab" / "rig1" / "bad.mcap").write_bytes(b"")
@@ -181,7 +179,7 @@ def test_the_command_lists_filters_and_sorts(tmp_path: Path) -> None:
     assert answer.returncode == 0, answer.stderr
     runs = json.loads(answer.stdout)["runs"]
     assert [Path(run["path"]).stem[-4:] for run in runs] == ["long", "abcd", "bad"]
-    assert runs[2]["trouble"] == "empty"
+    assert runs[2]["trouble"] == "the file is empty"
     assert json.loads(hilrig("runs", tmp_path, "--json", "--rig", "rig2").stdout)["runs"] == []
     limited = json.loads(hilrig("runs", tmp_path, "--json", "--limit", "1", "--controller", "192.0.2").stdout)
     assert (limited["total"], len(limited["runs"])) == (2, 1)
@@ -190,14 +188,14 @@ def test_the_command_lists_filters_and_sorts(tmp_path: Path) -> None:
     assert "20.0" in table.stdout
 
 
-def test_the_command_says_in_one_line_that_there_is_no_such_folder(tmp_path: Path) -> None:
+def test_command_reports_a_missing_folder_in_one_line(tmp_path: Path) -> None:
     answer = hilrig("runs", tmp_path / "nowhere")
     assert answer.returncode == 2
     assert answer.stderr.count("\n") == 1
     assert "nowhere" in answer.stderr
 
 
-def test_an_untoward_ending_is_told_with_its_reason(tmp_path: Path) -> None:
+def test_command_shows_the_reason_of_an_abnormal_ending(tmp_path: Path) -> None:
     path = tmp_path / "lab" / "rig1" / "20260101T000000Z-rig1-abcd.mcap"
     path.parent.mkdir(parents=True)
     writer = RecordingWriter(path, metadata=(Metadata("hilrig.session", {"rig": "rig1", "session": path.stem}),))

@@ -1,4 +1,4 @@
-"""The integration methods: their limits of stability, their orders, and whole trajectories against scipy's DOP853."""
+"""Unit tests of the integration methods: stability limits, orders, trajectories compared with scipy's DOP853."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from hilrig_sim.arm.stability import check_stable, fastest_mode, largest_safe_st
 from hilrig_sim.arm.stepping import FixedStep
 
 PAPER = ArmParameters(masses=(1.0, 0.5, 0.5))
-"""Of m2 and m3 only the sum counts in the plane: 1 kg as in experiment (44)."""
+"""In the plane only the sum of m2 and m3 matters: 1 kg as in experiment (44)."""
 EFFORT = np.array([1.2, -0.7, -4.5, 0.05])
 
 
 def stepped(table: Tableau, step_s: float, seconds: float, arm: ArmParameters = PAPER) -> tuple[np.ndarray, np.ndarray]:
-    """q(t) and the last embedded error, from rest."""
+    """Return q(t), from rest, and the last embedded error."""
     position, velocity, error = (np.zeros((4, 1)) for _ in range(3))
     stepper = FixedStep(ReducedDynamics([arm]), table, step_s)
     for _ in range(round(seconds / step_s)):
@@ -25,7 +25,7 @@ def stepped(table: Tableau, step_s: float, seconds: float, arm: ArmParameters = 
 
 
 def exact(seconds: float, arm: ArmParameters = PAPER) -> np.ndarray:
-    """q(t) by DOP853."""
+    """Return q(t) by DOP853."""
 
     dynamics = ReducedDynamics([arm])
     state, rates, drive = np.zeros((5, 1)), np.zeros((5, 1)), np.zeros((4, 1))
@@ -40,14 +40,14 @@ def exact(seconds: float, arm: ArmParameters = PAPER) -> np.ndarray:
     return reference_solution(derivative, np.zeros(8), np.array([0.0, seconds]))[:4, -1]
 
 
-def test_limits_of_stability_are_those_of_the_literature() -> None:
+def test_stability_limits_equal_the_literature() -> None:
     assert EULER.negative_real_limit() == pytest.approx(2.0)
     assert RK4.negative_real_limit() == pytest.approx(2.785, abs=1e-3)
     assert RKF45.negative_real_limit() == pytest.approx(3.678, abs=1e-3)
     assert RKF45.negative_real_limit(RKF45.embedded) == pytest.approx(3.020, abs=1e-3)
 
 
-def test_the_papers_arm_has_its_fastest_mode_at_129_5() -> None:
+def test_fastest_mode_of_the_arm_of_the_paper() -> None:
     assert fastest_mode(PAPER, theta2=0.0) == pytest.approx(129.5, abs=0.05)
     assert fastest_mode(PAPER) == pytest.approx(129.5, abs=0.05)
     assert fastest_mode(PAPER, payload=0.5) < fastest_mode(PAPER)
@@ -62,7 +62,7 @@ def test_weights_are_consistent(table: Tableau) -> None:
 
 @pytest.mark.parametrize(("table", "order"), [(EULER, 1), (RK4, 4), (RKF45, 5)], ids=["euler", "rk4", "rkf45"])
 def test_each_method_has_its_order(table: Tableau, order: int) -> None:
-    # An arm with little friction, so that the steps are limited by accuracy and not by stability.
+    # Little friction, so that accuracy and not stability limits the steps.
     arm = ArmParameters(friction=(0.3, 0.3, 1.0, 0.005))
     reference = exact(0.8, arm)
     errors = [np.abs(stepped(table, step_s, 0.8, arm)[0] - reference).max() for step_s in (0.02, 0.01)]
@@ -77,7 +77,7 @@ def test_ten_seconds_agree_with_dop853() -> None:
     np.testing.assert_allclose(at_20_ms, reference, rtol=0, atol=2e-4)
 
 
-def test_embedded_error_tells_how_far_off_the_step_is() -> None:
+def test_embedded_error_estimates_the_true_error() -> None:
     _, coarse = stepped(RKF45, 0.02, 0.02)
     _, fine = stepped(RKF45, 0.01, 0.01)
     assert np.all(np.abs(coarse[:2]) > 8 * np.abs(fine[:2]))
@@ -87,7 +87,7 @@ def test_embedded_error_tells_how_far_off_the_step_is() -> None:
 
 
 @pytest.mark.parametrize(("table", "limit_s"), [(EULER, 0.01544), (RK4, 0.02150), (RKF45, 0.02839)])
-def test_a_mode_grows_just_beyond_the_limit_and_not_below(table: Tableau, limit_s: float) -> None:
+def test_mode_grows_just_beyond_the_stability_limit(table: Tableau, limit_s: float) -> None:
     def speed_after(step_s: float) -> float:
         stepper = FixedStep(ReducedDynamics([PAPER]), table, step_s)
         position, velocity = np.zeros((4, 1)), np.zeros((4, 1))
@@ -101,9 +101,9 @@ def test_a_mode_grows_just_beyond_the_limit_and_not_below(table: Tableau, limit_
     assert speed_after(1.02 * limit_s) > 1e-8
 
 
-def test_an_unstable_step_is_refused_with_what_would_be_right() -> None:
+def test_unstable_step_is_rejected_with_the_fix() -> None:
     unstable = RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000))
-    with pytest.raises(InputError, match=r"the largest safe step is 22\.7 ms \(20% margin\); give sim.substeps = 2"):
+    with pytest.raises(InputError, match=r"the largest safe step is 22\.7 ms \(20% margin\); set sim.substeps = 2"):
         check_stable(unstable)
     check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000, substeps=2)))
     check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=20_000_000)))
@@ -111,5 +111,5 @@ def test_an_unstable_step_is_refused_with_what_would_be_right() -> None:
         check_stable(RigParameters(arm=PAPER, sim=StepParameters(integrator="euler")))
 
 
-def test_what_has_no_friction_has_no_limit() -> None:
+def test_arm_without_friction_has_no_step_limit() -> None:
     assert largest_safe_step(ArmParameters(friction=(0.0, 0.0, 0.0, 0.0)), "rkf45") == float("inf")

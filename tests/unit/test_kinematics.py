@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics: every solution is one, none is missed, and where there is none it says why."""
+"""Unit tests of forward and inverse kinematics: solutions are correct and complete, failures have a cause."""
 
 import math
 
@@ -28,7 +28,7 @@ def same_pose(one: np.ndarray, other: np.ndarray, tolerance: float = 1e-9) -> bo
 
 
 @given(joints)
-def test_every_solution_reaches_the_pose_and_is_within_the_limits(q: tuple[float, ...]) -> None:
+def test_every_solution_reaches_pose_within_limits(q: tuple[float, ...]) -> None:
     pose = kinematics.forward(ARM, q)
     for solution in kinematics.inverse(ARM, pose):
         assert np.all(solution >= ARM.lower)
@@ -37,13 +37,13 @@ def test_every_solution_reaches_the_pose_and_is_within_the_limits(q: tuple[float
 
 
 @given(joints.filter(lambda q: abs(math.sin(q[1])) > 1e-3))
-def test_the_joints_that_made_a_pose_are_among_its_solutions(q: tuple[float, ...]) -> None:
+def test_solutions_include_the_original_joints(q: tuple[float, ...]) -> None:
     solutions = kinematics.inverse(ARM, kinematics.forward(ARM, q))
     assert np.abs(solutions - np.array(q)).max(axis=1).min() < 1e-6
 
 
 @given(joints.filter(lambda q: abs(math.sin(q[1])) > 1e-3))
-def test_both_elbows_and_every_turn_of_joint_4_are_found(q: tuple[float, ...]) -> None:
+def test_solutions_include_both_elbows_and_all_theta4(q: tuple[float, ...]) -> None:
     pose = kinematics.forward(ARM, q)
     solutions = kinematics.inverse(ARM, pose)
     for theta2 in (q[1], -q[1]):
@@ -59,7 +59,7 @@ def test_both_elbows_and_every_turn_of_joint_4_are_found(q: tuple[float, ...]) -
                     assert np.abs(solutions - expected).max(axis=1).min() < 1e-6
 
 
-def test_no_solution_is_given_twice() -> None:
+def test_solutions_are_unique() -> None:
     straight = kinematics.inverse(ARM, (ARM.l2 + ARM.l3, 0.0, 0.1, 0.0))
     assert len({tuple(np.round(solution, 9)) for solution in straight}) == len(straight)
 
@@ -67,27 +67,27 @@ def test_no_solution_is_given_twice() -> None:
 @pytest.mark.parametrize(
     ("pose", "why"),
     [
-        ((0.61, 0.0, 0.1, 0.0), "too far: 610.0 mm from joint 1, 600.0 mm is the most"),
+        ((0.61, 0.0, 0.1, 0.0), "too far: 610.0 mm from joint 1, must be at most 600.0 mm"),
         ((0.05, 0.0, 0.1, 0.0), "in reach, but theta2 would be"),
-        ((0.4, 0.0, 0.2, 0.0), "too high: z goes from -61.0 to 139.0 mm"),
+        ((0.4, 0.0, 0.2, 0.0), "too high: must be -61.0 to 139.0 mm"),
         ((0.4, 0.0, -0.1, 0.0), "too low"),
         ((-0.55, 0.0, 0.1, 0.0), "theta1 would be"),
         ((float("nan"), 0.0, 0.1, 0.0), "must be finite"),
     ],
 )
-def test_an_unreachable_pose_says_why(pose: tuple[float, ...], why: str) -> None:
+def test_unreachable_pose_has_a_cause(pose: tuple[float, ...], why: str) -> None:
     with pytest.raises(UnreachableError, match=why):
         kinematics.inverse(ARM, pose)
     assert issubclass(UnreachableError, InputError)
 
 
-def test_a_pose_nearer_than_the_difference_of_the_links_is_too_near() -> None:
+def test_pose_nearer_than_link_difference_is_too_near() -> None:
     arm = ArmParameters(l2=0.4, l3=0.2)
-    with pytest.raises(UnreachableError, match=r"too near: 100\.0 mm from joint 1, 200\.0 mm is the least"):
+    with pytest.raises(UnreachableError, match=r"too near: 100\.0 mm from joint 1, must be at least 200\.0 mm"):
         kinematics.inverse(arm, (0.1, 0.0, 0.1, 0.0))
 
 
-def test_a_limit_of_joint_4_can_be_what_is_in_the_way() -> None:
+def test_limit_of_joint_4_is_reported() -> None:
     arm = ArmParameters(lower=(*ARM.lower[:3], -0.1), upper=(*ARM.upper[:3], 0.1))
     with pytest.raises(UnreachableError, match="theta4 would be"):
         kinematics.inverse(arm, (0.4, 0.0, 0.1, math.pi))
@@ -104,14 +104,14 @@ def test_jacobian_is_the_derivative_of_the_pose(q: tuple[float, ...]) -> None:
 
 
 @given(joints)
-def test_the_determinant_vanishes_where_the_arm_is_straight_or_folded(q: tuple[float, ...]) -> None:
+def test_determinant_is_zero_where_arm_is_straight(q: tuple[float, ...]) -> None:
     determinant = abs(np.linalg.det(kinematics.jacobian(ARM, q)))
     assert determinant == pytest.approx(float(kinematics.manipulability(ARM, q)), abs=1e-12)
     assert kinematics.is_singular(ARM, (q[0], 0.0, q[2], q[3]))
     assert not kinematics.is_singular(ARM, (q[0], 1.0, q[2], q[3]))
 
 
-def test_many_poses_at_once_are_the_same_as_one_by_one() -> None:
+def test_many_poses_equal_single_poses() -> None:
     rng = np.random.default_rng(1)
     many = rng.uniform(np.array(ARM.lower)[:, None], np.array(ARM.upper)[:, None], (4, 50))
     poses, jacobians = kinematics.forward(ARM, many), kinematics.jacobian(ARM, many)
@@ -120,10 +120,10 @@ def test_many_poses_at_once_are_the_same_as_one_by_one() -> None:
         np.testing.assert_array_equal(jacobians[:, :, index], kinematics.jacobian(ARM, many[:, index]))
 
 
-def test_the_inverse_of_many_poses_is_that_of_each() -> None:
+def test_inverse_of_many_poses_equals_single_inverses() -> None:
     rng = np.random.default_rng(2)
     poses = np.stack([*rng.uniform(-0.65, 0.65, (2, 300)), rng.uniform(-0.08, 0.15, 300), rng.uniform(-7, 7, 300)])
-    # The edge of the workspace, where the arm is straight, is among them.
+    # Includes the limit of the workspace, where the arm is straight.
     poses[:, 0] = 0.6, 0.0, 0.1, 0.0
     many = kinematics.inverse_many(ARM, poses)
     found = 0
@@ -138,7 +138,7 @@ def test_the_inverse_of_many_poses_is_that_of_each() -> None:
     assert found > 300
 
 
-def test_reach_is_a_ring_less_what_the_stops_cut_off() -> None:
+def test_reach_is_a_ring_reduced_by_joint_limits() -> None:
     reach = kinematics.reach(ARM)
     assert reach.outer == pytest.approx(0.6)
     assert reach.inner == pytest.approx(2 * 0.3 * math.cos(math.radians(153 / 2)))
@@ -150,7 +150,7 @@ def test_reach_is_a_ring_less_what_the_stops_cut_off() -> None:
 
 
 @given(st.floats(-0.65, 0.65), st.floats(-0.65, 0.65))
-def test_what_is_in_reach_has_a_solution_and_nothing_else(x: float, y: float) -> None:
+def test_exactly_points_in_reach_have_a_solution(x: float, y: float) -> None:
     try:
         found = len(kinematics.inverse(ARM, (x, y, 0.1, 0.0))) > 0
     except UnreachableError:

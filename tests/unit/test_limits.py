@@ -1,4 +1,4 @@
-"""Where the system gives no more, or a name is not known: one clear line each, with what to do."""
+"""Unit tests of messages for exhausted system resources and unavailable addresses."""
 
 import errno
 import os
@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from hilrig_modbus_edge.server import listener as server
+from hilrig_modbus_edge.server.listener import bind
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import unknown_host
 from hilrig_runtime.config.lab import parse_lab
@@ -24,7 +24,7 @@ from support.labs import free_ports
         (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "no more open files"),
     ],
 )
-def test_what_the_system_does_not_give_is_one_line(
+def test_exhausted_resource_is_reported_in_one_line(
     capsys: pytest.CaptureFixture[str], error: Exception, words: str
 ) -> None:
     def main() -> int:
@@ -36,7 +36,7 @@ def test_what_the_system_does_not_give_is_one_line(
     assert words in line
 
 
-def test_any_other_error_is_no_such_thing() -> None:
+def test_other_errors_are_not_caught() -> None:
     def main() -> int:
         raise RuntimeError("a mistake in the program")
 
@@ -51,31 +51,31 @@ def test_any_other_error_is_no_such_thing() -> None:
         ("no-such-host.invalid", "edge.host in lab.toml must be an address of this host"),
     ],
 )
-def test_an_address_of_another_host_is_named_as_one(host: str, words: str) -> None:
+def test_address_of_another_host_is_reported(host: str, words: str) -> None:
     with pytest.raises(OperationError) as caught:
-        server.bind("rig1", host, free_ports(1))
+        bind("rig1", host, free_ports(1))
     if sys.platform == "linux" or host != "192.0.2.1":
         assert words in str(caught.value)
     assert "while attempting" not in str(caught.value)
 
 
-def test_a_port_in_use_is_another_matter() -> None:
+def test_port_in_use_is_reported() -> None:
     port = free_ports(1)
     with (
-        server.bind("rig1", "127.0.0.1", port),
-        pytest.raises(OperationError, match=r"in use; stop what listens there, or choose another port"),
+        bind("rig1", "127.0.0.1", port),
+        pytest.raises(OperationError, match=r"in use; stop the program that listens there, or choose another port"),
     ):
-        server.bind("rig2", "127.0.0.1", port)
+        bind("rig2", "127.0.0.1", port)
 
 
-def test_a_router_whose_name_is_not_known_is_told_apart_from_one_that_is_silent() -> None:
+def test_unknown_router_name_is_reported() -> None:
     bus = parse_lab('[bus]\ntopology = "router"\nrouter = "tcp/no-such-host.invalid:7447"\n').bus
     with pytest.raises(OperationError, match=r"the name 'no-such-host\.invalid' is not known here"):
         ZenohBus(bus, "tool")
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tls/[::1]:7447", "tcp/localhost:1?rel=1"])
-def test_a_known_host_is_not_named(endpoint: str) -> None:
+def test_known_host_is_not_reported(endpoint: str) -> None:
     assert unknown_host(endpoint) == ""
 
 
@@ -91,6 +91,6 @@ print(resource.getrlimit(resource.RLIMIT_NOFILE) == (most, most))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
-def test_a_service_may_open_all_the_files_that_its_user_may() -> None:
+def test_service_raises_its_limit_of_open_files() -> None:
     done = subprocess.run([sys.executable, "-c", LIMITS], check=True, capture_output=True, text=True, timeout=60)
     assert done.stdout == "True\n"

@@ -4,22 +4,20 @@ from hypothesis import strategies as st
 from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU
 
-from hilrig_modbus_edge.protocol.mbap import MAX_FRAME, Request, frame, split
+from hilrig_modbus_edge.protocol.mbap import MAX_FRAME, Request, decode_frames, encode_frame
 
 REQUEST = st.builds(Request, st.integers(0, 65535), st.integers(0, 255), st.binary(min_size=1, max_size=253))
 
 
 @given(st.lists(REQUEST, max_size=5), st.data())
-def test_requests_come_out_whole_and_in_order_however_the_stream_is_cut(
-    requests: list[Request], data: st.DataObject
-) -> None:
-    stream = b"".join(frame(*request) for request in requests)
+def test_requests_are_decoded_from_arbitrary_segments(requests: list[Request], data: st.DataObject) -> None:
+    stream = b"".join(encode_frame(*request) for request in requests)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
     seen: list[Request] = []
     rest = b""
     for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         rest += stream[start:end]
-        found = split(rest)
+        found = decode_frames(rest)
         assert not found.malformed
         seen += found.requests
         rest = rest[found.used :]
@@ -29,15 +27,15 @@ def test_requests_come_out_whole_and_in_order_however_the_stream_is_cut(
 
 
 @given(REQUEST)
-def test_frames_are_pymodbuss(request: Request) -> None:
+def test_encoded_frame_equals_that_of_pymodbus(request: Request) -> None:
     framer = FramerSocket(DecodePDU(is_server=True))
-    assert frame(*request) == framer.encode(request.pdu, request.unit, request.transaction)
+    assert encode_frame(*request) == framer.encode(request.pdu, request.unit, request.transaction)
 
 
 @given(st.binary(max_size=600))
-def test_any_bytes_are_requests_a_beginning_or_malformed(data: bytes) -> None:
-    found = split(data)
-    assert b"".join(frame(*request) for request in found.requests) == data[: found.used]
+def test_any_bytes_are_requests_incomplete_or_malformed(data: bytes) -> None:
+    found = decode_frames(data)
+    assert b"".join(encode_frame(*request) for request in found.requests) == data[: found.used]
     rest = data[found.used :]
     if not found.malformed:
         assert len(rest) < MAX_FRAME
@@ -45,8 +43,8 @@ def test_any_bytes_are_requests_a_beginning_or_malformed(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 1, 255, 65535])
-def test_a_length_that_no_request_has_is_malformed(length: int) -> None:
-    good = frame(1, 1, b"\x07")
-    found = split(good + b"\0\0\0\0" + length.to_bytes(2, "big"))
+def test_invalid_length_is_malformed(length: int) -> None:
+    good = encode_frame(1, 1, b"\x07")
+    found = decode_frames(good + b"\0\0\0\0" + length.to_bytes(2, "big"))
     assert found.requests == [Request(1, 1, b"\x07")]
     assert f"length {length}" in found.malformed

@@ -1,16 +1,17 @@
-"""The notebook's page is run as it stands, block after block."""
+"""Runs the code blocks of docs/notebook.md, and compares the public API with the page."""
 
 import re
 from pathlib import Path
 
 import pytest
 
+import hilrig_replay
 from support.recordings import Script, make, write
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
 
 
-def test_every_block_of_the_page_runs(
+def test_runs_all_code_blocks_of_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     script = Script(seconds=4.0)
@@ -27,9 +28,16 @@ def test_every_block_of_the_page_runs(
         "a step is 20.0 ms",
         "192.0.2.7:40001",
         "SESSION_START",
-        "reads a second",
-        "fit: False",
+        "reads per second",
+        "valid for latency measurements: False",
         "% of the task, ",
-        "J into the arm",
+        "J of mechanical energy into the arm",
     ):
         assert words in printed, words
+
+
+def test_public_names_are_those_of_the_page() -> None:
+    lines = re.findall(r"^from (hilrig_replay\S*) import (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {module for module, _ in lines} == {"hilrig_replay"}
+    assert sorted(name.strip() for _, names in lines for name in names.split(",")) == sorted(hilrig_replay.__all__)
+    assert all(hasattr(hilrig_replay, name) for name in hilrig_replay.__all__)

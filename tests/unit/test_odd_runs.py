@@ -1,4 +1,4 @@
-"""Runs that are not as they should be: every command gives one clear answer."""
+"""Unusual and unreadable runs: each command reports one clear error, or accepts the run."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.errors import InputError
 from support.recordings import Script, make, record, write
 
-ALL: dict[str, Callable[[Path], object]] = {
+COMMANDS: dict[str, Callable[[Path], object]] = {
     "latency": lambda path: measure(open_run(path)),
     "replay": lambda path: save_rrd(open_run(path), path.with_suffix(".rrd")),
     "compare": lambda path: compare([open_run(path), open_run(path)]),
@@ -23,7 +23,7 @@ ALL: dict[str, Callable[[Path], object]] = {
 }
 
 
-def torn(folder: Path) -> Path:
+def truncated(folder: Path) -> Path:
     path = folder / "run.mcap"
     path.write_bytes(record(folder / "whole.mcap", Script(seconds=2.0)).read_bytes()[:9000])
     return path
@@ -41,28 +41,28 @@ def newer(folder: Path) -> Path:
     return write(folder / "run.mcap", make(Script(seconds=1.0)), schema_version="hilrig.v2")
 
 
-@pytest.mark.parametrize("command", ALL)
+@pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (torn, "torn: it has no end; `hilrig recover .*` makes a whole file of it"),
-        (damaged, "damaged .*: `hilrig recover .*` saves what is whole"),
-        (newer, r"recorded with messages hilrig\.v2, and this hilrig reads hilrig\.v1: use a newer hilrig"),
+        (truncated, r"truncated \(no footer\): run `hilrig recover .*` to complete it"),
+        (damaged, "damaged .*: run `hilrig recover .*` to save the intact messages"),
+        (newer, r"recorded with message schemas hilrig\.v2, but this version reads hilrig\.v1: use a newer hilrig"),
     ],
 )
-def test_what_can_not_be_read_is_said_with_what_to_do(
+def test_commands_report_unreadable_files_with_a_fix(
     spoil: Callable[[Path], Path], words: str, command: str, tmp_path: Path
 ) -> None:
     path = spoil(tmp_path)
-    with pytest.raises(InputError, match=words) as said:
-        ALL[command](path)
-    assert str(said.value).startswith(f"{path}: ")
-    assert "\n" not in str(said.value)
+    with pytest.raises(InputError, match=words) as raised:
+        COMMANDS[command](path)
+    assert str(raised.value).startswith(f"{path}: ")
+    assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("command", [command for command in ALL if command != "verify"])
-def test_a_run_without_a_controller_is_a_run(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command != "verify"])
+def test_commands_accept_a_run_without_a_controller(command: str, tmp_path: Path) -> None:
     path = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
-    ALL[command](path)
+    COMMANDS[command](path)
     if command == "replay":
         assert (tmp_path / "run.rrd").stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""Our functions against pymodbus's classes: it writes the requests and reads the answers, we do what is between."""
+"""Unit tests of the functions against pymodbus, which encodes the requests and decodes the responses."""
 
 import pytest
 from hypothesis import given
@@ -29,10 +29,10 @@ DECODER = DecodePDU(is_server=False)
 
 
 def ask(bench: Bench, request: ModbusPDU) -> ModbusPDU:
-    """What pymodbus makes of our answer to its request."""
+    """Execute a request of pymodbus and return the response as pymodbus decodes it."""
     client = next(iter(bench.device.clients), None) or bench.connect()
     data = bytes((request.function_code,)) + request.encode()
-    answer = pdu.answer(bench.device, client, data, bench.clock.monotonic_ns())
+    answer = pdu.execute(bench.device, client, data, bench.clock.monotonic_ns())
     decoded = DECODER.decode(answer)
     assert decoded is not None
     return decoded
@@ -45,7 +45,7 @@ def fresh() -> Bench:
 
 
 @given(WORDS)
-def test_registers_that_pymodbus_writes_it_reads_back(words: list[int]) -> None:
+def test_written_registers_are_read_back(words: list[int]) -> None:
     bench, count = fresh(), len(words)
     written = ask(bench, WriteMultipleRegistersRequest(address=0, registers=words))
     assert (written.address, written.count) == (0, count)
@@ -78,7 +78,7 @@ def test_coils(on: bool) -> None:
 
 
 @given(st.integers(0, 15), st.integers(1, 16))
-def test_discrete_inputs_are_the_bits_of_the_status_word(address: int, count: int) -> None:
+def test_discrete_inputs_are_bits_of_status_register(address: int, count: int) -> None:
     bench = fresh()
     reply = ask(bench, ReadDiscreteInputsRequest(address=address, count=count))
     if address + count > 16:
@@ -105,7 +105,7 @@ def test_identification_streams(code: int, objects: list[int]) -> None:
     reply = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=0))
     assert list(reply.information) == objects  # type: ignore[attr-defined]
     assert reply.information[0] == b"hilrig"  # type: ignore[attr-defined]
-    # A stream goes on where it is asked to, and starts again where there is nothing.
+    # A stream starts at the requested object, or at the first one if that does not exist.
     later = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=2))
     assert list(later.information) == [number for number in objects if number >= 2]  # type: ignore[attr-defined]
     nowhere = ask(fresh(), ReadDeviceInformationRequest(read_code=code, object_id=99))
@@ -113,23 +113,23 @@ def test_identification_streams(code: int, objects: list[int]) -> None:
 
 
 @given(st.binary(min_size=1, max_size=253))
-def test_whatever_is_asked_is_answered(request: bytes) -> None:
+def test_every_request_gets_a_response(request: bytes) -> None:
     bench = fresh()
-    reply = pdu.answer(bench.device, bench.connect(), request, bench.clock.monotonic_ns())
+    reply = pdu.execute(bench.device, bench.connect(), request, bench.clock.monotonic_ns())
     assert reply[0] & 0x7F == request[0] & 0x7F
     assert 2 <= len(reply) <= 253
     if reply[0] & 0x80:
         assert reply[1] in (1, 2, 3, 4)
 
 
-def test_a_wrong_address_is_said_before_what_cannot_be_done_now() -> None:
+def test_wrong_address_takes_precedence_over_missing_state() -> None:
     bench = Bench()
     client = bench.connect()
 
     def code(request: str) -> int:
-        return pdu.answer(bench.device, client, bytes.fromhex(request), bench.clock.monotonic_ns())[1]
+        return pdu.execute(bench.device, client, bytes.fromhex(request), bench.clock.monotonic_ns())[1]
 
-    # No state has come yet.
+    # No state was received yet.
     assert code("17 00 04 00 04 00 00 00 01 02 00 2A") == 4
     assert code("17 00 04 00 04 00 08 00 01 02 00 2A") == 2
     assert code("03 00 04 00 05") == 2

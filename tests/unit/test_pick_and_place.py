@@ -1,14 +1,14 @@
-"""The demo's controller does its work, also through a slow loop, and the judge sees what stands where."""
+"""Unit tests of the pick-and-place controller, also with a slow loop, and of the placement check."""
 
 import numpy as np
 import pytest
 
-from hilrig_replay.grading.placement import placed_parts
+from hilrig_replay.grading.placement import evaluate_placement
 from hilrig_schemas import JointState, PartState
 from hilrig_sim.arm.dynamics import forward_dynamics
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from support.recordings import PARAMETERS
-from support.virtual_rig import FarRig, VirtualRig, pick_and_place, work
+from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, work
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
@@ -17,11 +17,11 @@ def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
 
 
 @pytest.mark.parametrize("extra_ms", [0, 20, 40, 60])
-def test_every_part_of_the_default_scene_is_placed_within_2_mm_whatever_the_latency(extra_ms: int) -> None:
+def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     with VirtualRig() as rig:
         done_s = work(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert result.placed == len(PARAMETERS.scene.parts) == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
@@ -31,16 +31,14 @@ def test_every_part_of_the_default_scene_is_placed_within_2_mm_whatever_the_late
 
 
 @pytest.mark.parametrize("one_way_ms", [0.0, 3.0, 6.0, 9.5, 20.0, 30.0])
-def test_a_network_may_be_slow_where_each_request_waits_for_its_answer(
-    one_way_ms: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch: pytest.MonkeyPatch) -> None:
     example = pick_and_place()
     with VirtualRig() as rig:
-        far = FarRig(rig, one_way_ms, seed=1)
-        monkeypatch.setattr(example, "time", far)
-        said = example.control(far, example.Controller(example.task_of({})), 40.0, once=True)
+        remote = RemoteRig(rig, one_way_ms, seed=1)
+        monkeypatch.setattr(example, "time", remote)
+        said = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert said["placed"] == result.placed == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
@@ -48,54 +46,54 @@ def test_a_network_may_be_slow_where_each_request_waits_for_its_answer(
 
 @pytest.mark.parametrize("one_way_ms", [0.0, 20.0])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_machine_that_is_held_up_once_or_twice_a_second_delays_the_work_and_spoils_none(
+def test_stalls_delay_the_task_but_do_not_spoil_it(
     one_way_ms: float, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     example = pick_and_place()
     with VirtualRig() as rig:
-        far = FarRig(rig, one_way_ms, seed, stalls=0.004)
-        monkeypatch.setattr(example, "time", far)
-        said = example.control(far, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
+        remote = RemoteRig(rig, one_way_ms, seed, stalls=0.004)
+        monkeypatch.setattr(example, "time", remote)
+        said = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
         parts, held = last_parts(rig.states)
-    result = placed_parts(PARAMETERS.scene, parts, held=held)
+    result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert said["placed"] == result.placed == 4
     assert said["missing"] == []
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
 
 
-def test_the_magnet_waits_for_an_arm_that_does_not_come() -> None:
+def test_magnet_waits_until_the_arm_is_at_the_part() -> None:
     example = pick_and_place()
     task = example.task_of({})
     controller = example.Controller(task)
     ends = {stage.text: stage.goal for stage in list(example.plan(task, example.HOME))[:3]}
-    # An arm that is where each stage ends, but 0.2 degrees beside the part.
-    ends["take red"] = ends["take red"] + [0.0035, 0.0, 0.0, 0.0]
+    # The arm is at the end of each stage, but 0.2° beside the part.
+    ends["pick red"] = ends["pick red"] + [0.0035, 0.0, 0.0, 0.0]
     now_s = 0.0
     controller.update(now_s, example.HOME)
     while now_s < 60.0:
         now_s += 0.01
         controller.update(now_s, ends[controller.doing])
-    assert (controller.doing, controller.magnet, controller.placed) == ("take red", False, 0)
+    assert (controller.doing, controller.magnet, controller.placed) == ("pick red", False, 0)
 
 
-def test_time_that_runs_out_is_said_with_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     example = pick_and_place()
     with VirtualRig() as rig:
-        far = FarRig(rig, 0.0, seed=1)
-        monkeypatch.setattr(example, "time", far)
-        said = example.control(far, example.Controller(example.task_of({})), 8.0)
+        remote = RemoteRig(rig, 0.0, seed=1)
+        monkeypatch.setattr(example, "time", remote)
+        said = example.control(remote, example.Controller(example.task_of({})), 8.0)
     assert said["done_s"] is None
     assert 0 < said["placed"] < 4
     assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
     told = example.sentence({"parts": 4, **said})
     assert told.startswith(
-        f"{said['placed']} of 4 parts placed, not {', '.join(said['missing'])}: the time was over at"
+        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
     )
     assert repr(said["doing"]) in told
 
 
-def test_its_model_of_the_arm_is_the_arms() -> None:
+def test_model_of_the_controller_equals_the_arm() -> None:
     example = pick_and_place()
     rng = np.random.default_rng(3)
     for _ in range(50):
@@ -105,7 +103,7 @@ def test_its_model_of_the_arm_is_the_arms() -> None:
         np.testing.assert_allclose(forward_dynamics(arm, position, speed, efforts, held), acceleration, atol=1e-9)
 
 
-def test_its_task_is_the_default_scene() -> None:
+def test_default_task_equals_the_default_scene() -> None:
     task = pick_and_place().task_of({})
     scene = PARAMETERS.scene
     assert [part.name for part in task.parts] == [part.name for part in scene.parts]
@@ -116,7 +114,7 @@ def test_its_task_is_the_default_scene() -> None:
     np.testing.assert_allclose([(place.x, place.y, place.z) for place in task.places], places, atol=1e-12)
 
 
-def test_a_part_on_the_magnet_beside_its_place_or_on_the_table_is_not_placed() -> None:
+def test_part_on_magnet_or_beside_its_place_is_not_placed() -> None:
     scene = PARAMETERS.scene
     places = [place for tray in scene.trays for place in tray.places]
 
@@ -125,16 +123,16 @@ def test_a_part_on_the_magnet_beside_its_place_or_on_the_table_is_not_placed() -
         return PartState(name=part.name, x=x + dx, y=y, z=z + part.size[2] / 2 + dz)
 
     poses = [standing(0, 0, dx=0.001), standing(1, 1, dx=0.030), standing(2, 2, dz=0.01), standing(3, 3)]
-    result = placed_parts(scene, poses, held=scene.parts[3].name)
+    result = evaluate_placement(scene, poses, held=scene.parts[3].name)
     assert [part.place for part in result.parts] == [0, None, None, None]
-    assert placed_parts(scene, [standing(2, 2, dz=-0.008)]).placed == 0
+    assert evaluate_placement(scene, [standing(2, 2, dz=-0.008)]).placed == 0
     assert result.placed == 1
     assert result.parts[0].error_mm == pytest.approx(1.0)
-    assert placed_parts(RigParameters().scene, []).largest_error_mm is None
+    assert evaluate_placement(RigParameters().scene, []).largest_error_mm is None
 
 
-def test_two_parts_do_not_stand_on_one_place() -> None:
+def test_two_parts_cannot_be_placed_on_one_place() -> None:
     scene = PARAMETERS.scene
     x, y, z = scene.trays[0].places[0]
     poses = [PartState(name=part.name, x=x, y=y, z=z + part.size[2] / 2) for part in scene.parts[:2]]
-    assert placed_parts(scene, poses).placed == 1
+    assert evaluate_placement(scene, poses).placed == 1

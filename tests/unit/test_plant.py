@@ -1,4 +1,4 @@
-"""The plant's laws: energy is balanced, stops take energy and never give any, and no rig knows of its neighbours."""
+"""Unit tests of the plant: energy balance, hard stops, independence of the rigs, reproducibility."""
 
 from dataclasses import replace
 
@@ -11,12 +11,12 @@ from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics, mass_matrix
 from hilrig_sim.arm.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.plant.hard_stops import stop_outward
-from hilrig_sim.plant.limits import Happening
+from hilrig_sim.plant.limits import PlantEventKind
 from hilrig_sim.plant.plant import Plant
 from support.recordings import PARAMETERS
 
 ARM = ArmParameters()
-# Nothing to come down on: the quill has its own stop alone.
+# No object below the tool: the quill has its own stops only.
 BARE = RigParameters(scene=SceneParameters(table_height=-1.0))
 OFF = np.zeros(1, dtype=np.bool_)
 
@@ -30,7 +30,7 @@ def plant_at(
     position: tuple[float, ...], velocity: tuple[float, ...], rig: RigParameters = BARE, step_ns: int = 20_000_000
 ) -> Plant:
     plant = Plant([replace(rig, sim=StepParameters(step_ns=step_ns))])
-    plant.place(0, position, velocity)
+    plant.set_state(0, position, velocity)
     return plant
 
 
@@ -50,7 +50,7 @@ def test_mass_matrix_is_symmetric_and_positive_definite(
 
 
 @pytest.mark.parametrize("payload", [0.0, 1.2])
-def test_what_goes_in_less_friction_is_what_there_is(payload: float) -> None:
+def test_energy_balance_with_work_and_friction(payload: float) -> None:
     arm = replace(ARM, friction=(0.4, 0.3, 2.0, 0.02), external_force_z=1.0, external_torque_z=0.1)
     plant = plant_at((-1.0, 0.5, 0.10, 0.0), (0.5, -0.5, 0.0, 1.0), replace(BARE, arm=arm), step_ns=1_000_000)
     plant.dynamics.set_payload(np.array([payload]))
@@ -70,7 +70,7 @@ def test_what_goes_in_less_friction_is_what_there_is(payload: float) -> None:
 
 
 @given(joints, speeds, st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 2), st.floats(0, 2))
-def test_an_impact_never_adds_energy_and_leaves_nothing_moving_outwards(
+def test_impact_adds_no_energy_and_leaves_no_outward_motion(
     position: tuple[float, ...], velocity: tuple[float, ...], side: tuple[float, float], payload: float
 ) -> None:
     dynamics = ReducedDynamics.of(ARM, payload)
@@ -84,7 +84,7 @@ def test_an_impact_never_adds_energy_and_leaves_nothing_moving_outwards(
     assert dynamics.kinetic_energy(theta2, after)[0] <= before * (1 + 1e-12)
     assert side[0] * v1[0] <= 1e-12
     assert side[1] * v2[0] <= 1e-12
-    # A stop pushes inwards or not at all: the change of momentum is along each stop that pushes.
+    # A stop pushes inward only: the change of momentum is along each stop that pushes.
     alpha, a12, a22 = (element[0] for element in mass)
     push = np.array([[alpha, a12], [a12, a22]]) @ (after[:2, 0] - v[:2, 0])
     for j, pushed in ((0, pushed1[0]), (1, pushed2[0])):
@@ -108,9 +108,7 @@ def test_no_joint_is_ever_outside_its_limits(
 
 @settings(max_examples=20)
 @given(joints, speeds)
-def test_without_efforts_energy_only_falls_through_any_impacts(
-    position: tuple[float, ...], velocity: tuple[float, ...]
-) -> None:
+def test_energy_never_increases_without_efforts(position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
     plant = plant_at(position, velocity, step_ns=1_000_000)
     effort = np.zeros((4, 1))
     last = energy(plant)
@@ -121,12 +119,12 @@ def test_without_efforts_energy_only_falls_through_any_impacts(
         last = now
 
 
-def test_a_joint_stops_dead_at_its_limit_and_tells_how_fast_it_came() -> None:
+def test_joint_stops_at_its_limit_with_event_and_speed() -> None:
     plant = plant_at((2.2, 0.0, 0.1, 0.0), (0.0, 0.0, 0.0, 0.0))
     effort = np.array([[8.0], [0.0], [-0.5 * GRAVITY], [0.0]])
     hits = [event for _ in range(60) for event in tuple(plant.step(effort, OFF))]
     first = next(hit for hit in hits if hit.joint == 1)
-    assert (first.happening, first.upper) == (Happening.LIMIT_HIT, True)
+    assert (first.kind, first.upper) == (PlantEventKind.LIMIT_HIT, True)
     assert first.speed > 0.1
     assert plant.position[0, 0] == ARM.upper[0]
     assert plant.velocity[0, 0] == 0.0
@@ -134,7 +132,7 @@ def test_a_joint_stops_dead_at_its_limit_and_tells_how_fast_it_came() -> None:
     assert sum(hit.joint == 1 for hit in hits) == 1
 
 
-def test_a_joint_held_on_its_stop_stays_and_the_other_turns_about_it_alone() -> None:
+def test_joint_at_stop_stays_and_the_other_moves_alone() -> None:
     plant = plant_at((ARM.upper[0], 0.3, 0.1, 0.0), (0.0, 0.0, 0.0, 0.0))
     effort = np.array([[20.0], [0.4], [-0.5 * GRAVITY], [0.0]])
     for _ in range(50):
@@ -147,7 +145,7 @@ def test_a_joint_held_on_its_stop_stays_and_the_other_turns_about_it_alone() -> 
     assert plant.position[1, 0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_joint_leaves_its_stop_when_it_is_pulled_off() -> None:
+def test_joint_leaves_its_stop_under_inward_effort() -> None:
     plant = plant_at((ARM.upper[0], ARM.lower[1], 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
     for _ in range(10):
         plant.step(np.array([[-2.0], [2.0], [-5.5], [0.0]]), OFF)
@@ -156,7 +154,7 @@ def test_a_joint_leaves_its_stop_when_it_is_pulled_off() -> None:
     assert plant.limit_flags[0] == 1 << 2
 
 
-def test_where_within_the_step_a_stop_is_hit_hardly_depends_on_the_step() -> None:
+def test_impact_time_hardly_depends_on_the_step() -> None:
     def after(step_ns: int) -> np.ndarray:
         plant = plant_at((2.0, 1.0, 0.1, 0.0), (2.5, -1.0, 0.0, 0.0), step_ns=step_ns)
         effort = np.array([[6.0], [0.5], [-0.5 * GRAVITY], [0.0]])
@@ -168,24 +166,24 @@ def test_where_within_the_step_a_stop_is_hit_hardly_depends_on_the_step() -> Non
     np.testing.assert_allclose(after(20_000_000), after(500_000), atol=2e-3)
 
 
-@pytest.mark.parametrize("many", [2, 7, 64, 65, 300])
-def test_a_rigs_trajectory_does_not_depend_to_the_last_bit_on_how_many_step_beside_it(many: int) -> None:
-    rng = np.random.default_rng(many)
+@pytest.mark.parametrize("count", [2, 7, 64, 65, 300])
+def test_trajectory_is_bit_identical_for_any_number_of_rigs(count: int) -> None:
+    rng = np.random.default_rng(count)
     rigs = [
         replace(
             PARAMETERS,
             arm=replace(ARM, masses=tuple(rng.uniform(0.9, 1.5, 3)), friction=tuple(rng.uniform(0.05, 1.5, 4))),
         )
-        for _ in range(many)
+        for _ in range(count)
     ]
     together = Plant(rigs)
-    watched = [0, many // 2, many - 1]
+    watched = [0, count // 2, count - 1]
     alone = [Plant([rigs[index]]) for index in watched]
     for step in range(150):
         if step % 25 == 0:
-            effort = rng.uniform(-6, 6, (4, many))
+            effort = rng.uniform(-6, 6, (4, count))
         effort[2] = rng.uniform(-9, 3)
-        magnet = rng.random(many) < 0.5
+        magnet = rng.random(count) < 0.5
         together.step(effort, magnet)
         for plant, index in zip(alone, watched, strict=True):
             plant.step(effort[:, index : index + 1].copy(), magnet[index : index + 1])
@@ -199,7 +197,7 @@ def test_a_rigs_trajectory_does_not_depend_to_the_last_bit_on_how_many_step_besi
             assert plant.limit_flags[0] == together.limit_flags[index]
 
 
-def test_the_same_steps_give_the_same_bits() -> None:
+def test_same_steps_are_bit_identical() -> None:
     def run() -> bytes:
         plant = Plant([PARAMETERS])
         for step in range(300):
@@ -209,7 +207,7 @@ def test_the_same_steps_give_the_same_bits() -> None:
     assert run() == run()
 
 
-def test_substeps_are_shorter_steps() -> None:
+def test_substeps_equal_shorter_steps() -> None:
     def after(step_ns: int, substeps: int, steps: int) -> np.ndarray:
         plant = Plant([replace(BARE, sim=StepParameters(step_ns=step_ns, substeps=substeps))])
         for _ in range(steps):
@@ -219,7 +217,7 @@ def test_substeps_are_shorter_steps() -> None:
     np.testing.assert_array_equal(after(20_000_000, 4, 25), after(5_000_000, 1, 100))
 
 
-def test_with_no_torque_the_quill_drops_to_its_stop() -> None:
+def test_quill_without_effort_falls_to_its_stop() -> None:
     plant = plant_at((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
     for _ in range(60):
         plant.step(np.zeros((4, 1)), OFF)
@@ -227,8 +225,8 @@ def test_with_no_torque_the_quill_drops_to_its_stop() -> None:
     assert plant.limit_flags[0] == 1 << 6
 
 
-def test_rigs_of_different_steps_do_not_step_together() -> None:
-    with pytest.raises(InputError, match="need the same step"):
+def test_rigs_with_different_steps_are_rejected() -> None:
+    with pytest.raises(InputError, match="must have the same step"):
         Plant([BARE, replace(BARE, sim=StepParameters(step_ns=10_000_000))])
     with pytest.raises(InputError, match="at least one rig"):
         Plant([])

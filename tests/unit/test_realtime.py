@@ -17,7 +17,7 @@ def _granted(connection: Connection) -> None:
     import platform
     import threading
 
-    realtime.prefer_latency()
+    realtime.set_short_slice()
     slices = []
 
     def look() -> None:
@@ -94,7 +94,7 @@ def _one_ahead(connection: Connection) -> None:
         priorities.append(realtime.realtime_priority())
 
     def receive() -> None:
-        with realtime.one_ahead():
+        with realtime.raise_priority():
             look()
             thread = threading.Thread(target=look)
             thread.start()
@@ -119,7 +119,7 @@ def test_who_receives_goes_one_ahead_and_back_under_the_real_time_policy_alone()
 
 
 def _stepped_back(connection: Connection) -> None:
-    realtime.yield_to_others()
+    realtime.lower_priority()
     connection.send(os.getpriority(os.PRIO_PROCESS, 0))
 
 
@@ -138,6 +138,6 @@ def test_an_unknown_machine_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("platform.machine", lambda: "abacus")
     interval = sys.getswitchinterval()
     try:
-        realtime.prefer_latency()
+        realtime.set_short_slice()
     finally:
         sys.setswitchinterval(interval)

@@ -9,8 +9,8 @@ from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.messaging.recording_stream import (
     FLUSH_PERIOD_NS,
     SESSIONS_PERIOD_NS,
-    LogStream,
-    batches_kept,
+    RecordingStream,
+    batch_cache_depth,
     decode_batch,
     entries_of,
 )
@@ -30,7 +30,7 @@ class Collecting(Publisher):
 
 def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
     out = Collecting()
-    log = LogStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, "sim/1", incarnation=7)
     for number in range(3):
         log.append("hil/lab/rig1/state", number + 1, 100 + number, bytes([number, 255]))
     log.flush(0)
@@ -47,7 +47,7 @@ def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
     sent: list[bytes] = []
     out = Collecting()
     out.put = sent.append  # type: ignore[method-assign]
-    log = LogStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, "sim/1", incarnation=7)
     log.append("hil/lab/rig1/state", 1, 100, b"payload")
     log.flush(0)
     (payload,) = sent
@@ -60,7 +60,7 @@ def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
 
 def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
     out = Collecting()
-    log = LogStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, "sim/1", incarnation=7)
     log.flush(0)
     for _ in range(2):
         log.append("k", 1, 0, b"")
@@ -70,7 +70,7 @@ def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
 
 def test_a_flush_is_due_once_a_period() -> None:
     out = Collecting()
-    log = LogStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, "sim/1", incarnation=7)
     for now in (1_000, 2_000, FLUSH_PERIOD_NS - 1_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
         log.append("k", 1, 0, b"")
         log.flush_if_due(now)
@@ -79,7 +79,7 @@ def test_a_flush_is_due_once_a_period() -> None:
 
 def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_none() -> None:
     out = Collecting()
-    log = LogStream(out, "edge/1", incarnation=7)
+    log = RecordingStream(out, "edge/1", incarnation=7)
     log.set_sessions([OpenSession(rig="rig1", session="s1")])
     log.flush(10)
     log.flush(20)
@@ -92,7 +92,7 @@ def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_n
 
 def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> None:
     out = Collecting()
-    log = LogStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, "sim/1", incarnation=7)
     jitter = random.Random(1)
     for turn in range(200):
         log.append("hil/lab/rig1/state", turn + 1, turn, b"")
@@ -106,8 +106,8 @@ def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> Non
 
 
 def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:
-    kept_ns = {rigs: batches_kept(rigs, 20.0) * FLUSH_PERIOD_NS for rigs in (1, 30, 50, 100, 500)}
+    kept_ns = {rigs: batch_cache_depth(rigs, 20.0) * FLUSH_PERIOD_NS for rigs in (1, 30, 50, 100, 500)}
     assert {rigs: ns / 1e9 for rigs, ns in kept_ns.items()} == {1: 30, 30: 30, 50: 20, 100: 10, 500: 10}
     # At a step of 1 ms a rig says twenty times as much.
-    assert batches_kept(1, 1.0) == 1500
-    assert batches_kept(10, 1.0) == 500
+    assert batch_cache_depth(1, 1.0) == 1500
+    assert batch_cache_depth(10, 1.0) == 500

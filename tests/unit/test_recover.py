@@ -309,7 +309,7 @@ def test_command_recovers_and_reports_losses(tmp_path: Path) -> None:
     answer = hilrig("recover", part)
     assert answer.returncode == 1
     assert "messages in" in answer.stdout
-    assert "not saved" in answer.stdout
+    assert "lost: " in answer.stdout
     assert not part.exists()
     assert read(tmp_path / "truncated.mcap")
     complete = hilrig("recover", tmp_path / "run.mcap")

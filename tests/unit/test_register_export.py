@@ -3,19 +3,19 @@ import io
 import json
 from pathlib import Path
 
-from hilrig_modbus_edge.registers import export as register_tables
+from hilrig_modbus_edge.registers import export
 from hilrig_modbus_edge.registers.map import MAP
 from support.labs import hilrig
 
 PAGE = Path(__file__).parents[2] / "docs/registers.md"
 
 
-def test_the_page_is_generated_from_the_map() -> None:
-    assert PAGE.read_text() == register_tables.as_markdown(), "run: hilrig registers --markdown > docs/registers.md"
+def test_registers_page_equals_the_map() -> None:
+    assert PAGE.read_text() == export.as_markdown(), "run: hilrig registers --markdown > docs/registers.md"
 
 
-def test_the_csv_has_every_value_of_the_map() -> None:
-    rows = list(csv.DictReader(io.StringIO(register_tables.as_csv())))
+def test_csv_has_every_value_of_the_map() -> None:
+    rows = list(csv.DictReader(io.StringIO(export.as_csv())))
     assert {row["name"] for row in rows} == {register.name for register in MAP}
     theta1 = next(row for row in rows if row["name"] == "theta1")
     assert (theta1["table"], theta1["number"], theta1["address"], theta1["classic"]) == (
@@ -29,8 +29,8 @@ def test_the_csv_has_every_value_of_the_map() -> None:
     assert access == {register.name: "R/W" if register.writable else "R" for register in MAP}
 
 
-def test_the_command_prints_the_map_in_each_form() -> None:
-    assert hilrig("registers", "--csv").stdout == register_tables.as_csv()
-    assert hilrig("registers", "--markdown").stdout == register_tables.as_markdown()
-    assert json.loads(hilrig("registers", "--json").stdout) == register_tables.as_rows()
+def test_command_prints_the_map_in_each_format() -> None:
+    assert hilrig("registers", "--csv").stdout == export.as_csv()
+    assert hilrig("registers", "--markdown").stdout == export.as_markdown()
+    assert json.loads(hilrig("registers", "--json").stdout) == export.as_rows()
     assert "theta1" in hilrig("registers").stdout

@@ -3,22 +3,27 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_runtime.bus.reorder_buffer import InOrder
+from hilrig_runtime.bus.reorder_buffer import ReorderBuffer
 
-REACH = 10
+WINDOW = 10
 
 
 class Stream:
     """What a stream gave out: numbers, and how many were lost before each."""
 
-    def __init__(self, reach: int = REACH) -> None:
+    def __init__(self, window: int = WINDOW) -> None:
         self.got: list[int] = []
         self.lost: list[tuple[int, int]] = []
-        self.messages = InOrder[int](self.got.append, lambda count: self.lost.append((len(self.got), count)), reach)
+        self.messages = ReorderBuffer[int](
+            self.got.append, lambda count: self.lost.append((len(self.got), count)), window
+        )
+
+    def _on_loss(self, count: int) -> None:
+        self.lost.append((len(self.got), count))
 
     def take(self, *numbers: int) -> None:
         for number in numbers:
-            self.messages.take(number, number)
+            self.messages.insert(number, number)
 
 
 def test_messages_are_delivered_in_order_and_once() -> None:
@@ -43,7 +48,7 @@ def test_what_is_missing_is_asked_for_from_its_beginning_and_in_pieces() -> None
 def test_a_message_that_was_announced_and_did_not_come_is_missing() -> None:
     stream = Stream()
     stream.take(0)
-    stream.messages.announce(2)
+    stream.messages.set_head(2)
     assert stream.messages.missing(100) == range(1, 3)
 
 
@@ -53,9 +58,9 @@ def test_what_can_not_be_had_any_more_is_lost_and_told_before_what_follows() -> 
     assert stream.messages.missing(100) == range(11, 20)
     assert (stream.got, stream.lost) == ([0], [(1, 10)])
     stream.take(12)
-    stream.messages.give_up()
+    stream.messages.skip_gap()
     assert (stream.got, stream.lost) == ([0, 12], [(1, 10), (1, 1)])
-    stream.messages.finish()
+    stream.messages.flush()
     assert (stream.got, stream.lost) == ([0, 12, 20], [(1, 10), (1, 1), (2, 7)])
 
 
@@ -64,18 +69,18 @@ def test_what_was_sent_before_the_first_that_could_be_had_is_no_loss() -> None:
     stream.take(30)
     assert stream.messages.missing(100) == range(21, 30)
     stream.take(25)
-    stream.messages.give_up()
+    stream.messages.skip_gap()
     assert (stream.got, stream.lost) == ([25], [])
-    stream.messages.give_up()
+    stream.messages.skip_gap()
     assert (stream.got, stream.lost) == ([25, 30], [(1, 4)])
 
 
 def test_a_number_far_away_takes_no_time() -> None:
     stream = Stream()
     stream.take(0)
-    stream.messages.announce(2**32 - 1)
-    assert len(stream.messages.missing(100)) == REACH
-    assert stream.lost == [(1, 2**32 - 1 - REACH)]
+    stream.messages.set_head(2**32 - 1)
+    assert len(stream.messages.missing(100)) == WINDOW
+    assert stream.lost == [(1, 2**32 - 1 - WINDOW)]
 
 
 @given(
@@ -92,10 +97,10 @@ def test_every_message_is_delivered_in_order_or_counted_as_lost(case: tuple[int,
         stream.take(number)
         stream.messages.missing(3)
         if at in give_ups:
-            stream.messages.give_up()
-    stream.messages.announce(count - 1)
-    stream.messages.give_up()
-    stream.messages.finish()
+            stream.messages.skip_gap()
+    stream.messages.set_head(count - 1)
+    stream.messages.skip_gap()
+    stream.messages.flush()
     assert stream.got == sorted(set(stream.got))
     assert set(stream.got) <= set(arrivals)
     assert not stream.messages.missing(100)

@@ -1,33 +1,33 @@
-"""Requests a second: the same whatever pieces they come in, and bounded whatever controllers come and go."""
+"""Request rates: independent of the block size, with a bounded number of controllers."""
 
 import numpy as np
 
-from hilrig_replay.analysis.request_rates import BIN_NS, MOST, OTHERS, RequestRates
-from hilrig_replay.io.columns import TRAFFIC, Names, Rows
+from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, RequestRates
+from hilrig_replay.io.columns import TRAFFIC_DTYPE, Rows, StringTable
 
 
-def requests(names: Names, at_ms: list[float], *, controller: str = "a:1", function: int = 3) -> Rows:
-    rows = np.zeros(len(at_ms), TRAFFIC)
+def requests(names: StringTable, at_ms: list[float], *, controller: str = "a:1", function: int = 3) -> Rows:
+    rows = np.zeros(len(at_ms), TRAFFIC_DTYPE)
     rows["wall_ns"] = np.array(at_ms) * 1e6
     rows["controller"] = names.code(controller)
     rows["function"] = function
     return rows
 
 
-def counted(pieces: list[Rows], names: Names) -> dict[tuple[str, str], dict[int, int]]:
+def counted(pieces: list[Rows], names: StringTable) -> dict[tuple[str, str], dict[int, int]]:
     rates = RequestRates(names)
     found: dict[tuple[str, str], dict[int, int]] = {}
     given = [rate for piece in pieces for rate in rates.add(piece)] + list(rates.end())
     for client, kind, begins_ns, counts in given:
         bins = found.setdefault((client, kind), {})
         for begin_ns, count in zip(begins_ns.tolist(), counts.tolist(), strict=True):
-            assert begin_ns // BIN_NS not in bins, "a bin is given once"
+            assert begin_ns // BIN_NS not in bins, "a bin is returned once"
             bins[begin_ns // BIN_NS] = count
     return found
 
 
-def test_requests_are_counted_by_controller_and_kind() -> None:
-    names = Names()
+def test_counts_requests_by_controller_and_kind() -> None:
+    names = StringTable()
     rows = np.concatenate(
         (
             requests(names, [0, 50, 99, 100, 350]),
@@ -42,8 +42,8 @@ def test_requests_are_counted_by_controller_and_kind() -> None:
     }
 
 
-def test_pieces_do_not_change_what_is_counted() -> None:
-    names = Names()
+def test_counts_do_not_depend_on_the_block_size() -> None:
+    names = StringTable()
     at_ms = np.sort(np.random.default_rng(2).uniform(0, 5000, 700)).tolist()
     whole = counted([requests(names, at_ms)], names)
     assert sum(whole["a:1", "reads"].values()) == 700
@@ -52,26 +52,26 @@ def test_pieces_do_not_change_what_is_counted() -> None:
         assert counted(pieces, names) == whole
 
 
-def test_a_long_silence_costs_two_points() -> None:
-    names = Names()
+def test_a_long_gap_has_two_points() -> None:
+    names = StringTable()
     hour_ms = 3_600_000.0
     bins = counted([requests(names, [0, hour_ms])], names)["a:1", "reads"]
     assert bins == {0: 1, 1: 0, 35_999: 0, 36_000: 1}
 
 
-def test_controllers_beyond_the_first_are_counted_together() -> None:
-    names = Names()
-    rows = [requests(names, [10], controller=f"10.0.0.1:{number}") for number in range(MOST + 50)]
+def test_counts_controllers_beyond_the_limit_together() -> None:
+    names = StringTable()
+    rows = [requests(names, [10], controller=f"10.0.0.1:{number}") for number in range(MAX_CLIENTS + 50)]
     found = counted([np.concatenate(rows)], names)
-    assert len(found) == MOST + 1
-    assert found[OTHERS, "reads"] == {0: 50}
+    assert len(found) == MAX_CLIENTS + 1
+    assert found[OTHER_CLIENTS, "reads"] == {0: 50}
 
 
-def test_texts_beyond_what_a_code_can_tell_apart_share_the_last_one() -> None:
-    names = Names()
+def test_texts_beyond_the_code_range_share_the_last_code() -> None:
+    names = StringTable()
     codes = [names.code(f"192.0.2.7:{port}") for port in range(70_000)]
     assert codes[:3] == [1, 2, 3]
     assert max(codes) == 0xFFFF
-    assert (names[codes[65_533]], names[codes[65_534]]) == ("192.0.2.7:65533", Names.OTHERS)
+    assert (names[codes[65_533]], names[codes[65_534]]) == ("192.0.2.7:65533", StringTable.OVERFLOW_TEXT)
     assert names.code("192.0.2.7:5") == codes[5]
     assert codes[65_534:] == [0xFFFF] * (70_000 - 65_534)

@@ -97,3 +97,11 @@ def test_unwritable_path_raises(tmp_path: Path) -> None:
         save_rrd(run, tmp_path / "nowhere" / "run.rrd")
     with pytest.raises(OperationError, match="can't be written: Is a directory"):
         save_rrd(run, tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full exists on Linux only")
+def test_reports_a_full_disk(tmp_path: Path) -> None:
+    run = open_run(record(tmp_path / "run.mcap", Script(seconds=2.0)))
+    (tmp_path / "run.rrd").symlink_to("/dev/full")
+    with pytest.raises(OperationError, match=r"run\.rrd: can't be written: .*No space left on device"):
+        save_rrd(run, tmp_path / "run.rrd")

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.compare import Origin, compare, origin_of
-from hilrig_replay.analysis.summary import COURSE_POINTS, summarise
+from hilrig_replay.analysis.compare import Origin, compare, find_origin
+from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
 from hilrig_replay.geometry.scene import tool_positions
-from hilrig_replay.io.paths import names_of
+from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.comparison_plot import save_comparison_plot
 from hilrig_replay.report.report import build_report
@@ -32,7 +32,7 @@ def named(folder: Path, name: str, script: Script, made: list[Made] | None = Non
 
 def test_summary_has_the_scripted_motion(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=10.0)))
-    summary = summarise(run)
+    summary = summarize(run)
     t = np.arange(0, 10.0, 0.001)
     path = tool_positions(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
     assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum(), rel=0.01)
@@ -40,8 +40,8 @@ def test_summary_has_the_scripted_motion(tmp_path: Path) -> None:
     assert summary.motion.work_j == pytest.approx(work)
     assert summary.motion.saturated_share == (0, 0, 0, 0)
     assert summary.events == {"SESSION_END": 1, "SESSION_START": 1}
-    assert summary.task is not None
-    assert (summary.task.placed, len(summary.task.parts)) == (0, 4)
+    assert summary.placement is not None
+    assert (summary.placement.placed, len(summary.placement.parts)) == (0, 4)
 
 
 def test_saturation_is_the_share_of_steps_at_the_limit(tmp_path: Path) -> None:
@@ -50,16 +50,16 @@ def test_saturation_is_the_share_of_steps_at_the_limit(tmp_path: Path) -> None:
     states = [one.message for one in made if isinstance(one.message, JointState)]
     for state in states[:50]:
         state.effort[2] = -32.767
-    summary = summarise(named(tmp_path, "run", script, made))
+    summary = summarize(named(tmp_path, "run", script, made))
     assert summary.motion.saturated_share == (0, 0, 0.25, 0)
     assert summary.motion.peak_effort[2] == 32.767
 
 
 def test_trajectory_length_is_bounded(tmp_path: Path) -> None:
     script = Script(seconds=10.0, step_ms=1.0, poll_ms=50.0)
-    course = summarise(named(tmp_path, "run", script)).course
-    assert COURSE_POINTS <= len(course.time_s) < 2 * COURSE_POINTS
-    assert np.allclose(np.diff(course.time_s), course.time_s[1], atol=2e-4)
+    trajectory = summarize(named(tmp_path, "run", script)).trajectory
+    assert TRAJECTORY_POINTS <= len(trajectory.time_s) < 2 * TRAJECTORY_POINTS
+    assert np.allclose(np.diff(trajectory.time_s), trajectory.time_s[1], atol=2e-4)
 
 
 def test_identical_runs_have_no_differences(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_comparison_shows_a_slower_controller(tmp_path: Path) -> None:
 
 def test_missing_alignment_event_is_reported(tmp_path: Path) -> None:
     run = named(tmp_path, "run", Script(seconds=2.0))
-    with pytest.raises(InputError, match="has no event PART_PICKED; it has SESSION_END, SESSION_START"):
+    with pytest.raises(InputError, match="no event PART_PICKED; its events: SESSION_END, SESSION_START"):
         compare([run, run], "part_picked")
 
 
@@ -136,11 +136,11 @@ def test_initial_zero_torque_is_not_a_controller_command(tmp_path: Path) -> None
         0, Made("command", first.publish_wall_ns, TorqueCommand(rig="rig1", seq=1, effort=[0.0] * 4, safe=True))
     )
     run = named(tmp_path, "alone", silent, made)
-    assert origin_of(run, "motion") == Origin(0, "start")
-    summary = summarise(
+    assert find_origin(run, "motion") == Origin(0, "start")
+    summary = summarize(
         run, parse_lab("[[task.poses]]\nname = 'here'\nposition_mm = [300, 0, 0]\ntolerance_mm = 900\n").task
     )
-    assert summary.latency.reasons == ("nothing closed a loop, for no controller wrote in this session",)
+    assert summary.latency.reasons == ("no closed loop: no controller wrote commands in this session",)
     assert summary.grade is not None
     assert summary.grade.score == 0
 
@@ -154,14 +154,14 @@ def test_run_without_alignment_is_excluded(tmp_path: Path) -> None:
     comparison = compare(runs, "session-end")
     assert [one.session for one in comparison.differences] == ["two"]
     assert [run.session for run in comparison.runs] == ["one", "two"]
-    assert ["has no event SESSION_END" in reason for reason in comparison.left_out] == [True]
+    assert ["no event SESSION_END" in reason for reason in comparison.left_out] == [True]
 
 
 def test_report_of_a_run_without_a_controller(tmp_path: Path) -> None:
     silent = named(tmp_path, "silent", Script(seconds=2.0, controllers=False))
     alone = build_report([silent.path])
     page = _Page(alone.html)
-    assert page.text.count("nothing closed a loop, for no controller wrote in this session") == 2
+    assert page.text.count("no closed loop: no controller wrote commands in this session") == 2
     assert alone.html.count("<img") == 2
     assert "tick lateness" in page.text
     among = build_report([silent.path, named(tmp_path, "quick", Script(seconds=2.0)).path])
@@ -172,7 +172,7 @@ def test_report_of_a_run_without_a_controller(tmp_path: Path) -> None:
 
 
 def test_comparison_of_one_run_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="two runs or more"):
+    with pytest.raises(InputError, match="at least two runs"):
         compare([named(tmp_path, "run", Script(seconds=1.0))])
 
 
@@ -224,7 +224,7 @@ def test_report_is_a_self_contained_page(tmp_path: Path) -> None:
         "Not valid for latency measurements",
     ):
         assert expected in page.text, expected
-    assert "pass between reading the positions and writing the torques" in page.text
+    assert "between reading the positions and writing the torques" in page.text
 
 
 def test_group_report_ranks_the_runs(tmp_path: Path) -> None:
@@ -271,7 +271,7 @@ def test_files_with_equal_names_are_distinguished(tmp_path: Path) -> None:
         paths.append(named(tmp_path / day, "anna", Script(seconds=1.0)).path)
     third = named(tmp_path, "ben", Script(seconds=1.0)).path
     page = _Page(build_report([*paths, third]).html)
-    assert set(names_of([*paths, third]).values()) == {
+    assert set(display_names([*paths, third]).values()) == {
         str(tmp_path / "monday/anna"),
         str(tmp_path / "tuesday/anna"),
         "ben",

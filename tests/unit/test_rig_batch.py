@@ -29,14 +29,14 @@ def test_a_batch_is_on_the_bus_and_each_message_on_its_own_key_and_on_the_record
     together, single = Heard(hub, STATES.key("lab", "*", "*")), Heard(hub, STATE.key("lab", "rig2"))
     log = Heard(hub, LOG.key("lab", "*", "*"))
     with Service("sim", LAB, MemoryBus(hub), clock=ManualClock()) as service:
-        sender = service.batch_sender(STATES)
+        sender = service.batch_publisher(STATES)
         for rig in ("rig1", "rig2"):
             service.add_to_batch(sender, STATE, rig)
-        sender.send([b"one", b"two"])
+        sender.publish([b"one", b"two"])
         service.add_to_batch(sender, STATE, "rig3")
         sender.remove(0)
-        sender.send([b"four", b"five"])
-        service.log.flush(0)
+        sender.publish([b"four", b"five"])
+        service.recording_stream.flush(0)
         assert service.counters.published == 4
     assert together.batches() == [{"rig1": b"one", "rig2": b"two"}, {"rig2": b"four", "rig3": b"five"}]
     assert single.payloads == [b"two", b"four"]
@@ -48,7 +48,7 @@ def test_a_batch_is_on_the_bus_and_each_message_on_its_own_key_and_on_the_record
 def test_of_each_rig_the_newest_is_kept_and_rubbish_is_counted() -> None:
     hub = MemoryHub()
     with Service("edge", LAB, MemoryBus(hub), clock=ManualClock()) as service:
-        latest = service.latest_of_batches(STATES)
+        latest = service.latest_value_cache(STATES)
         put = MemoryBus(hub).publisher(STATES.key("lab", "sim", "1"), STATES.traffic).put
         put(RigBatch(rigs=["rig1", "rig2"], messages=[b"a", b"b"]).SerializeToString())
         first = latest.get("rig1")
@@ -64,7 +64,7 @@ def test_of_each_rig_the_newest_is_kept_and_rubbish_is_counted() -> None:
 def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
     hub = MemoryHub()
     with Service("sim", LAB, MemoryBus(hub), clock=ManualClock()) as service:
-        latest = service.latest_of_batches(COMMANDS, {"east": ("rig1",), "west": ("rig2",)})
+        latest = service.latest_value_cache(COMMANDS, {"east": ("rig1",), "west": ("rig2",)})
         for instance, payload in (("east", b"e"), ("stranger", b"s")):
             batch = RigBatch(rigs=["rig1", "rig2"], messages=[payload, payload])
             MemoryBus(hub).publisher(COMMANDS.key("lab", "edge", instance), COMMANDS.traffic).put(
@@ -76,7 +76,7 @@ def test_an_edge_with_rigs_of_its_own_is_heard_of_no_other() -> None:
 
 def test_sending_for_long_takes_no_memory() -> None:
     with VirtualRig(parse_lab("[rigs]\ncount = 32\n")) as lab:
-        lab.service.log.extend = list  # type: ignore[assignment, method-assign]
+        lab.service.recording_stream.extend = list  # type: ignore[assignment, method-assign]
 
         def work(steps: int) -> None:
             for step in range(steps):

@@ -1,4 +1,4 @@
-"""Rigs are added and taken away while others run, and the others' motion is the same to the last bit."""
+"""Unit tests of adding and removing rigs at run time: the motion of the other rigs stays bit-identical."""
 
 import json
 from collections.abc import Callable
@@ -8,11 +8,11 @@ import pytest
 
 from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.rig_registry import Membership
+from hilrig_sim.rig_registry import RigRegistry
 from support.virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
@@ -20,7 +20,7 @@ GUEST = RigSettings(name="guest")
 
 
 def motion(change: Callable[[VirtualRig], None] | None = None, rig: str = "rig3") -> list[bytes]:
-    """What a rig does for 60 steps under a torque, where something happens to the others at the 20th."""
+    """Return the states of a rig for 60 steps under a torque; `change` is applied at step 20."""
     with VirtualRig(LAB) as lab:
         for step in range(60):
             if step == 20 and change is not None:
@@ -42,22 +42,22 @@ def without(lab: VirtualRig, index: int) -> Plant:
     return Plant([one for number, one in enumerate(lab.simulation.parameters) if number != index])
 
 
-def test_others_do_not_feel_a_rig_that_is_added() -> None:
+def test_added_rig_does_not_change_the_others() -> None:
     assert motion() == motion(lambda lab: lab.simulation.add("guest", grown(lab)))
 
 
-def test_others_do_not_feel_a_rig_that_is_taken_away() -> None:
+def test_removed_rig_does_not_change_the_others() -> None:
     assert motion() == motion(lambda lab: lab.simulation.remove(0, without(lab, 0)))
 
 
-def test_torques_and_magnets_that_stand_stay_with_their_rigs_when_one_before_them_is_taken_away() -> None:
+def test_held_commands_stay_with_their_rigs_after_removal() -> None:
     def moved(lab: VirtualRig, *, remove: bool) -> dict[str, list[float]]:
         for number, name in enumerate(("rig1", "rig2", "rig3"), start=1):
             lab.command((0.5 * number, -0.2 * number, -4.9, 0.01), magnet=number == 2, rig=name)
         lab.tick(2)
         if remove:
             lab.simulation.remove(0, without(lab, 0))
-        # Nothing is sent any more: what stands acts.
+        # No further commands: the held ones stay applied.
         assert lab.simulation._magnet.tolist() == ([True, False] if remove else [False, True, False])
         lab.tick(15)
         return {state.rig: list(state.position) for state in lab.states[-2:]}
@@ -66,7 +66,7 @@ def test_torques_and_magnets_that_stand_stay_with_their_rigs_when_one_before_the
         assert moved(all_three, remove=False) == moved(two, remove=True)
 
 
-def test_a_rig_that_was_added_moves_and_is_recorded() -> None:
+def test_added_rig_moves_and_is_recorded() -> None:
     with VirtualRig(LAB) as lab:
         lab.tick(5)
         lab.simulation.add("guest", grown(lab))
@@ -76,10 +76,12 @@ def test_a_rig_that_was_added_moves_and_is_recorded() -> None:
         mine = [state for state in lab.states if state.rig == "guest"]
         assert len(mine) == 20
         assert mine[-1].position[0] > 0.01
-        assert [key for key, *_ in lab.service.log._entries].count(topics.STATE.key(lab.lab.name, "guest")) == 20
+        assert [key for key, *_ in lab.service.recording_stream._entries].count(
+            topics.STATE.key(lab.lab.name, "guest")
+        ) == 20
 
 
-def test_parts_in_the_air_and_on_magnets_go_on() -> None:
+def test_copied_state_includes_falling_and_held_parts() -> None:
     lab = LabConfig()
     parameters = [rig_parameters(lab, lab.rigs[0])] * 2
     before, after = Plant(parameters), Plant(parameters)
@@ -87,7 +89,7 @@ def test_parts_in_the_air_and_on_magnets_go_on() -> None:
     effort[2] = 6.0
     for step in range(120):
         before.step(effort, on if step % 60 < 50 else ~on)
-    after.adopt(before, [0, 1], [0, 1])
+    after.copy_state_from(before, [0, 1], [0, 1])
     for _ in range(40):
         before.step(effort, on)
         after.step(effort, on)
@@ -97,68 +99,70 @@ def test_parts_in_the_air_and_on_magnets_go_on() -> None:
         assert np.array_equal(getattr(before.world, name), getattr(after.world, name))
 
 
-class Served(VirtualRig):
-    """A simulation whose rigs can be changed over the bus; its turns are run at once."""
+class RegistryRig(VirtualRig):
+    """A simulation with a rig registry on the bus, whose mailbox executes calls at once."""
 
     def __init__(self) -> None:
         super().__init__(LAB)
-        turns = Turns()
+        turns = OwnerThreadExecutor()
         turns.call = lambda work: work()  # type: ignore[method-assign]
-        self.membership = Membership(self.service, self.simulation, turns)
+        self.registry = RigRegistry(self.service, self.simulation, turns)
 
     def ask(self, kind: Event.Kind, rig: str, settings: str = "") -> str:
         request = Event(kind=kind, rig=rig)
         request.configuration_data.text = settings
-        (answer,) = self.service.bus.ask(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
+        (answer,) = self.service.bus.query(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
         return answer.error or Event.FromString(answer.payload).text
 
 
-def test_a_simulation_says_how_it_steps_when_it_begins() -> None:
-    with Served() as lab:
+def test_start_event_has_the_step_parameters() -> None:
+    with RegistryRig() as lab:
         assert lab.kinds() == ["CONFIGURATION"] * 3
         assert [event.rig for event in lab.events] == ["rig1", "rig2", "rig3"]
-        assert lab.events[0].text == "simulated from now on: step 20 ms, rkf45"
-        said = json.loads(lab.events[0].configuration_data.text)
-        assert said == {"step_ns": 20_000_000, "substeps": 1, "integrator": "rkf45"}
+        assert lab.events[0].text == "simulation started: step 20 ms, rkf45"
+        parameters = json.loads(lab.events[0].configuration_data.text)
+        assert parameters == {"step_ns": 20_000_000, "substeps": 1, "integrator": "rkf45"}
 
 
-def test_over_the_bus_a_rig_is_added_described_and_taken_away() -> None:
-    with Served() as lab:
+def test_rig_is_added_described_and_removed_by_query() -> None:
+    with RegistryRig() as lab:
         assert lab.ask(Event.RIG_ADDED, "guest", GUEST.model_dump_json()) == "guest is simulated"
-        (answer,) = lab.service.bus.ask(topics.CONFIG.key(LAB.name, "guest"))
+        (answer,) = lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest"))
         assert RigConfig.FromString(answer.payload).rig == "guest"
         assert [rig.name for rig in lab.service.rigs] == ["rig1", "rig2", "rig3", "guest"]
-        assert lab.ask(Event.RIG_REMOVED, "guest") == "guest is simulated no more"
-        assert lab.service.bus.ask(topics.CONFIG.key(LAB.name, "guest")) == []
+        assert lab.ask(Event.RIG_REMOVED, "guest") == "guest is no longer simulated"
+        assert lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest")) == []
         assert lab.kinds()[-2:] == ["RIG_ADDED", "RIG_REMOVED"]
 
 
-def test_what_can_not_be_done_is_refused_and_changes_nothing() -> None:
-    with Served() as lab:
+def test_invalid_requests_are_rejected_without_effect() -> None:
+    with RegistryRig() as lab:
         assert (
             lab.ask(Event.RIG_ADDED, "rig1", RigSettings(name="rig1").model_dump_json())
-            == "'rig1' is simulated already"
+            == "rig 'rig1' is already simulated here; choose another name"
         )
         assert "expected greater than 0" in lab.ask(Event.RIG_ADDED, "x", '{"name": "x", "arm": {"l2_m": -1}}')
-        assert lab.ask(Event.RIG_REMOVED, "nobody") == "'nobody' is not simulated here"
-        assert "does not know" in lab.ask(Event.SESSION_START, "rig1")
-        assert lab.ask(Event.RIG_REMOVED, "rig1").endswith("no more")
+        assert (
+            lab.ask(Event.RIG_REMOVED, "nobody") == "rig 'nobody' is not simulated here; hilrig rig list shows all rigs"
+        )
+        assert "unknown control request" in lab.ask(Event.SESSION_START, "rig1")
+        assert lab.ask(Event.RIG_REMOVED, "rig1").endswith("no longer simulated")
         lab.ask(Event.RIG_REMOVED, "rig2")
         assert "the only rig" in lab.ask(Event.RIG_REMOVED, "rig3")
         lab.tick()
         assert lab.states[-1].rig == "rig3"
 
 
-def test_a_service_that_does_not_come_to_it_says_so_and_does_not_do_it_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timed_out_call_fails_and_is_not_executed_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilrig_runtime.process.mailbox.TIMEOUT_S", 0.01)
-    turns, done = Turns(), []
+    turns, done = OwnerThreadExecutor(), []
     with pytest.raises(OperationError, match="too busy"):
         turns.call(lambda: done.append(1))
-    turns.run_waiting()
+    turns.run_pending()
     assert done == []
 
 
-def test_a_broken_number_in_one_rig_stays_in_it() -> None:
+def test_nan_in_one_rig_does_not_change_the_others() -> None:
     def break_first(lab: VirtualRig) -> None:
         lab.simulation._plant.velocity[:, 0] = np.nan
 
@@ -166,8 +170,8 @@ def test_a_broken_number_in_one_rig_stays_in_it() -> None:
         assert motion() == motion(break_first)
 
 
-def test_a_malformed_command_for_one_rig_does_not_touch_another() -> None:
-    def send_rubbish(lab: VirtualRig) -> None:
+def test_malformed_command_does_not_change_other_rigs() -> None:
+    def send_malformed(lab: VirtualRig) -> None:
         lab.send(b"\xff\x00rubbish", "rig1")
 
-    assert motion() == motion(send_rubbish)
+    assert motion() == motion(send_malformed)

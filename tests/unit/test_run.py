@@ -1,4 +1,4 @@
-"""A recording read back: every field as it was written, and every bad file one clear sentence."""
+"""Loading of recordings: all fields are read as written, and each defect of a file has a clear error message."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from hilrig_replay.io.columns import COMMAND, STATE
+from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -23,12 +23,12 @@ def path(tmp_path: Path, made: list[Made]) -> Path:
     return write(tmp_path / "run.mcap", made)
 
 
-def test_every_field_of_every_state_is_as_it_was_sent(path: Path, made: list[Made]) -> None:
+def test_reads_all_fields_of_states(path: Path, made: list[Made]) -> None:
     run = open_run(path)
     sent = [one.message for one in made if isinstance(one.message, JointState)]
     assert len(run.states) == len(sent) == 150
     texts = {"session", "held_part"}
-    for name in STATE.names or ():
+    for name in STATE_DTYPE.names or ():
         if name in ("log_ns", "sequence"):
             continue
         for row, message in zip(run.states, sent, strict=True):
@@ -37,12 +37,12 @@ def test_every_field_of_every_state_is_as_it_was_sent(path: Path, made: list[Mad
             assert np.array_equal(value, expected if not hasattr(expected, "append") else list(expected)), name
 
 
-def test_every_field_of_every_command_is_as_it_was_sent(path: Path, made: list[Made]) -> None:
+def test_reads_all_fields_of_commands(path: Path, made: list[Made]) -> None:
     run = open_run(path)
     sent = [one.message for one in made if isinstance(one.message, TorqueCommand)]
     assert len(run.commands) == len(sent) > 500
     texts = {"session", "controller"}
-    for name in COMMAND.names or ():
+    for name in COMMAND_DTYPE.names or ():
         if name in ("log_ns", "sequence"):
             continue
         for row, message in zip(run.commands, sent, strict=True):
@@ -51,7 +51,7 @@ def test_every_field_of_every_command_is_as_it_was_sent(path: Path, made: list[M
             assert np.array_equal(value, expected if not hasattr(expected, "append") else list(expected)), name
 
 
-def test_parts_events_and_requests_are_there(path: Path, made: list[Made]) -> None:
+def test_reads_parts_events_and_requests(path: Path, made: list[Made]) -> None:
     run = open_run(path)
     assert set(run.names.texts(run.parts["part"])) == {"red", "blue", "green", "yellow"}
     assert list(run.events["kind"]) == ["SESSION_START", "SESSION_END"]
@@ -62,7 +62,7 @@ def test_parts_events_and_requests_are_there(path: Path, made: list[Made]) -> No
     assert (requests["answered_ns"] - requests["arrived_ns"] == 15_000).all()
 
 
-def test_the_run_says_what_it_is(path: Path) -> None:
+def test_reads_the_metadata(path: Path) -> None:
     run = open_run(path)
     assert (run.session, run.rig, run.lab) == ("20260101T000000Z-rig1-abcd", "rig1", "lab")
     assert run.controller == "192.0.2.7:40001"
@@ -72,21 +72,21 @@ def test_the_run_says_what_it_is(path: Path) -> None:
     assert "<robot" in run.urdf
 
 
-def test_time_begins_with_the_first_state_and_goes_by_its_clock(path: Path) -> None:
+def test_time_axis_uses_the_clock_of_the_states(path: Path) -> None:
     run = open_run(path)
     times = run.time_s(run.states)
     assert times[0] == 0
     assert np.allclose(np.diff(times), 0.02, atol=2e-4)
-    # The edge's clock is years away from the simulation's: commands come in by the wall clock.
+    # The monotonic clocks of edge and simulation are unrelated: commands are placed by the wall clock.
     assert np.array_equal(run.time_ns(run.commands), run.commands["wall_ns"] - run.start_wall_ns)
 
 
-def test_across_a_restart_of_the_simulation_time_goes_on(tmp_path: Path, made: list[Made]) -> None:
+def test_time_axis_continues_across_a_simulation_restart(tmp_path: Path, made: list[Made]) -> None:
     states = [one for one in made if isinstance(one.message, JointState)]
     for number, one in enumerate(states[100:]):
         message = JointState()
         message.CopyFrom(one.message)
-        # A new process: steps from 1, and a clock that has nothing to do with the old one.
+        # A new process: steps from 1, and an unrelated clock.
         message.incarnation, message.step = 99, number + 1
         message.sampled_ns -= 4_000_000_000_000
         states[100 + number] = Made("state", one.publish_wall_ns, message)
@@ -94,7 +94,7 @@ def test_across_a_restart_of_the_simulation_time_goes_on(tmp_path: Path, made: l
     assert np.allclose(np.diff(run.time_s(run.states)), 0.02, atol=2e-4)
 
 
-def test_blocks_hold_the_same_as_the_whole(path: Path) -> None:
+def test_blocks_contain_the_complete_run(path: Path) -> None:
     run = open_run(path)
     blocks = list(run.blocks(rows=100))
     assert len(blocks) > 5
@@ -103,7 +103,7 @@ def test_blocks_hold_the_same_as_the_whole(path: Path) -> None:
     assert np.array_equal(np.concatenate([block.traffic for block in blocks]), run.traffic)
 
 
-def test_a_range_of_time_is_what_lies_in_it(path: Path) -> None:
+def test_reads_a_time_range(path: Path) -> None:
     run = open_run(path)
     between = run.between(1.0, 2.0)
     low, high = START_WALL_NS + int(1e9), START_WALL_NS + int(2e9)
@@ -115,39 +115,37 @@ def test_a_range_of_time_is_what_lies_in_it(path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_every_compression_of_the_format_is_read(
-    tmp_path: Path, made: list[Made], compression: CompressionType
-) -> None:
+def test_reads_all_mcap_compressions(tmp_path: Path, made: list[Made], compression: CompressionType) -> None:
     assert len(open_run(write(tmp_path / "run.mcap", made, compression=compression)).states) == 150
 
 
-def test_a_missing_file_is_said(tmp_path: Path) -> None:
+def test_reports_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run\.mcap: no such file"):
         open_run(tmp_path / "run.mcap")
 
 
-def test_a_folder_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a folder, where a recording"):
+def test_reports_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected a recording \(\.mcap\), found a folder"):
         open_run(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"", "empty: there is nothing"), (b"# not a recording\n" * 9, "no MCAP file")]
+    ("content", "words"), [(b"", "the file is empty"), (b"# not a recording\n" * 9, "not an MCAP file")]
 )
-def test_a_file_of_something_else_is_said(tmp_path: Path, content: bytes, words: str) -> None:
+def test_reports_a_file_of_another_format(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
         open_run(path)
 
 
-def test_a_torn_file_names_the_command_that_repairs_it(tmp_path: Path, made: list[Made]) -> None:
+def test_truncated_file_error_names_the_recover_command(tmp_path: Path, made: list[Made]) -> None:
     path = write(tmp_path / "run.mcap.part", made, finish=False)
-    with pytest.raises(InputError, match=r"still being written, or torn.*`hilrig recover .*run\.mcap\.part`"):
+    with pytest.raises(InputError, match=r"still being written, or truncated.*`hilrig recover .*run\.mcap\.part`"):
         open_run(path)
 
 
-def test_a_file_cut_anywhere_is_a_clear_sentence(path: Path) -> None:
+def test_reports_a_file_truncated_at_any_position(path: Path) -> None:
     whole = path.read_bytes()
     cut = path.with_name("cut.mcap")
     for size in range(0, len(whole) - 1, max(1, len(whole) // 40)):
@@ -156,7 +154,7 @@ def test_a_file_cut_anywhere_is_a_clear_sentence(path: Path) -> None:
             open_run(cut)
 
 
-def test_a_flipped_byte_is_found_by_its_checksum(path: Path) -> None:
+def test_checksum_detects_a_flipped_bit(path: Path) -> None:
     whole = bytearray(path.read_bytes())
     whole[len(whole) // 3] ^= 0x40
     path.write_bytes(whole)
@@ -165,19 +163,21 @@ def test_a_flipped_byte_is_found_by_its_checksum(path: Path) -> None:
             pass
 
 
-def test_a_recording_without_states_is_empty(tmp_path: Path, made: list[Made]) -> None:
+def test_reports_a_recording_without_states(tmp_path: Path, made: list[Made]) -> None:
     path = write(tmp_path / "run.mcap", [one for one in made if one.topic == "event"])
-    with pytest.raises(InputError, match=r"an empty recording: it holds no state of the arm \(2 other messages\)"):
+    with pytest.raises(InputError, match=r"empty recording: it contains no state of the arm \(2 other messages\)"):
         open_run(path)
 
 
-def test_a_newer_schema_asks_for_a_newer_hilrig(tmp_path: Path, made: list[Made]) -> None:
+def test_reports_a_newer_schema_version(tmp_path: Path, made: list[Made]) -> None:
     path = write(tmp_path / "run.mcap", made, schema_version="hilrig.v2")
-    with pytest.raises(InputError, match=r"recorded with messages hilrig\.v2, and this hilrig reads hilrig\.v1"):
+    with pytest.raises(
+        InputError, match=r"recorded with message schemas hilrig\.v2, but this version reads hilrig\.v1"
+    ):
         open_run(path)
 
 
-def test_a_file_that_does_not_say_what_was_lost_has_no_figure(tmp_path: Path) -> None:
+def test_losses_are_unknown_without_metadata(tmp_path: Path) -> None:
     script = Script(seconds=1.0)
     path = write(tmp_path / "run.mcap", make(script), metadata={"hilrig.summary": {"ended": "recovered"}})
     run = open_run(path)
@@ -185,7 +185,7 @@ def test_a_file_that_does_not_say_what_was_lost_has_no_figure(tmp_path: Path) ->
     assert run.recovered
 
 
-def test_a_run_without_a_controller_can_be_opened(tmp_path: Path) -> None:
+def test_opens_a_run_without_a_controller(tmp_path: Path) -> None:
     run = open_run(record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False)))
     assert len(run.states) == 50
     assert len(run.commands) == 0

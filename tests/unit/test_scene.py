@@ -119,5 +119,5 @@ def test_parameters_round_trip() -> None:
     parameters = RigParameters(arm=ArmParameters(l2=0.25))
     assert parameters_of(parameters.to_json()) == parameters
     assert parameters_of("") == RigParameters()
-    with pytest.raises(InputError, match="parameters are not understood"):
+    with pytest.raises(InputError, match="invalid rig parameters"):
         parameters_of("{}")

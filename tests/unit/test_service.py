@@ -22,9 +22,9 @@ def test_what_is_sent_is_on_the_bus_and_on_the_record_with_the_same_bytes() -> N
     witness.subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
     witness.subscribe(LOG.key("lab", "*", "*"), lambda _, payload: batches.append(payload))
     with make_service(hub, clock) as service:
-        sender = service.sender(STATE, "rig1")
+        sender = service.rig_publisher(STATE, "rig1")
         for step in (1, 2):
-            sender.send(JointState(rig="rig1", step=step))
+            sender.publish(JointState(rig="rig1", step=step))
         service.beat(clock.monotonic_ns())
     batch = LogBatch.FromString(batches[0])
     assert list(batch.payloads) == seen
@@ -37,7 +37,7 @@ def test_a_repetition_is_heard_but_not_recorded() -> None:
     seen: list[bytes] = []
     MemoryBus(hub).subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
     with make_service(hub, ManualClock()) as service:
-        service.sender(STATE, "rig1").repeat(JointState(step=1))
+        service.rig_publisher(STATE, "rig1").republish(JointState(step=1))
     assert len(seen) == 1
     assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).keys]
 
@@ -45,13 +45,13 @@ def test_a_repetition_is_heard_but_not_recorded() -> None:
 def test_only_the_newest_value_of_each_rig_is_kept_with_its_arrival() -> None:
     hub, clock = MemoryHub(), ManualClock()
     with make_service(hub, clock, "edge") as edge, make_service(hub, clock, "sim") as sim:
-        latest = edge.latest_of_batches(STATES)
+        latest = edge.latest_value_cache(STATES)
         assert latest.get("rig1") is None
-        sender = sim.batch_sender(STATES)
+        sender = sim.batch_publisher(STATES)
         sim.add_to_batch(sender, STATE, "rig1")
         for step in (1, 2):
             clock.advance(1_000)
-            sender.send([JointState(step=step).SerializeToString()])
+            sender.publish([JointState(step=step).SerializeToString()])
         arrival = latest.get("rig1")
         assert arrival is not None
         assert STATE.decode(arrival.payload).step == 2
@@ -72,14 +72,14 @@ def test_a_service_is_alive_from_ready_to_close_and_leaves_nothing_behind() -> N
     hub = MemoryHub()
     witness = MemoryBus(hub)
     service = make_service(hub, ManualClock())
-    latest = service.latest_of_batches(STATES)
-    assert witness.alive(alive_key("lab", "*", "*")) == []
+    latest = service.latest_value_cache(STATES)
+    assert witness.get_liveliness(alive_key("lab", "*", "*")) == []
     service.ready()
     service.ready()
-    assert witness.alive(alive_key("lab", "*", "*")) == [alive_key("lab", "sim", "1")]
+    assert witness.get_liveliness(alive_key("lab", "*", "*")) == [alive_key("lab", "sim", "1")]
     service.close()
     service.close()
-    assert witness.alive(alive_key("lab", "*", "*")) == []
+    assert witness.get_liveliness(alive_key("lab", "*", "*")) == []
     late = RigBatch(rigs=["rig1"], messages=[b""]).SerializeToString()
     witness.publisher(STATES.key("lab", "sim", "1"), STATES.traffic).put(late)
     assert latest.get("rig1") is None

@@ -1,4 +1,4 @@
-"""The simulation's tick in virtual time: its order, its stamps, what it sends and what it tells of."""
+"""Unit tests of the simulation loop in simulated time: order, timestamps, states and events."""
 
 import json
 from dataclasses import replace
@@ -11,9 +11,9 @@ from hilrig_runtime.errors import InputError
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event
 from hilrig_sim.arm.model import RigParameters
-from hilrig_sim.events import Reporter
+from hilrig_sim.events import SimulationEvents
 from hilrig_sim.parameters import rig_parameters
-from hilrig_sim.plant.limits import Happening, PlantEvent
+from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 from support.virtual_rig import VirtualRig
 
@@ -24,7 +24,7 @@ def rig() -> VirtualRig:
         yield virtual
 
 
-def test_steps_count_from_one_and_carry_incarnation_and_stamps(rig: VirtualRig) -> None:
+def test_steps_have_number_incarnation_and_timestamps(rig: VirtualRig) -> None:
     rig.tick(3)
     assert [state.step for state in rig.states] == [1, 2, 3]
     assert {state.incarnation for state in rig.states} == {rig.service.incarnation}
@@ -34,7 +34,7 @@ def test_steps_count_from_one_and_carry_incarnation_and_stamps(rig: VirtualRig) 
     assert rig.states[-1].lateness_ns == 0
 
 
-def test_the_state_is_sent_before_the_step_with_the_effort_that_acts_from_then_on(rig: VirtualRig) -> None:
+def test_state_is_published_before_its_step_with_its_effort(rig: VirtualRig) -> None:
     rig.tick()
     rig.command((1.0, 0.5, -5.0, 0.0))
     applied = rig.tick()
@@ -42,14 +42,14 @@ def test_the_state_is_sent_before_the_step_with_the_effort_that_acts_from_then_o
     assert list(applied.position[:2]) == [0.0, 0.0]
     following = rig.tick()
     plant = Plant([rig.parameters[0]])
-    plant.place(0, applied.position, applied.velocity)
+    plant.set_state(0, applied.position, applied.velocity)
     plant.step(np.array([applied.effort]).T, np.array([False]))
     assert list(following.position) == plant.position[:, 0].tolist()
     assert list(following.velocity) == plant.velocity[:, 0].tolist()
     assert list(following.integration_error) == plant.error[:, 0].tolist()
 
 
-def test_loop_latency_is_the_time_between_two_samples_and_only_where_a_command_took_effect(rig: VirtualRig) -> None:
+def test_loop_latency_is_time_from_basis_to_new_command(rig: VirtualRig) -> None:
     rig.tick(5)
     rig.clock.advance(7_000_000)
     rig.command(basis_step=3)
@@ -62,7 +62,7 @@ def test_loop_latency_is_the_time_between_two_samples_and_only_where_a_command_t
     assert (after.basis_step, after.command_arrived_ns, after.loop_latency_ns, after.command_seq) == (0, 0, 0, 1)
 
 
-def test_a_basis_that_is_not_kept_or_not_ours_gives_no_latency(rig: VirtualRig) -> None:
+def test_unknown_basis_gives_no_latency(rig: VirtualRig) -> None:
     rig.tick(2)
     for options in ({"basis_step": 99}, {"basis_step": 1, "basis_incarnation": 5}, {"basis_step": 0}):
         rig.command(**options)
@@ -71,7 +71,7 @@ def test_a_basis_that_is_not_kept_or_not_ours_gives_no_latency(rig: VirtualRig) 
         assert state.command_arrived_ns > 0
 
 
-def test_when_commands_stop_the_effort_goes_to_zero_and_both_ends_are_told(rig: VirtualRig) -> None:
+def test_lost_and_resumed_commands_are_reported(rig: VirtualRig) -> None:
     rig.command((1.0, 0.0, 0.0, 0.0))
     assert not rig.tick().safe
     rig.tick(31)
@@ -80,14 +80,14 @@ def test_when_commands_stop_the_effort_goes_to_zero_and_both_ends_are_told(rig: 
     assert list(state.effort) == [0.0] * 4
     rig.command((1.0, 0.0, 0.0, 0.0), repeat=True)
     assert list(rig.tick().effort) == [1.0, 0.0, 0.0, 0.0]
-    told = [event for event in rig.events if event.kind in (Event.COMMAND_LOST, Event.COMMAND_BACK)]
-    assert [event.kind for event in told] == [Event.COMMAND_LOST, Event.COMMAND_BACK]
-    assert told[0].watchdog_data.timeout_ns == 600_000_000
-    assert told[0].watchdog_data.silent_ns > 600_000_000
-    assert told[0].session == "session"
+    reported = [event for event in rig.events if event.kind in (Event.COMMAND_LOST, Event.COMMAND_BACK)]
+    assert [event.kind for event in reported] == [Event.COMMAND_LOST, Event.COMMAND_BACK]
+    assert reported[0].watchdog_data.timeout_ns == 600_000_000
+    assert reported[0].watchdog_data.silent_ns > 600_000_000
+    assert reported[0].session == "session"
 
 
-def test_a_reset_starts_from_the_start_pose_at_that_very_step(rig: VirtualRig) -> None:
+def test_reset_is_executed_at_its_tick(rig: VirtualRig) -> None:
     rig.command((3.0, -2.0, -5.5, 0.2))
     rig.tick(20)
     rig.command((3.0, -2.0, -5.5, 0.2), resets=1)
@@ -99,15 +99,15 @@ def test_a_reset_starts_from_the_start_pose_at_that_very_step(rig: VirtualRig) -
     assert reset.step == state.step
 
 
-def test_parts_are_stated_at_the_start_while_they_move_and_once_a_second(rig: VirtualRig) -> None:
+def test_parts_are_published_at_start_and_once_per_second(rig: VirtualRig) -> None:
     rig.tick(120)
-    stated = [state.step for state in rig.states if state.parts]
-    assert stated[0] == 1
-    assert np.diff(stated).tolist() == [50, 50]
+    steps = [state.step for state in rig.states if state.parts]
+    assert steps[0] == 1
+    assert np.diff(steps).tolist() == [50, 50]
     assert [part.name for part in rig.states[0].parts] == ["red", "blue", "green", "yellow"]
 
 
-def test_the_quill_coming_down_is_told_once(rig: VirtualRig) -> None:
+def test_contact_of_the_quill_is_reported_once(rig: VirtualRig) -> None:
     rig.tick(100)
     (hit,) = [event for event in rig.events if event.kind == Event.LIMIT_HIT]
     assert (hit.limit_data.joint, hit.limit_data.upper) == (0, True)
@@ -116,7 +116,7 @@ def test_the_quill_coming_down_is_told_once(rig: VirtualRig) -> None:
     assert "mm/s" in hit.text
 
 
-def test_a_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
+def test_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
     rig.tick(3)
     rig.clock.advance(130_000_000)
     state = rig.tick()
@@ -124,29 +124,29 @@ def test_a_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
     assert state.step == 4
     (overrun,) = [event for event in rig.events if event.kind == Event.OVERRUN]
     assert overrun.overrun_data.missed_steps == 5
-    # Late for the deadline that was meant, not for the one that was taken up again.
+    # Lateness against the original deadline, not the one after the skipped steps.
     behind_ns = state.lateness_ns + 5 * 20_000_000
     assert overrun.overrun_data.lateness_ns == behind_ns
-    assert overrun.text == f"the simulation came {behind_ns / 1e6:.1f} ms late and gave up 5 steps"
+    assert overrun.text == f"simulation overrun: up to {behind_ns / 1e6:.1f} ms late, 5 steps skipped"
     rig.tick()
     assert rig.states[-1].missed_steps == 0
     assert rig.service.counters.overruns == 1
 
 
-def test_overruns_in_a_burst_are_told_of_together(rig: VirtualRig) -> None:
+def test_burst_of_overruns_is_reported_together(rig: VirtualRig) -> None:
     for _ in range(30):
         rig.clock.advance(50_000_000)
         rig.tick()
     late = [state for state in rig.states if state.missed_steps]
-    # A second later the last of them are told of too, though no other follows.
+    # The last ones are reported a second later, without a further overrun.
     rig.tick(110)
-    told = [event for event in rig.events if event.kind == Event.OVERRUN]
-    assert 2 <= len(told) <= 3
+    reported = [event for event in rig.events if event.kind == Event.OVERRUN]
+    assert 2 <= len(reported) <= 3
     # The first tick has no deadline to miss.
     assert rig.service.counters.overruns == 29
-    assert sum(event.overrun_data.missed_steps for event in told) == sum(state.missed_steps for state in late)
-    assert told[-1].step == late[-1].step
-    # What was told of is over: the next event says of a smaller one how late that was.
+    assert sum(event.overrun_data.missed_steps for event in reported) == sum(state.missed_steps for state in late)
+    assert reported[-1].step == late[-1].step
+    # The counters have restarted: the next event has the lateness of the next overrun.
     rig.clock.advance(45_000_000)
     state = rig.tick()
     last = [event for event in rig.events if event.kind == Event.OVERRUN][-1]
@@ -154,7 +154,7 @@ def test_overruns_in_a_burst_are_told_of_together(rig: VirtualRig) -> None:
     assert last.overrun_data.lateness_ns == state.lateness_ns + state.missed_steps * 20_000_000 < 30_000_000
 
 
-def test_a_states_lateness_is_that_of_its_stamp_not_of_the_tick_s_begin(rig: VirtualRig) -> None:
+def test_lateness_of_state_is_that_of_its_timestamp(rig: VirtualRig) -> None:
     rate = Rate(rig.lab.sim.step_ns, rig.clock)
     tick = rate.wait()
     rig.clock.advance(3_000_000)
@@ -163,22 +163,22 @@ def test_a_states_lateness_is_that_of_its_stamp_not_of_the_tick_s_begin(rig: Vir
     assert rig.states[-1].sampled_ns == tick.deadline_ns + 3_000_000
 
 
-def test_a_joint_that_rattles_at_its_stop_is_told_of_once_and_again_when_it_had_been_quiet() -> None:
-    told: list[Event] = []
-    reporter = Reporter(told.append, ["rig1"], Plant([RigParameters()]))
-    hit = PlantEvent(Happening.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
+def test_chattering_joint_is_reported_once_per_quiet_period() -> None:
+    reported: list[Event] = []
+    events = SimulationEvents(reported.append, ["rig1"], Plant([RigParameters()]))
+    hit = PlantEvent(PlantEventKind.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
     for now_ms in (0, 100, 300, 520, 800):
-        reporter.tell_of_plant([hit], now_ms, now_ms * 1_000_000, ["session"])
-    # From 520 to 800 ms it was quiet; the lower stop and the other joints have quiets of their own.
-    assert [event.step for event in told] == [0, 800]
-    reporter.tell_of_plant([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
-    assert [event.text for event in told[2:]] == [
-        "joint 1 came to its lower stop at 29 °/s",
-        "joint 2 came to its upper stop at 29 °/s",
+        events.report_plant_events([hit], now_ms, now_ms * 1_000_000, ["session"])
+    # From 520 to 800 ms there was no impact; other stops and joints have their own quiet period.
+    assert [event.step for event in reported] == [0, 800]
+    events.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
+    assert [event.text for event in reported[2:]] == [
+        "joint 1 hit its lower stop at 29 °/s",
+        "joint 2 hit its upper stop at 29 °/s",
     ]
 
 
-def test_what_the_step_cannot_follow_comes_back_at_the_start() -> None:
+def test_diverged_rig_is_reset_to_the_start() -> None:
     arm = ArmConfig(masses_kg=(0.05, 0.02, 0.02), friction=(0.01, 0.01, 0.1, 0.01))
     with VirtualRig(LabConfig(rigs=(RigSettings(arm=arm),))) as rig, np.errstate(all="ignore"):
         for turn in range(300):
@@ -193,7 +193,7 @@ def test_what_the_step_cannot_follow_comes_back_at_the_start() -> None:
     assert list(state.position) == [0.0] * 4
 
 
-def test_rigs_of_one_lab_obey_their_own_commands_only() -> None:
+def test_rigs_apply_their_own_commands_only() -> None:
     lab = LabConfig(rigs=(RigSettings(name="a"), RigSettings(name="b")))
     with VirtualRig(lab) as rig:
         rig.command((2.0, 0.0, -4.9, 0.0), rig="b")
@@ -205,16 +205,16 @@ def test_rigs_of_one_lab_obey_their_own_commands_only() -> None:
     assert not last["b"].safe
 
 
-def test_parameters_come_back_from_json_exactly() -> None:
+def test_parameters_survive_json() -> None:
     parameters = rig_parameters(LabConfig(), RigSettings())
     assert RigParameters.from_json(parameters.to_json()) == parameters
     assert json.loads(parameters.to_json())["scene"]["parts"][0]["name"] == "red"
     for text in ("", "{}", "[]", '{"arm": {}, "sim": {}, "scene": {"parts": [{"name": 1}], "trays": []}}'):
-        with pytest.raises(InputError, match="not understood"):
+        with pytest.raises(InputError, match="invalid rig parameters"):
             RigParameters.from_json(text)
 
 
-def test_a_step_that_would_be_unstable_is_refused_with_the_rig_named() -> None:
+def test_unstable_step_is_rejected_with_the_rig() -> None:
     lab = LabConfig(sim=SimConfig(step_ms=40))
     with pytest.raises(InputError, match=r"rig 'rig1': the step of 40 ms would be unstable.*sim\.substeps = 2"):
         rig_parameters(lab, lab.rigs[0])

@@ -1,4 +1,4 @@
-"""States put together of pieces are what protobuf would have encoded, and the same whenever the commands came."""
+"""Unit tests of the state encoder: valid protobuf, independent of the arrival time of the commands."""
 
 import struct
 from functools import partial
@@ -10,20 +10,20 @@ from hilrig_runtime.config.lab import parse_lab
 from hilrig_schemas import Event, JointState
 from hilrig_sim.loop import PRE_ENCODE_MIN_RIGS
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.state_encoder import loop_bytes, motion_bytes
+from hilrig_sim.state_encoder import encode_loop_latency, encode_motion
 from support.virtual_rig import VirtualRig
 
 LAB = parse_lab(f"[rigs]\ncount = {PRE_ENCODE_MIN_RIGS}\n")
 
 
-def test_motion_is_what_protobuf_reads_and_writes() -> None:
+def test_encoded_motion_equals_protobuf_encoding() -> None:
     with VirtualRig(parse_lab("[rigs]\ncount = 3\n")) as lab:
         plant = Plant(lab.parameters)
     random = np.random.default_rng(3)
     for values in (plant.position, plant.velocity, plant.error):
         values[:] = random.normal(size=values.shape)
     plant.position[0, 1], plant.velocity[:, 2] = -0.0, 0.0
-    for rig, encoded in enumerate(motion_bytes(plant)):
+    for rig, encoded in enumerate(encode_motion(plant)):
         state = JointState.FromString(encoded)
         assert state.SerializeToString() == encoded
         for found, expected in (
@@ -35,24 +35,24 @@ def test_motion_is_what_protobuf_reads_and_writes() -> None:
 
 
 @pytest.mark.parametrize("latency_ns", [0, 1, 20_000_000, 2**62])
-def test_the_end_of_a_state_says_its_latency(latency_ns: int) -> None:
-    assert JointState.FromString(loop_bytes(latency_ns)).loop_latency_ns == latency_ns
+def test_loop_latency_is_encoded(latency_ns: int) -> None:
+    assert JointState.FromString(encode_loop_latency(latency_ns)).loop_latency_ns == latency_ns
 
 
-def played(at_ms: float) -> tuple[list[JointState], list[Event]]:
-    """Two rigs of many are commanded, held, reset and left alone, `at_ms` before each tick."""
+def simulate(at_ms: float) -> tuple[list[JointState], list[Event]]:
+    """Command, hold, reset and release two of many rigs, `at_ms` before each tick."""
     with VirtualRig(LAB) as lab:
-        waking, sent = lab.clock.sleep_until_ns, [False]
+        sleep_until, sent = lab.clock.sleep_until_ns, [False]
         tick_ns = [0]
 
         def until(commands: object, deadline_ns: int) -> None:
-            # On its way to the deadline: the moment at which the commands come.
-            come_ns = tick_ns[0] - round(at_ms * 1e6)
-            if not sent[0] and deadline_ns >= come_ns:
-                waking(come_ns)
+            # The commands arrive while the simulation waits for the deadline.
+            arrival_ns = tick_ns[0] - round(at_ms * 1e6)
+            if not sent[0] and deadline_ns >= arrival_ns:
+                sleep_until(arrival_ns)
                 sent[0] = True
                 commands()  # type: ignore[operator]
-            waking(deadline_ns)
+            sleep_until(deadline_ns)
 
         for step in range(70):
 
@@ -69,9 +69,9 @@ def played(at_ms: float) -> tuple[list[JointState], list[Event]]:
 
 
 @pytest.mark.parametrize("at_ms", [1.0, 0.1])
-def test_states_do_not_depend_on_when_before_the_tick_a_command_came(at_ms: float) -> None:
-    early, late = played(5.0), played(at_ms)
-    # Only when it came and when the process was started differ.
+def test_states_do_not_depend_on_command_arrival_time(at_ms: float) -> None:
+    early, late = simulate(5.0), simulate(at_ms)
+    # Only arrival time and incarnation differ.
     fields = {field.name for field in JointState.DESCRIPTOR.fields} - {"command_arrived_ns", "incarnation"}
     for one, other in zip(early[0], late[0], strict=True):
         for name in fields:
@@ -89,10 +89,10 @@ def test_parts_are_published_on_time_after_a_late_command() -> None:
             rig.simulation.pre_encode(rig._rate.next_ns)
             rig.command((0.1, 0.0, 0.0, 0.0))
             rig.simulation.tick(rig._rate.wait())
-        stated = [state.step for state in rig.states if state.rig == "rig1" and state.parts]
+        steps = [state.step for state in rig.states if state.rig == "rig1" and state.parts]
         others = [state.step for state in rig.states if state.rig == "rig2" and state.parts]
-    assert stated == others
-    assert len(stated) >= 3
+    assert steps == others
+    assert len(steps) >= 3
 
 
 def test_command_that_expires_before_a_late_tick_does_not_act() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hilrig_modbus_edge.impairment.model import Impairment
 from hilrig_modbus_edge.registers import codec
-from hilrig_runtime.config.impairment import WayImpairment
+from hilrig_runtime.config.impairment import LinkImpairment
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_study.controllers.control_laws import ComputedTorque, LawController, Measurement, Pid
@@ -103,7 +103,7 @@ def test_constant_delays_match_pattern_of_theory(
 @given(seed=st.integers(0, 10_000), jitter_ms=st.integers(1, 120), loss=st.floats(0, 0.5))
 def test_newest_command_acts_under_jitter_and_loss(seed: int, jitter_ms: int, loss: float) -> None:
     timing, ticks = LoopTiming(), 80
-    link = WayImpairment.model_validate({"delay": f"uniform:0,{jitter_ms}", "loss": f"bernoulli:{loss}"})
+    link = LinkImpairment.model_validate({"delay": f"uniform:0,{jitter_ms}", "loss": f"bernoulli:{loss}"})
     states, commands = Impairment(link, seed), Impairment(link, seed + 1)
     (state_ns, state_lost), (command_ns, command_lost) = states.draw(ticks), commands.draw(poll_count(timing, ticks))
     line = timeline(timing, ticks, state_ns, command_ns, state_lost, command_lost)
@@ -168,7 +168,7 @@ def test_loop_latency_is_rounded_up_to_steps() -> None:
 
 
 def jittered(seed: int, ticks: int = 500, high_ms: int = 60) -> Timeline:
-    link = WayImpairment.model_validate(f"uniform:0,{high_ms}")
+    link = LinkImpairment.model_validate(f"uniform:0,{high_ms}")
     delay_ns, _ = Impairment(link, seed).draw(poll_count(LoopTiming(), ticks))
     return timeline(LoopTiming(), ticks, command_delay_ns=delay_ns)
 

@@ -280,9 +280,9 @@ def test_command_accepts_controller_file(tmp_path: Path) -> None:
 def test_command_reports_missing_arguments(tmp_path: Path) -> None:
     path = write(tmp_path)
     for arguments, expected in (
-        ([], "name a study's file"),
-        ([str(path), "--live"], "names none"),
-        ([str(path), "--live", "--from", "x.mcap"], "choose one"),
+        ([], "STUDY.TOML or --from RUN.MCAP is required"),
+        ([str(path), "--live"], "the study has none"),
+        ([str(path), "--live", "--from", "x.mcap"], "can't be combined"),
     ):
         done = CliRunner().invoke(app, ["study", *arguments])
         assert isinstance(done.exception, InputError), done.output

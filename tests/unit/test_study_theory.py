@@ -43,11 +43,11 @@ def test_linear_step_equals_derivative_of_arm_step(pose: tuple[float, float, flo
     for index in range(12):
         ends = []
         for sign in (1, -1):
-            moved = np.zeros(12)
-            moved[index] = sign * small
+            offset = np.zeros(12)
+            offset[index] = sign * small
             arm = Plant([rig])
-            arm.place(0, tuple(np.array(pose) + moved[:4]), tuple(moved[4:8]))
-            arm.step((np.array(plant.holding) + moved[8:])[:, np.newaxis], np.zeros(1, dtype=np.bool_))
+            arm.set_state(0, tuple(np.array(pose) + offset[:4]), tuple(offset[4:8]))
+            arm.step((np.array(plant.holding) + offset[8:])[:, np.newaxis], np.zeros(1, dtype=np.bool_))
             ends.append(np.concatenate([arm.position[:, 0], arm.velocity[:, 0]]))
         found[:, index] = (ends[0] - ends[1]) / (2 * small)
     np.testing.assert_allclose(found, np.hstack([phi, gamma]), atol=2e-7)
@@ -226,11 +226,11 @@ def test_loop_is_stable_within_jitter_margin(gain: float) -> None:
     law = linearize_law(pd(gain, step_s), plant, step_s)
     timing = LoopTiming(step_ns, step_ns, 0, step_ns // 2, 0)
     margin = margins(phi, gamma, law, timing, 1)
-    most = int(margin.jitter_margin_s / step_s)
-    assert most >= 1
+    max_delay = int(margin.jitter_margin_s / step_s)
+    assert max_delay >= 1
     assert margin.jitter_margin_s <= margin.delay_margin_s
     held = len(law.a) + 8
-    size = held + 4 * (most + 1)
+    size = held + 4 * (max_delay + 1)
     output = np.hstack([np.eye(4), np.zeros((4, 4))])
 
     def step_matrix(delay: int) -> np.ndarray:
@@ -241,18 +241,18 @@ def test_loop_is_stable_within_jitter_margin(gain: float) -> None:
         matrix[:8, place : place + 4] = gamma
         matrix[8:held, :8], matrix[8:held, 8:held] = law.b @ output, law.a
         matrix[held : held + 4, :8], matrix[held : held + 4, 8:held] = law.d @ output, law.c
-        matrix[held + 4 :, held:-4] = np.eye(4 * most)
+        matrix[held + 4 :, held:-4] = np.eye(4 * max_delay)
         return matrix
 
-    steps = [step_matrix(delay) for delay in range(most + 1)]
+    steps = [step_matrix(delay) for delay in range(max_delay + 1)]
     rng = np.random.default_rng(7)
-    ascending = list(range(most + 1))
+    ascending = list(range(max_delay + 1))
     patterns = [
         ascending,
         ascending[::-1],
-        [0, most],
-        [0] * 5 + [most] * 5,
-        *(rng.integers(0, most + 1, 12) for _ in range(60)),
+        [0, max_delay],
+        [0] * 5 + [max_delay] * 5,
+        *(rng.integers(0, max_delay + 1, 12) for _ in range(60)),
     ]
     for pattern in patterns:
         product = np.eye(size)

@@ -1,4 +1,4 @@
-"""What controllers asked: from the note at the edge to the rows of a recording, and what is no such record."""
+"""Unit tests of the request log, from the edge to the rows of a recording."""
 
 import numpy as np
 import pytest
@@ -6,21 +6,21 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_modbus_edge.request_log import TrafficRecord
-from hilrig_replay.io.columns import TRAFFIC, Names, Rows, Table
+from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_replay.io.columns import TRAFFIC_DTYPE, RowBuffer, Rows, StringTable
 from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
 READ, WRITE = bytes.fromhex("03 0004 0004"), bytes.fromhex("10 0000 0004 08 0001 0002 0003 0004")
 
 
-def rows_of(message: ModbusTraffic, names: Names | None = None) -> Rows:
-    table = Table(TRAFFIC)
-    traffic_decoder(table, names or Names())(message.SerializeToString(), 1, 0)
-    return table.take()
+def rows_of(message: ModbusTraffic, names: StringTable | None = None) -> Rows:
+    table = RowBuffer(TRAFFIC_DTYPE)
+    traffic_decoder(table, names or StringTable())(message.SerializeToString(), 1, 0)
+    return table.drain()
 
 
-_NOTES = st.lists(
+_REQUESTS = st.lists(
     st.tuples(
         st.binary(min_size=1, max_size=12) | st.sampled_from([READ, WRITE]),
         st.integers(0, 2**60),
@@ -32,17 +32,17 @@ _NOTES = st.lists(
 )
 
 
-@given(_NOTES)
-def test_what_was_noted_is_what_is_read_in_its_order(notes: list[tuple[bytes, int, int, int, str]]) -> None:
-    record = TrafficRecord("rig1")
-    for pdu, arrived_ns, took_ns, exception, controller in notes:
-        record.note(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
-    assert record.count == len(notes)
-    names = Names()
-    rows = rows_of(record.take(5_000, 7_000), names)
-    assert record.count == 0
-    assert len(rows) == len(notes)
-    for row, (pdu, arrived_ns, took_ns, exception, controller) in zip(rows, notes, strict=True):
+@given(_REQUESTS)
+def test_recorded_requests_are_read_in_order(requests: list[tuple[bytes, int, int, int, str]]) -> None:
+    log = RequestLog("rig1")
+    for pdu, arrived_ns, took_ns, exception, controller in requests:
+        log.record(pdu, arrived_ns, arrived_ns + took_ns, exception, controller)
+    assert log.count == len(requests)
+    names = StringTable()
+    rows = rows_of(log.drain(5_000, 7_000), names)
+    assert log.count == 0
+    assert len(rows) == len(requests)
+    for row, (pdu, arrived_ns, took_ns, exception, controller) in zip(rows, requests, strict=True):
         assert (row["function"], row["exception"], names[row["controller"]]) == (pdu[0], exception, controller)
         assert (row["arrived_ns"], row["answered_ns"]) == (arrived_ns, arrived_ns + took_ns)
         assert row["wall_ns"] == arrived_ns + 2_000
@@ -63,25 +63,25 @@ def test_what_was_noted_is_what_is_read_in_its_order(notes: list[tuple[bytes, in
     ],
 )
 def test_address_and_count_are_those_of_the_request(pdu: str, address: int, count: int) -> None:
-    record = TrafficRecord("rig1")
-    record.note(bytes.fromhex(pdu), 1, 2, 0, "10.0.0.1:1")
-    [row] = rows_of(record.take(0, 0))
+    log = RequestLog("rig1")
+    log.record(bytes.fromhex(pdu), 1, 2, 0, "10.0.0.1:1")
+    [row] = rows_of(log.drain(0, 0))
     assert (row["address"], row["count"]) == (address, count)
 
 
-def test_who_asks_the_same_again_is_a_number_and_two_times() -> None:
-    record = TrafficRecord("rig1")
+def test_repeated_requests_share_a_kind() -> None:
+    log = RequestLog("rig1")
     for number in range(100):
-        record.note(READ, number, number, 0, "10.0.0.1:1")
-        record.note(bytes((6, 0, 0, number, 7)), number, number, 0, "10.0.0.1:1")
-    message = record.take(0, 0)
+        log.record(READ, number, number, 0, "10.0.0.1:1")
+        log.record(bytes((6, 0, 0, number, 7)), number, number, 0, "10.0.0.1:1")
+    message = log.drain(0, 0)
     assert len(message.kinds) == 2
     assert list(message.kind_indexes) == [0, 1] * 100
 
 
-def test_a_recording_of_before_has_a_record_a_request() -> None:
+def test_old_recordings_have_one_record_per_request() -> None:
     one = ModbusRequest(function=16, address=1, count=2, arrived_ns=50, answered_ns=60, exception=6, controller="a:1")
-    names = Names()
+    names = StringTable()
     [row] = rows_of(ModbusTraffic(wall_ns=1_000, closed_ns=100, requests=[one]), names)
     assert [row[name] for name in ("function", "address", "count", "exception")] == [16, 1, 2, 6]
     assert (row["wall_ns"], row["arrived_ns"], row["answered_ns"], names[row["controller"]]) == (950, 50, 60, "a:1")
@@ -90,18 +90,16 @@ def test_a_recording_of_before_has_a_record_a_request() -> None:
 @pytest.mark.parametrize(
     ("indexes", "arrived", "after"), [([0, 0], [1], [1, 1]), ([1], [1], [1]), ([0], [1], [2**64 - 1])]
 )
-def test_columns_that_do_not_fit_together_are_no_record(
-    indexes: list[int], arrived: list[int], after: list[int]
-) -> None:
+def test_inconsistent_columns_are_rejected(indexes: list[int], arrived: list[int], after: list[int]) -> None:
     message = ModbusTraffic(
         kinds=[ModbusKind(function=3)], kind_indexes=indexes, arrived_ns=arrived, answered_after_ns=after
     )
-    with pytest.raises(DecodeError, match="do not fit together"):
+    with pytest.raises(DecodeError, match="inconsistent request columns"):
         rows_of(message)
 
 
-def test_a_batch_of_a_flood_is_small() -> None:
-    record = TrafficRecord("rig1")
+def test_batch_of_many_requests_is_small() -> None:
+    log = RequestLog("rig1")
     for now_ns in np.arange(10**15, 10**15 + 256 * 20_000, 20_000).tolist():
-        record.note(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")
-    assert len(record.take(10**15, 10**18).SerializeToString()) < 256 * 12 + 100
+        log.record(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")
+    assert len(log.drain(10**15, 10**18).SerializeToString()) < 256 * 12 + 100

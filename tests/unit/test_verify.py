@@ -1,4 +1,4 @@
-"""A recording is verified bit for bit, and what was changed in it is found at its step."""
+"""Verification: a recording is reproduced bit for bit, and each change is found at its step."""
 
 import time
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.verify import OTHER_MACHINE_TOLERANCE, verify
+from hilrig_replay.analysis.verify import OTHER_PLATFORM_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState
 from hilrig_sim.platform_fingerprint import machine_name
@@ -16,7 +16,7 @@ from support.virtual_rig import VirtualRig, work
 
 @pytest.fixture(scope="module")
 def run() -> list[Made]:
-    """The example's work, then a reset, a collision with the stops and the fall of the quill."""
+    """The pick-and-place example, then a reset, an impact on the joint limits, and a falling quill."""
     with VirtualRig() as rig:
         work(rig, 14.0, state_delay_ms=10, command_delay_ms=10)
         rig.command((0, 0, -5, 0), resets=0)
@@ -41,7 +41,7 @@ def copied(made: list[Made]) -> list[Made]:
     return copies
 
 
-def test_a_run_with_picks_drops_stops_and_a_reset_is_verified_bit_for_bit(run: list[Made], tmp_path: Path) -> None:
+def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[Made], tmp_path: Path) -> None:
     kinds = {one.message.kind for one in run if not isinstance(one.message, JointState)}
     assert len(kinds) >= 4
     found = verify(write(tmp_path / "run.mcap", run), tolerance=0.0)
@@ -49,13 +49,13 @@ def test_a_run_with_picks_drops_stops_and_a_reset_is_verified_bit_for_bit(run: l
     assert found.exact
     assert found.gaps == 0
     assert found.largest_deviation == (0.0, 0.0, 0.0, 0.0)
-    # A reset is a beginning, and the last state has no successor.
+    # A reset starts a new interval, and the last state has no successor.
     assert found.steps == len(states(run)) - 2
-    assert "bit for bit" in found.sentence()
+    assert "bit-identical" in found.sentence()
 
 
 @pytest.mark.parametrize("row", [40, 333, 700])
-def test_one_changed_effort_is_found_at_its_step(run: list[Made], tmp_path: Path, row: int) -> None:
+def test_finds_the_step_of_a_changed_effort(run: list[Made], tmp_path: Path, row: int) -> None:
     changed = copied(run)
     state = states(changed)[row]
     state.effort[1] += 0.001
@@ -65,10 +65,10 @@ def test_one_changed_effort_is_found_at_its_step(run: list[Made], tmp_path: Path
     assert found.first_diverging_step == state.step
     assert found.largest_deviation[1] > 1e-8
     assert f"step {state.step} does not lead" in found.sentence()
-    assert not verify(tmp_path / "run.mcap", tolerance=OTHER_MACHINE_TOLERANCE).same
+    assert not verify(tmp_path / "run.mcap", tolerance=OTHER_PLATFORM_TOLERANCE).same
 
 
-def test_a_changed_position_is_found_before_and_after(run: list[Made], tmp_path: Path) -> None:
+def test_finds_the_step_before_a_changed_position(run: list[Made], tmp_path: Path) -> None:
     changed = copied(run)
     state = states(changed)[500]
     state.position[0] = np.nextafter(state.position[0], 10)
@@ -77,7 +77,7 @@ def test_a_changed_position_is_found_before_and_after(run: list[Made], tmp_path:
     assert verify(tmp_path / "run.mcap", tolerance=1e-9).same
 
 
-def test_a_part_that_was_moved_by_hand_is_found(run: list[Made], tmp_path: Path) -> None:
+def test_finds_a_changed_part_position(run: list[Made], tmp_path: Path) -> None:
     changed = copied(run)
     state = next(state for state in states(changed)[300:] if state.parts)
     state.parts[0].x += 0.001
@@ -96,18 +96,18 @@ def test_missing_states_are_gaps_not_divergence(run: list[Made], tmp_path: Path)
     assert "2 gaps" in found.sentence()
 
 
-def test_a_simulation_that_was_started_anew_is_a_gap_though_its_steps_go_on(run: list[Made], tmp_path: Path) -> None:
+def test_a_simulation_restart_is_a_gap(run: list[Made], tmp_path: Path) -> None:
     restarted = copied(run)
     for state in states(restarted)[200:]:
         state.incarnation += 1
-        # Whatever was before, it stands somewhere else now.
+        # The restarted simulation has another state.
         state.position[3] += 0.5
     found = verify(write(tmp_path / "run.mcap", restarted), tolerance=0.0)
     assert found.gaps == 1
     assert found.first_diverging_step != states(restarted)[199].step
 
 
-def test_another_part_on_the_magnet_is_found(run: list[Made], tmp_path: Path) -> None:
+def test_finds_a_changed_held_part(run: list[Made], tmp_path: Path) -> None:
     changed = copied(run)
     state = next(state for state in states(changed) if state.held_part == "blue")
     state.held_part = "red"
@@ -116,25 +116,25 @@ def test_another_part_on_the_magnet_is_found(run: list[Made], tmp_path: Path) ->
     assert found.largest_part_deviation == np.inf
 
 
-def test_without_a_tolerance_it_depends_on_the_machine(run: list[Made], tmp_path: Path) -> None:
+def test_default_tolerance_depends_on_the_platform(run: list[Made], tmp_path: Path) -> None:
     found = verify(write(tmp_path / "run.mcap", run))
     assert found.machine != machine_name()
-    assert found.tolerance == OTHER_MACHINE_TOLERANCE
+    assert found.tolerance == OTHER_PLATFORM_TOLERANCE
 
 
-def test_a_run_that_the_model_never_made_is_refused_as_false(tmp_path: Path) -> None:
+def test_rejects_a_run_not_made_by_the_model(tmp_path: Path) -> None:
     found = verify(record(tmp_path / "run.mcap"))
     assert not found.same
     assert found.first_diverging_step == 1
 
 
-def test_a_recording_without_parameters_says_so(run: list[Made], tmp_path: Path) -> None:
+def test_reports_a_recording_without_parameters(run: list[Made], tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", run, metadata={"hilrig.config": {"step_ns": "20000000"}})
-    with pytest.raises(InputError, match="does not say with which parameters"):
+    with pytest.raises(InputError, match="does not contain the parameters"):
         verify(path)
 
 
-def test_an_hour_would_take_less_than_half_a_minute(tmp_path: Path) -> None:
+def test_verifies_an_hour_in_less_than_half_a_minute(tmp_path: Path) -> None:
     with VirtualRig() as rig:
         for second in range(60):
             rig.command(np.sin(second + np.arange(4.0)) * (1, 1, 3, 0.05) - (0, 0, 4.9, 0))

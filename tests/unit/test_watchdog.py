@@ -4,14 +4,14 @@ from hypothesis import strategies as st
 from hilrig_modbus_edge.device.watchdog import Watchdog, WatchdogState
 
 
-def test_it_waits_for_the_first_write() -> None:
+def test_first_write_arms_the_watchdog() -> None:
     watchdog = Watchdog(100)
     assert watchdog.state is WatchdogState.WAITING
     assert watchdog.deadline_ns is None
     assert not watchdog.check(10_000)
 
 
-def test_it_trips_once_at_its_deadline_and_latches_until_the_next_write() -> None:
+def test_trips_once_and_latches_until_next_write() -> None:
     watchdog = Watchdog(100)
     assert not watchdog.feed(1000)
     assert watchdog.state is WatchdogState.WATCHING
@@ -24,7 +24,7 @@ def test_it_trips_once_at_its_deadline_and_latches_until_the_next_write() -> Non
     assert watchdog.state is WatchdogState.WATCHING
 
 
-def test_with_no_time_out_it_is_off() -> None:
+def test_timeout_zero_turns_it_off() -> None:
     watchdog = Watchdog(0)
     watchdog.feed(1000)
     assert watchdog.state is WatchdogState.OFF
@@ -32,16 +32,16 @@ def test_with_no_time_out_it_is_off() -> None:
     assert not watchdog.check(10**12)
 
 
-def test_at_rest_there_is_nothing_to_trip() -> None:
+def test_disarmed_watchdog_does_not_trip() -> None:
     watchdog = Watchdog(100)
     watchdog.feed(1000)
-    watchdog.rest()
+    watchdog.disarm()
     assert not watchdog.check(10_000)
     assert watchdog.state is WatchdogState.WAITING
 
 
 @given(st.lists(st.integers(1, 300), min_size=1))
-def test_it_trips_exactly_where_a_gap_reaches_the_time_out(gaps: list[int]) -> None:
+def test_trips_exactly_when_a_gap_reaches_the_timeout(gaps: list[int]) -> None:
     watchdog, now_ns = Watchdog(100), 0
     watchdog.feed(now_ns)
     for gap in gaps:

@@ -1,4 +1,4 @@
-"""Parts, tray, table and magnet: what is picked, carried, dropped, and what comes to rest on what."""
+"""Unit tests of the scene: picking, holding and releasing parts, and contact with parts, trays and table."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 
 from hilrig_sim.arm import kinematics
 from hilrig_sim.arm.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
-from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG, Happening, PlantEvent
+from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG, PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
-from hilrig_sim.plant.static_geometry import GROUND_BELOW_TABLE
-from hilrig_sim.plant.world import NONE
+from hilrig_sim.plant.static_geometry import TABLE_ABOVE_GROUND_M
+from hilrig_sim.plant.world import NO_PART
 
 ARM = ArmParameters()
 TABLE = -0.06
@@ -28,18 +28,18 @@ TRAY = TrayParameters("tray", (0.1, 0.1, 0.008), (0.3, -0.2, TABLE), 0.3, "#4040
 
 
 def plant_over(x: float, y: float, z: float, *parts: PartParameters, arm: ArmParameters = ARM) -> Plant:
-    """A rig whose tool stands at (x, y, z), over a scene of parts and the tray."""
+    """Return a rig with its tool at (x, y, z), in a scene of parts and the tray."""
     plant = Plant([RigParameters(arm=arm, scene=SceneParameters(parts=parts, trays=(TRAY,)))])
-    go_to(plant, x, y, z)
+    move_to(plant, x, y, z)
     return plant
 
 
-def go_to(plant: Plant, x: float, y: float, z: float) -> None:
-    plant.place(0, kinematics.inverse(ARM, (x, y, z, 0.0))[0], np.zeros(4), None)
+def move_to(plant: Plant, x: float, y: float, z: float) -> None:
+    plant.set_state(0, kinematics.inverse(ARM, (x, y, z, 0.0))[0], np.zeros(4), None)
 
 
 def hold(plant: Plant) -> np.ndarray:
-    """Efforts that carry the quill and what is on it."""
+    """Return the efforts that hold the quill and its part against gravity."""
     return np.array([[0.0], [0.0], [-(ARM.masses[2] + plant.world.payload()[0]) * GRAVITY], [0.0]])
 
 
@@ -47,14 +47,14 @@ def steps(plant: Plant, count: int, effort: np.ndarray, magnet: np.ndarray) -> l
     return [event for _ in range(count) for event in tuple(plant.step(effort, magnet))]
 
 
-def test_the_magnet_takes_a_part_within_its_reach_and_its_mass_is_carried() -> None:
+def test_magnet_picks_part_within_reach_with_its_mass() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.034, part("a", 0.308, 0.1))
     (event,) = steps(plant, 1, hold(plant), ON)
-    assert (event.happening, event.part) == (Happening.PART_PICKED, 0)
+    assert (event.kind, event.part) == (PlantEventKind.PART_PICKED, 0)
     assert plant.world.held[0] == 0
     assert plant.dynamics.payload[0] == 0.2
     later = steps(plant, 50, hold(plant), ON)
-    assert Happening.PART_DROPPED not in {event.happening for event in later}
+    assert PlantEventKind.PART_DROPPED not in {event.kind for event in later}
     assert abs(plant.velocity[2, 0]) < 0.02
 
 
@@ -63,22 +63,22 @@ def test_the_magnet_takes_a_part_within_its_reach_and_its_mass_is_carried() -> N
     [(0.3 + 0.0151, TABLE + 0.03, True), (0.3, TABLE + 0.03 + 0.0052, True), (0.3, TABLE + 0.03, False)],
     ids=["too far aside", "too high", "not magnetic"],
 )
-def test_the_magnet_takes_nothing_else(x: float, z: float, iron: bool) -> None:
+def test_magnet_picks_no_other_part(x: float, z: float, iron: bool) -> None:
     plant = plant_over(0.3, 0.1, z, part("a", x, 0.1, iron=iron))
     assert steps(plant, 1, hold(plant), ON) == []
-    assert plant.world.held[0] == NONE
+    assert plant.world.held[0] == NO_PART
 
 
-def test_of_two_parts_in_reach_it_takes_the_nearer() -> None:
+def test_magnet_picks_the_nearer_of_two_parts() -> None:
     thin = [replace(part(name, x, 0.1), size=(0.01, 0.01, 0.03)) for name, x in (("a", 0.312), ("b", 0.292))]
     plant = plant_over(0.3, 0.1, TABLE + 0.03, *thin)
     steps(plant, 1, hold(plant), ON)
     assert plant.world.held[0] == 1
 
 
-def test_a_held_part_stays_where_it_sits_on_the_magnet_and_turns_with_it() -> None:
+def test_held_part_moves_and_rotates_with_the_tool() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.308, 0.105))
-    # The tool is turned when it takes the part: 8 mm and 5 mm are along the world's axes.
+    # The tool is rotated when it picks the part: 8 mm and 5 mm are along the world axes.
     plant.position[3, 0] += 0.7
     steps(plant, 1, hold(plant), ON)
     effort = hold(plant)
@@ -97,29 +97,27 @@ def test_a_held_part_stays_where_it_sits_on_the_magnet_and_turns_with_it() -> No
 
 @pytest.mark.parametrize("table_m", [1.3, 1.0], ids=["table everywhere", "table with an edge"])
 @pytest.mark.parametrize("tray", [False, True], ids=["on the table", "on a tray"])
-def test_a_tip_that_came_into_a_part_from_the_side_holds_it_at_the_height_at_which_it_stands(
-    table_m: float, tray: bool
-) -> None:
+def test_tip_inside_a_part_holds_it_at_its_height(table_m: float, tray: bool) -> None:
     base = TABLE + (0.008 if tray else 0.0)
     scene = SceneParameters(
         parts=(part("a", 0.3, -0.2, below=base),), trays=(TRAY,) if tray else (), table_size=(table_m, table_m)
     )
     plant = Plant([RigParameters(scene=scene)])
-    go_to(plant, 0.3, -0.2, base + 0.026)
+    move_to(plant, 0.3, -0.2, base + 0.026)
     d3 = plant.position[2, 0]
     (event, *_) = steps(plant, 1, hold(plant), ON)
-    assert event.happening is Happening.PART_PICKED
-    # Neither is the part pressed into what it stands on nor the quill pushed up; and further down it does not go.
+    assert event.kind is PlantEventKind.PART_PICKED
+    # The part is not pressed into the surface below, the quill is not pushed up, and it does not move further down.
     pressed = hold(plant)
     pressed[2] += 8.0
     for _ in range(60):
         plant.step(pressed, ON)
         assert plant.position[2, 0] == pytest.approx(d3, abs=1e-8)
         assert plant.world.z[0, 0] - 0.015 == pytest.approx(base, abs=1e-8)
-    # What a recorded pose gives back is the same plant, to the last bit.
+    # A plant restored from the recorded pose is bit-identical.
     world, again = plant.world, Plant([RigParameters(scene=scene)])
     pose = tuple(float(of[0, 0]) for of in (world.x, world.y, world.z, world.yaw))
-    again.place(0, plant.position[:, 0], plant.velocity[:, 0], [pose], held=0)
+    again.set_state(0, plant.position[:, 0], plant.velocity[:, 0], [pose], held=0)
     lifted = hold(plant)
     lifted[2] -= 1.0
     for effort in (pressed, lifted):
@@ -133,7 +131,7 @@ def test_a_tip_that_came_into_a_part_from_the_side_holds_it_at_the_height_at_whi
     assert world.z[0, 0] - 0.015 == pytest.approx(base, abs=1e-8)
 
 
-def test_to_take_a_part_along_costs_energy_and_keeps_momentum() -> None:
+def test_picking_conserves_momentum_and_reduces_energy() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1, mass=1.0))
     plant.velocity[:, 0] = 0.8, -0.5, -0.3, 0.7
     before = plant.dynamics.kinetic_energy(plant.position[1], plant.velocity)[0]
@@ -145,18 +143,18 @@ def test_to_take_a_part_along_costs_energy_and_keeps_momentum() -> None:
     np.testing.assert_allclose(np.array([[alpha, a12], [a12, a22]]) @ plant.velocity[:2, 0], momentum, atol=1e-12)
     after = plant.dynamics.kinetic_energy(plant.position[1], plant.velocity)[0]
     assert after < 0.95 * before
-    # The quill, on its way up, takes it along by itself; joint 4 turns it about its own axis, a point mass.
+    # Joint 3 is decoupled; the part is a point mass on the axis of joint 4.
     assert plant.velocity[2, 0] == pytest.approx(-0.3 * ARM.masses[2] / (ARM.masses[2] + 1.0))
     assert plant.velocity[3, 0] == 0.7
 
 
-def test_a_dropped_part_falls_freely_and_comes_to_rest_on_the_table() -> None:
+def test_released_part_falls_freely_onto_the_table() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1))
     steps(plant, 1, hold(plant), ON)
-    go_up(plant, 0.15)
+    move_up(plant, 0.15)
     height = plant.world.z[0, 0]
     dropped = steps(plant, 1, hold(plant), OFF)
-    assert [event.happening for event in dropped] == [Happening.PART_DROPPED]
+    assert [event.kind for event in dropped] == [PlantEventKind.PART_DROPPED]
     assert plant.dynamics.payload[0] == 0.0
     assert plant.world.z[0, 0] == pytest.approx(height - 0.5 * GRAVITY * 0.02**2)
     heights = []
@@ -170,38 +168,38 @@ def test_a_dropped_part_falls_freely_and_comes_to_rest_on_the_table() -> None:
     assert not plant.world.moving[0]
 
 
-def go_up(plant: Plant, height: float) -> None:
-    """Move tool and part up at once, as a test may."""
+def move_up(plant: Plant, height: float) -> None:
+    """Move tool and held part up without simulating a motion."""
     plant.position[2, 0] -= height
-    plant._begin_anew()
+    plant._refresh_derived_state()
     rigs = np.array([0])
-    plant.world.carry(rigs, plant.tool(rigs))
+    plant.world.move_held_parts(rigs, plant.tool(rigs))
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "rests_on"),
+    ("x", "y", "support"),
     [(0.3, -0.2, TABLE + 0.008), (0.42, 0.15, TABLE + 0.03), (0.42, 0.185, TABLE + 0.03), (0.2, 0.25, TABLE)],
     ids=["tray", "part", "edge of a part", "table"],
 )
-def test_a_dropped_part_rests_on_what_is_below_it(x: float, y: float, rests_on: float) -> None:
+def test_released_part_rests_on_the_surface_below_it(x: float, y: float, support: float) -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1), part("b", 0.42, 0.15))
     steps(plant, 1, hold(plant), ON)
     plant.position[:, 0] = kinematics.inverse(ARM, (x, y, 0.1, 0.0))[0]
-    go_up(plant, 0.0)
+    move_up(plant, 0.0)
     steps(plant, 40, hold(plant), OFF)
-    assert plant.world.z[0, 0] == pytest.approx(rests_on + 0.015, abs=1e-9)
+    assert plant.world.z[0, 0] == pytest.approx(support + 0.015, abs=1e-9)
     assert plant.world.at_rest(0)
 
 
 @pytest.mark.parametrize("order", ["abc", "cba", "bca"])
-def test_a_stack_comes_down_whole_when_its_lowest_part_is_taken_away(order: str) -> None:
+def test_stack_falls_when_its_lowest_part_is_picked(order: str) -> None:
     places = {"a": 0.06, "b": 0.03, "c": 0.0}
     stack = [part(name, 0.3, 0.1, below=TABLE + places[name], iron=name == "c") for name in order]
     plant = plant_over(0.3, 0.112, TABLE + 0.03, *stack)
     steps(plant, 1, hold(plant), ON)
     assert plant.world.held[0] == order.index("c")
     plant.position[0, 0] += 0.5
-    plant._begin_anew()
+    plant._refresh_derived_state()
     steps(plant, 60, hold(plant), ON)
     bottoms = {name: plant.world.z[row, 0] - 0.015 - TABLE for row, name in enumerate(order)}
     assert (bottoms["b"], bottoms["a"]) == pytest.approx((0.0, 0.03), abs=1e-9)
@@ -209,27 +207,27 @@ def test_a_stack_comes_down_whole_when_its_lowest_part_is_taken_away(order: str)
     assert not plant.world.falling
 
 
-def test_what_stood_on_a_part_that_is_taken_away_falls() -> None:
+def test_part_on_a_picked_part_falls() -> None:
     lower, upper = part("lower", 0.30, 0.1), part("upper", 0.33, 0.1, below=TABLE + 0.03, iron=False)
-    # The tool stands where only the lower one is, for the upper one leaves its middle free.
+    # The tool is above the lower part only: the upper part does not cover its center.
     plant = plant_over(0.30, 0.1, TABLE + 0.03, replace(lower, size=(0.05, 0.05, 0.03)), upper)
     assert plant.world.at_rest(0)
     steps(plant, 1, hold(plant), ON)
     assert plant.world.held[0] == 0
-    go_up(plant, 0.1)
+    move_up(plant, 0.1)
     steps(plant, 20, hold(plant), ON)
     assert plant.world.z[1, 0] == pytest.approx(TABLE + 0.015, abs=1e-9)
 
 
-def test_a_part_dropped_beyond_the_table_lies_on_the_floor() -> None:
+def test_part_released_beside_the_table_lies_on_the_floor() -> None:
     scene = SceneParameters(parts=(part("a", 0.3, 0.1),), table_size=(0.7, 0.7))
     plant = Plant([RigParameters(scene=scene)])
-    go_to(plant, 0.3, 0.1, TABLE + 0.03)
+    move_to(plant, 0.3, 0.1, TABLE + 0.03)
     steps(plant, 1, hold(plant), ON)
     plant.position[:, 0] = kinematics.inverse(ARM, (0.1, 0.5, 0.1, 0.0))[0]
-    go_up(plant, 0.0)
+    move_up(plant, 0.0)
     steps(plant, 60, hold(plant), OFF)
-    assert plant.world.z[0, 0] == pytest.approx(TABLE - GROUND_BELOW_TABLE + 0.015, abs=1e-9)
+    assert plant.world.z[0, 0] == pytest.approx(TABLE - TABLE_ABOVE_GROUND_M + 0.015, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -237,10 +235,10 @@ def test_a_part_dropped_beyond_the_table_lies_on_the_floor() -> None:
     [(0.3, -0.2, TABLE + 0.008), (0.42, 0.15, TABLE + 0.03), (0.2, 0.25, TABLE)],
     ids=["tray", "part", "table"],
 )
-def test_the_tool_stops_on_what_is_below_it(x: float, y: float, stops_at: float) -> None:
+def test_tool_stops_on_the_surface_below_it(x: float, y: float, stops_at: float) -> None:
     plant = plant_over(x, y, 0.1, part("b", 0.42, 0.15))
     events = steps(plant, 60, np.zeros((4, 1)), OFF)
-    (hit,) = [event for event in events if event.happening is Happening.LIMIT_HIT]
+    (hit,) = [event for event in events if event.kind is PlantEventKind.LIMIT_HIT]
     assert (hit.joint, hit.upper) == (0, True)
     assert hit.speed > 0.3
     assert plant.tool(np.array([0]))[2, 0] == pytest.approx(stops_at, abs=1e-12)
@@ -248,17 +246,17 @@ def test_the_tool_stops_on_what_is_below_it(x: float, y: float, stops_at: float)
     assert plant.velocity[2, 0] == 0.0
 
 
-def test_a_held_part_stops_the_tool_its_height_earlier() -> None:
+def test_held_part_stops_the_tool_at_its_height() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1), part("b", 0.42, 0.15))
     steps(plant, 1, hold(plant), ON)
     plant.position[:, 0] = kinematics.inverse(ARM, (0.45, 0.15, 0.08, 0.0))[0]
-    go_up(plant, 0.0)
+    move_up(plant, 0.0)
     steps(plant, 60, np.zeros((4, 1)), ON)
     assert plant.tool(np.array([0]))[2, 0] == pytest.approx(TABLE + 0.06, abs=1e-12)
     assert plant.world.z[0, 0] == pytest.approx(TABLE + 0.045, abs=1e-12)
 
 
-def test_nothing_is_ever_below_the_table() -> None:
+def test_tool_and_parts_are_never_below_the_table() -> None:
     rng = np.random.default_rng(8)
     parts = [part("a", 0.3, 0.1), part("b", 0.42, 0.15), part("c", 0.2, 0.3)]
     plant = plant_over(0.3, 0.1, TABLE + 0.03, *parts)
@@ -270,18 +268,18 @@ def test_nothing_is_ever_below_the_table() -> None:
         assert np.all(plant.world.z[:, 0] - 0.015 >= TABLE - 1e-12)
 
 
-def test_a_reset_puts_arm_and_parts_back() -> None:
+def test_reset_moves_arm_and_parts_to_the_start() -> None:
     plant = plant_over(0.3, 0.1, TABLE + 0.03, part("a", 0.3, 0.1))
     steps(plant, 10, hold(plant) + 1.0, ON)
     plant.reset(0)
-    assert plant.world.held[0] == NONE
+    assert plant.world.held[0] == NO_PART
     assert plant.dynamics.payload[0] == 0.0
     np.testing.assert_array_equal(plant.position[:, 0], ARM.start)
     np.testing.assert_allclose((plant.world.x[0, 0], plant.world.y[0, 0]), (0.3, 0.1))
     assert plant.world.moving[0]
 
 
-def test_a_rig_without_parts_or_trays_has_a_table_all_the_same() -> None:
+def test_rig_without_parts_and_trays_has_a_table() -> None:
     plant = Plant([RigParameters()])
     steps(plant, 60, np.zeros((4, 1)), ON)
     assert plant.tool(np.array([0]))[2, 0] == pytest.approx(TABLE, abs=1e-12)

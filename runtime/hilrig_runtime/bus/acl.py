@@ -13,7 +13,7 @@ from hilrig_runtime.config.bus import BusTlsConfig
 from hilrig_schemas import topics
 from hilrig_schemas.topics import RIG_TOPICS, ROOT, SERVICE_TOPICS, SERVICES, Traffic, alive_key
 
-TOOLS: Final = ("operator", "viewer")
+TOOL_ROLES: Final = ("operator", "viewer")
 """An operator asks services to do things; a viewer only looks."""
 
 
@@ -26,19 +26,19 @@ class Rule:
 
 
 RULES: Final[dict[str, Rule]] = {
-    topics.STATE.name: Rule(("sim",), ("edge", *TOOLS)),
-    topics.COMMAND.name: Rule(("edge",), ("sim", *TOOLS)),
-    topics.EVENT.name: Rule(SERVICES, ("recorder", *TOOLS)),
-    topics.TRAFFIC.name: Rule(("edge",), TOOLS),
-    topics.CONFIG.name: Rule(("sim",), ("edge", "recorder", *TOOLS)),
+    topics.STATE.name: Rule(("sim",), ("edge", *TOOL_ROLES)),
+    topics.COMMAND.name: Rule(("edge",), ("sim", *TOOL_ROLES)),
+    topics.EVENT.name: Rule(SERVICES, ("recorder", *TOOL_ROLES)),
+    topics.TRAFFIC.name: Rule(("edge",), TOOL_ROLES),
+    topics.CONFIG.name: Rule(("sim",), ("edge", "recorder", *TOOL_ROLES)),
     topics.LEASE.name: Rule(("edge",), ("operator",)),
     topics.IMPAIRMENT.name: Rule(("edge",), ("operator",)),
     topics.LOG.name: Rule(SERVICES, ("recorder",)),
-    topics.HEALTH.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
+    topics.HEALTH.name: Rule(SERVICES, (*SERVICES, *TOOL_ROLES)),
     # A service asks whether another one does its work already.
-    topics.ROSTER.name: Rule(SERVICES, (*SERVICES, *TOOLS)),
-    topics.STATES.name: Rule(("sim",), ("edge", *TOOLS)),
-    topics.COMMANDS.name: Rule(("edge",), ("sim", *TOOLS)),
+    topics.SERVICE_INFO.name: Rule(SERVICES, (*SERVICES, *TOOL_ROLES)),
+    topics.STATES.name: Rule(("sim",), ("edge", *TOOL_ROLES)),
+    topics.COMMANDS.name: Rule(("edge",), ("sim", *TOOL_ROLES)),
     # A recorder asks whether another one records the lab already.
     topics.CONTROL.name: Rule(SERVICES, ("recorder", "operator")),
 }
@@ -46,7 +46,7 @@ RULES: Final[dict[str, Rule]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class BusIdentity:
     """A common name, its role, and the rigs that it sends for; `*`: all."""
 
     name: str
@@ -54,10 +54,15 @@ class Identity:
     rigs: tuple[str, ...] = ("*",)
 
 
-def identities(tls: BusTlsConfig) -> list[Identity]:
+def identities(tls: BusTlsConfig) -> list[BusIdentity]:
     """Everyone who is let in, the router apart."""
-    edges = [Identity(name, "edge", rigs) for name, rigs in tls.edges.items()] or [Identity("edge", "edge")]
-    return [Identity("sim", "sim"), *edges, Identity("recorder", "recorder"), *(Identity(t, t) for t in TOOLS)]
+    edges = [BusIdentity(name, "edge", rigs) for name, rigs in tls.edges.items()] or [BusIdentity("edge", "edge")]
+    return [
+        BusIdentity("sim", "sim"),
+        *edges,
+        BusIdentity("recorder", "recorder"),
+        *(BusIdentity(t, t) for t in TOOL_ROLES),
+    ]
 
 
 def access_control(tls: BusTlsConfig, lab: str = "*") -> dict[str, Any]:
@@ -79,7 +84,7 @@ def access_control(tls: BusTlsConfig, lab: str = "*") -> dict[str, Any]:
     }
 
 
-def _rules_of(identity: Identity, lab: str) -> Iterable[dict[str, Any]]:
+def _rules_of(identity: BusIdentity, lab: str) -> Iterable[dict[str, Any]]:
     sends, serves, reads, asks = _keys(identity, lab)
     recorded = [key for key in (*sends, *reads) if f"/{topics.LOG.name}/" in key]
     # The caches of recording streams, their heartbeats and tokens stand under a verbatim part that `**` leaves out.
@@ -115,7 +120,7 @@ def _rules_of(identity: Identity, lab: str) -> Iterable[dict[str, Any]]:
     yield from rule("hears of", "egress", ["declare_subscriber", "declare_queryable"], everything)
 
 
-def _keys(identity: Identity, lab: str) -> tuple[list[str], list[str], list[str], list[str]]:
+def _keys(identity: BusIdentity, lab: str) -> tuple[list[str], list[str], list[str], list[str]]:
     """Keys on which an identity sends, answers, reads and asks."""
     sends: list[str] = []
     serves: list[str] = []

@@ -13,14 +13,14 @@ from typing import Final, Self
 
 from hilrig_schemas.topics import Traffic
 
-KEPT: Final = 500
+CACHE_DEPTH: Final = 500
 """Messages that a sender of recordings can repeat, where nothing else is said: 10 s at 50 a second."""
 
 OnMessage = Callable[[str, bytes], None]
 """Called with the key and the payload of each message."""
 OnLoss = Callable[[int], None]
 """Called with the number of messages that are missing for good."""
-OnAlive = Callable[[str, bool], None]
+OnLiveliness = Callable[[str, bool], None]
 """Called with a token's key, and whether it appeared (True) or went (False)."""
 
 
@@ -49,7 +49,7 @@ class Publisher(Handle):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Reply:
     """What one server said to a question."""
 
     key: str
@@ -61,12 +61,12 @@ class Answer:
 class Bus(Handle):
     """A connection to the bus; closing it takes back everything that was declared on it."""
 
-    settling_s: float = 0.0
+    settle_timeout_s: float = 0.0
     """For how long after it was opened some who are there may not be linked yet, s."""
 
     @abstractmethod
-    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:
-        """Declare that this process sends on `key`; the newest `kept` of `Traffic.RECORDING` can be repeated."""
+    def publisher(self, key: str, traffic: Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:
+        """Declare that this process sends on `key`; the newest `cache_depth` of `Traffic.RECORDING` can be repeated."""
 
     @abstractmethod
     def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
@@ -80,29 +80,31 @@ class Bus(Handle):
         """
 
     @abstractmethod
-    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int = KEPT) -> Handle:
+    def subscribe_recording(
+        self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
+    ) -> Handle:
         """Receive `Traffic.RECORDING` completely and in order, including what was sent shortly before.
 
-        What an outage of the link kept back is fetched from the publisher's cache, which has its newest `kept`
+        What an outage of the link kept back is fetched from the publisher's cache, which has its newest `cache_depth`
         messages; `on_loss` gets what is lost all the same.
         """
 
     @abstractmethod
-    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+    def declare_queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
         """Answer questions asked on `key`; a `HilrigError` raised by `answer` goes back as a refusal."""
 
     @abstractmethod
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         """Ask everyone who serves a key that matches; their answers until all have come or the time is over."""
 
     @abstractmethod
-    def announce(self, key: str) -> Handle:
+    def declare_token(self, key: str) -> Handle:
         """Show a liveliness token until it is closed or this process dies."""
 
     @abstractmethod
-    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
+    def subscribe_liveliness(self, key_expr: str, on_alive: OnLiveliness) -> Handle:
         """Follow the liveliness tokens that match, those already there first."""
 
     @abstractmethod
-    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
+    def get_liveliness(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
         """Keys of the liveliness tokens that match now, sorted."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from hilrig_runtime.bus.api import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
 from hilrig_runtime.errors import HilrigError
 from hilrig_schemas.topics import Traffic
 
@@ -33,7 +33,7 @@ class MemoryHub:
     subscribers: list[tuple[str, OnMessage]] = field(default_factory=list)
     servers: list[tuple[str, Callable[[bytes], bytes]]] = field(default_factory=list)
     tokens: list[str] = field(default_factory=list)
-    watchers: list[tuple[str, OnAlive]] = field(default_factory=list)
+    watchers: list[tuple[str, OnLiveliness]] = field(default_factory=list)
     history: dict[str, list[bytes]] = field(default_factory=dict)
     lock: threading.RLock = field(default_factory=threading.RLock)
 
@@ -83,7 +83,7 @@ class MemoryBus(Bus):
         self.hub = MemoryHub() if hub is None else hub
         self._handles: list[Handle] = []
 
-    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:  # noqa: ARG002
+    def publisher(self, key: str, traffic: Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:  # noqa: ARG002
         """See `Bus.publisher`."""
         return _MemoryPublisher(self.hub, key, traffic)
 
@@ -100,7 +100,7 @@ class MemoryBus(Bus):
         key_expr: str,
         on_message: OnMessage,
         on_loss: OnLoss,  # noqa: ARG002
-        kept: int = KEPT,  # noqa: ARG002
+        cache_depth: int = CACHE_DEPTH,  # noqa: ARG002
     ) -> Handle:
         """See `Bus.subscribe_recording`; nothing is ever lost here."""
         with self.hub.lock:
@@ -110,23 +110,23 @@ class MemoryBus(Bus):
                         on_message(key, payload)
             return self._keep(self.hub.subscribers, (key_expr, on_message))
 
-    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
-        """See `Bus.serve`."""
+    def declare_queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+        """See `Bus.declare_queryable`."""
         return self._keep(self.hub.servers, (key, answer))
 
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:  # noqa: ARG002
-        """See `Bus.ask`."""
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:  # noqa: ARG002
+        """See `Bus.query`."""
         answers = []
         for key, answer in list(self.hub.servers):
             if matches(key_expr, key):
                 try:
-                    answers.append(Answer(key, answer(payload)))
+                    answers.append(Reply(key, answer(payload)))
                 except HilrigError as error:
-                    answers.append(Answer(key, b"", str(error)))
+                    answers.append(Reply(key, b"", str(error)))
         return answers
 
-    def announce(self, key: str) -> Handle:
-        """See `Bus.announce`."""
+    def declare_token(self, key: str) -> Handle:
+        """See `Bus.declare_token`."""
         self.hub.tokens.append(key)
         self.hub.tell(key, True)
 
@@ -136,14 +136,14 @@ class MemoryBus(Bus):
 
         return self._hold(_Undo(undo))
 
-    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
-        """See `Bus.watch`."""
-        for key in self.alive(key_expr):
+    def subscribe_liveliness(self, key_expr: str, on_alive: OnLiveliness) -> Handle:
+        """See `Bus.subscribe_liveliness`."""
+        for key in self.get_liveliness(key_expr):
             on_alive(key, True)
         return self._keep(self.hub.watchers, (key_expr, on_alive))
 
-    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:  # noqa: ARG002
-        """See `Bus.alive`."""
+    def get_liveliness(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:  # noqa: ARG002
+        """See `Bus.get_liveliness`."""
         return sorted(key for key in self.hub.tokens if matches(key_expr, key))
 
     def close(self) -> None:

@@ -17,9 +17,9 @@ import zenoh
 import zenoh.ext
 
 from hilrig_runtime.bus.api import Handle, OnLoss, OnMessage
-from hilrig_runtime.bus.reorder_buffer import InOrder
+from hilrig_runtime.bus.reorder_buffer import ReorderBuffer
 
-PIECE_BYTES: Final = 256 * 1024
+FETCH_PAGE_BYTES: Final = 256 * 1024
 """Of samples asked for at once: little enough to lie in the buffers between two processes."""
 _PAUSE_S: Final = 0.002
 """Between two pieces, so that what is live goes on."""
@@ -34,8 +34,8 @@ _HEARTBEAT_S: Final = 0.25
 logger = logging.getLogger(__name__)
 
 
-def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority, kept: int) -> Any:
-    """A publisher with a cache of its newest `kept` samples.
+def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority, cache_depth: int) -> Any:
+    """A publisher with a cache of its newest `cache_depth` samples.
 
     It never waits: what a slow reader has no room for is dropped, and can be repeated.
     """
@@ -45,7 +45,7 @@ def declare_recording_publisher(session: zenoh.Session, key: str, priority: zeno
         congestion_control=zenoh.CongestionControl.DROP,
         priority=priority,
         cache=zenoh.ext.CacheConfig(
-            kept,
+            cache_depth,
             # The cache is locked while it answers: it must not wait for a reader that is held up. Who misses an answer
             # asks again.
             replies_config=zenoh.ext.RepliesConfig(
@@ -63,8 +63,8 @@ class _Source:
 
     cache: str
     """Where its cache is asked."""
-    samples: InOrder[zenoh.Sample]
-    size: int = PIECE_BYTES
+    samples: ReorderBuffer[zenoh.Sample]
+    size: int = FETCH_PAGE_BYTES
     """Of its newest sample, bytes."""
     is_new: bool = True
     """It is not known yet what it sent before."""
@@ -72,21 +72,21 @@ class _Source:
     """When to ask next, if something is missing; monotonic clock."""
     since_s: float = 0.0
     """Since when something is missing and nothing came of it."""
-    is_behind: bool = False
+    has_backlog: bool = False
     """Something is missing."""
 
 
-class CompleteStream(Handle):
+class ReliableSubscriber(Handle):
     """Subscribes to the recording publishers on `key_expr`; messages of each come in order and without a gap.
 
-    `on_loss` hears how many messages of a publisher could not be recovered; each can repeat its newest `kept`.
+    `on_loss` hears how many messages of a publisher could not be recovered; each can repeat its newest `cache_depth`.
     """
 
     def __init__(
-        self, session: zenoh.Session, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int
+        self, session: zenoh.Session, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int
     ) -> None:
         self._session = session
-        self._kept = kept
+        self._cache_depth = cache_depth
         self._on_message = on_message
         self._on_loss = on_loss
         self._changed = threading.Condition()
@@ -110,7 +110,7 @@ class CompleteStream(Handle):
                 self._closing = True
                 self._changed.notify()
                 for source in self._sources.values():
-                    source.samples.finish()
+                    source.samples.flush()
 
     # -- what comes -------------------------------------------------------------------------------------------------
 
@@ -124,13 +124,13 @@ class CompleteStream(Handle):
             source = self._source(f"{sample.key_expr}/@adv/pub/{identity}/*")
             source.size = max(1, len(sample.payload))
             source.is_new = False
-            source.samples.take(int(info.source_sn), sample)
+            source.samples.insert(int(info.source_sn), sample)
             self._look(source)
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         with self._changed:
             source = self._source(_cache_of(sample))
-            source.samples.announce(int.from_bytes(sample.payload.to_bytes(), "little"))
+            source.samples.set_head(int.from_bytes(sample.payload.to_bytes(), "little"))
             self._look(source, _OVERTAKEN_S)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
@@ -144,14 +144,14 @@ class CompleteStream(Handle):
     def _source(self, cache: str) -> _Source:
         source = self._sources.get(cache)
         if source is None:
-            samples: InOrder[zenoh.Sample] = InOrder(self._deliver, self._on_loss, self._kept)
+            samples: ReorderBuffer[zenoh.Sample] = ReorderBuffer(self._deliver, self._on_loss, self._cache_depth)
             source = self._sources[cache] = _Source(cache, samples)
         return source
 
     def _look(self, source: _Source, wait_s: float = 0.0) -> None:
         """See whether something is missing; if so, it is asked for after a while."""
-        was_behind, source.is_behind = source.is_behind, source.is_new or bool(source.samples.missing(1))
-        if source.is_behind and not was_behind:
+        had_backlog, source.has_backlog = source.has_backlog, source.is_new or bool(source.samples.missing(1))
+        if source.has_backlog and not had_backlog:
             source.since_s = time.monotonic()
             source.ask_at_s = source.since_s + wait_s
             self._changed.notify()
@@ -176,7 +176,7 @@ class CompleteStream(Handle):
     def _next(self) -> _Source | None:
         """Wait for the source that is to be asked next, something of which is missing; None: the stream is closed."""
         while not self._closing:
-            behind = [source for source in self._sources.values() if source.is_behind]
+            behind = [source for source in self._sources.values() if source.has_backlog]
             first = min(behind, key=lambda source: source.ask_at_s, default=None)
             wait_s = None if first is None else first.ask_at_s - time.monotonic()
             if wait_s is not None and wait_s <= 0:
@@ -202,7 +202,7 @@ class CompleteStream(Handle):
                 with self._changed:
                     if self._closing:
                         break
-                    got += source.samples.take(int(sample.source_info.source_sn), sample)
+                    got += source.samples.insert(int(sample.source_info.source_sn), sample)
                     source.size = max(1, len(sample.payload))
                     source.is_new = False
         except zenoh.ZError as error:
@@ -218,7 +218,7 @@ class CompleteStream(Handle):
         else:
             source.ask_at_s = now_s + _ASK_AGAIN_S
         if now_s - source.since_s > _GIVE_UP_S:
-            source.samples.give_up()
+            source.samples.skip_gap()
             source.is_new = False
             source.since_s = now_s
         self._look(source)
@@ -228,7 +228,7 @@ def _wanted(source: _Source) -> str:
     """What to ask a cache for: the next piece, or of a source that is new its newest sample, to know what there is."""
     if source.is_new:
         return "_max=1"
-    numbers = source.samples.missing(max(1, PIECE_BYTES // source.size))
+    numbers = source.samples.missing(max(1, FETCH_PAGE_BYTES // source.size))
     return f"_max={len(numbers)};_sn={numbers.start}..{numbers.stop - 1}"
 
 

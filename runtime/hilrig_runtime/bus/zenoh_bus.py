@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import zenoh
 
-from hilrig_runtime.bus.api import KEPT, Answer, Bus, Handle, OnAlive, OnLoss, OnMessage, Publisher
-from hilrig_runtime.bus.reliable import CompleteStream, declare_recording_publisher
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
+from hilrig_runtime.bus.reliable import ReliableSubscriber, declare_recording_publisher
 from hilrig_runtime.bus.zenoh_config import (
     FIRST_INSTANCE,
     MESH_ORDER,
@@ -20,7 +20,7 @@ from hilrig_runtime.bus.zenoh_config import (
 )
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.timing.realtime import one_ahead
+from hilrig_runtime.timing.realtime import raise_priority
 from hilrig_schemas.topics import Traffic
 
 _GOSSIP_S: Final = 1.0
@@ -60,7 +60,7 @@ class _NewestReader(Handle):
         self._thread.start()
 
     def _read(self) -> None:
-        with one_ahead():
+        with raise_priority():
             self._read_all()
 
     def _read_all(self) -> None:
@@ -103,9 +103,9 @@ class ZenohBus(Bus):
     def __init__(self, bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> None:
         self._express = bus.express
         if finds_others_by_gossip(bus, service, instance):
-            self.settling_s = _GOSSIP_S
+            self.settle_timeout_s = _GOSSIP_S
         try:
-            with one_ahead():
+            with raise_priority():
                 self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
         except zenoh.ZError as error:
             raise OperationError(_why_not_open(bus, service, error)) from error
@@ -117,10 +117,10 @@ class ZenohBus(Bus):
             raise OperationError("the bus is closed")
         return self._session
 
-    def publisher(self, key: str, traffic: Traffic, kept: int = KEPT) -> Publisher:
+    def publisher(self, key: str, traffic: Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:
         """See `Bus.publisher`."""
         if traffic is Traffic.RECORDING:
-            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic], kept))
+            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic], cache_depth))
         return _ZenohPublisher(
             self.session.declare_publisher(
                 key,
@@ -138,12 +138,14 @@ class ZenohBus(Bus):
         """See `Bus.subscribe_newest`."""
         return _NewestReader(self.session, key_expr, on_message, waiting)
 
-    def subscribe_recording(self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, kept: int = KEPT) -> Handle:
+    def subscribe_recording(
+        self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
+    ) -> Handle:
         """See `Bus.subscribe_recording`."""
-        return CompleteStream(self.session, key_expr, on_message, on_loss, kept)
+        return ReliableSubscriber(self.session, key_expr, on_message, on_loss, cache_depth)
 
-    def serve(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
-        """See `Bus.serve`."""
+    def declare_queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+        """See `Bus.declare_queryable`."""
 
         def reply(query: zenoh.Query) -> None:
             with query:
@@ -157,33 +159,33 @@ class ZenohBus(Bus):
 
         return _Declared(self.session.declare_queryable(key, reply))
 
-    def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """See `Bus.ask`."""
+    def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
+        """See `Bus.query`."""
         answers = []
         for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
             if reply.ok is not None:
-                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+                answers.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes().decode(errors="replace")
                 # zenoh answers a question that nobody answered in time with an error of its own.
                 if text.lower() != "timeout":
-                    answers.append(Answer(key_expr, b"", text))
+                    answers.append(Reply(key_expr, b"", text))
         return answers
 
-    def announce(self, key: str) -> Handle:
-        """See `Bus.announce`."""
+    def declare_token(self, key: str) -> Handle:
+        """See `Bus.declare_token`."""
         return _Declared(self.session.liveliness().declare_token(key))
 
-    def watch(self, key_expr: str, on_alive: OnAlive) -> Handle:
-        """See `Bus.watch`."""
+    def subscribe_liveliness(self, key_expr: str, on_alive: OnLiveliness) -> Handle:
+        """See `Bus.subscribe_liveliness`."""
 
         def on_sample(sample: zenoh.Sample) -> None:
             on_alive(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         return _Declared(self.session.liveliness().declare_subscriber(key_expr, on_sample, history=True))
 
-    def alive(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
-        """See `Bus.alive`."""
+    def get_liveliness(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:
+        """See `Bus.get_liveliness`."""
         replies = self.session.liveliness().get(key_expr, timeout=timeout_s)
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import zenoh
 
-from hilrig_runtime.bus.acl import TOOLS, access_control, identities
+from hilrig_runtime.bus.acl import TOOL_ROLES, access_control, identities
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError
 
@@ -90,7 +90,7 @@ def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE
     Raises:
         InputError: there is none.
     """
-    roles = (service,) if service in MESH_ORDER else TOOLS
+    roles = (service,) if service in MESH_ORDER else TOOL_ROLES
     names = [identity.name for role in roles for identity in identities(tls) if identity.role == role]
     if service == ROUTER:
         names = [ROUTER]

@@ -198,7 +198,7 @@ def read_trace(path: Path) -> tuple[float, ...]:
     return tuple(delays)
 
 
-class WayImpairment(Section):
+class LinkImpairment(Section):
     """What one way does to the messages on it; a text alone is its delay."""
 
     delay: Delay = ConstantDelay()
@@ -210,13 +210,13 @@ class WayImpairment(Section):
         return {"delay": value} if isinstance(value, str) else value
 
     @property
-    def does_nothing(self) -> bool:
+    def is_inactive(self) -> bool:
         """Whether every message passes at once."""
         return self.delay == ConstantDelay() and self.loss == NoLoss()
 
     def describe(self) -> str:
         """In words, for people."""
-        if self.does_nothing:
+        if self.is_inactive:
             return "none"
         words = [] if self.delay == ConstantDelay() else [self.delay.describe()]
         if self.loss != NoLoss():
@@ -224,33 +224,33 @@ class WayImpairment(Section):
         return ", ".join(words)
 
 
-class Ways(Section):
+class LinkImpairments(Section):
     """Both ways of a rig's loop."""
 
-    state: WayImpairment = WayImpairment()
+    state: LinkImpairment = LinkImpairment()
     """From the simulation to the controller."""
-    command: WayImpairment = WayImpairment()
+    command: LinkImpairment = LinkImpairment()
     """From the controller to the simulation."""
 
     @property
-    def do_nothing(self) -> bool:
+    def is_inactive(self) -> bool:
         """Whether the loop is as it is."""
-        return self.state.does_nothing and self.command.does_nothing
+        return self.state.is_inactive and self.command.is_inactive
 
     def describe(self) -> str:
         """In words, for people."""
-        if self.do_nothing:
+        if self.is_inactive:
             return "none"
-        return f"state way {self.state.describe()}; command way {self.command.describe()}"
+        return f"state link {self.state.describe()}; command link {self.command.describe()}"
 
 
-def _both(delay: Delay, loss: Loss = NoLoss()) -> Ways:  # noqa: B008
-    way = WayImpairment(delay=delay, loss=loss)
-    return Ways(state=way, command=way)
+def _both(delay: Delay, loss: Loss = NoLoss()) -> LinkImpairments:  # noqa: B008
+    way = LinkImpairment(delay=delay, loss=loss)
+    return LinkImpairments(state=way, command=way)
 
 
-PRESETS: Final[dict[str, Ways]] = {
-    "none": Ways(),
+PRESETS: Final[dict[str, LinkImpairments]] = {
+    "none": LinkImpairments(),
     "wired": _both(GammaDelay(mean_ms=0.2, std_ms=0.1, offset_ms=0.1)),
     "busy-wifi": _both(
         GammaDelay(mean_ms=8.0, std_ms=8.0, offset_ms=2.0), GilbertElliottLoss(to_bad=0.005, to_good=0.5)
@@ -260,7 +260,7 @@ PRESETS: Final[dict[str, Ways]] = {
         GammaDelay(mean_ms=15.0, std_ms=12.0, offset_ms=20.0), GilbertElliottLoss(to_bad=0.002, to_good=0.3)
     ),
     # A quick controller at a step of 20 ms waits up to a step for the tick: 5 to 80 ms on top make the paper's loop.
-    "paper-25-100ms": Ways(command=WayImpairment(delay=UniformDelay(low_ms=5.0, high_ms=80.0))),
+    "paper-25-100ms": LinkImpairments(command=LinkImpairment(delay=UniformDelay(low_ms=5.0, high_ms=80.0))),
 }
 """What labs have, by name; delays are one way."""
 
@@ -276,16 +276,16 @@ class ImpairmentSetting(Section):
 
     preset: Annotated[str, BeforeValidator(_known)] = "none"
     """none, wired, busy-wifi, vpn, mobile or paper-25-100ms."""
-    state: WayImpairment | None = None
+    state: LinkImpairment | None = None
     """The state's way, as "gamma:20,8" or { delay = "gamma:20,8", loss = "bernoulli:0.01" }; default: the preset's."""
-    command: WayImpairment | None = None
+    command: LinkImpairment | None = None
     """The command's way; default: the preset's."""
 
     @property
-    def ways(self) -> Ways:
+    def links(self) -> LinkImpairments:
         """What is in force on both ways."""
         preset = PRESETS[self.preset]
-        return Ways(state=self.state or preset.state, command=self.command or preset.command)
+        return LinkImpairments(state=self.state or preset.state, command=self.command or preset.command)
 
 
 class ScheduledImpairment(ImpairmentSetting):
@@ -305,7 +305,7 @@ class ImpairmentConfig(ImpairmentSetting):
 
     def describe(self) -> str:
         """In words, for people; "none" where the loop is as it is."""
-        words = [self.ways.describe(), *(f"at {entry.at_s:g} s {entry.ways.describe()}" for entry in self.schedule)]
+        words = [self.links.describe(), *(f"at {entry.at_s:g} s {entry.links.describe()}" for entry in self.schedule)]
         return ", then ".join(words)
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.config.types import Flag, Name, Network, NotNegative, Number, Port, Positive, Section, Vector4
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
@@ -316,7 +316,7 @@ def read_rig(settings_json: str) -> RigSettings:
     try:
         return RigSettings.model_validate_json(settings_json)
     except ValidationError as error:
-        raise InputError("; ".join(mistakes_in(error))) from error
+        raise InputError("; ".join(format_validation_error(error))) from error
 
 
 def load_lab(path: Path | None) -> LabConfig:
@@ -352,6 +352,6 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: no valid TOML: {error}") from error
     except ValidationError as error:
-        raise InputError("\n".join(f"{where}: {mistake}" for mistake in mistakes_in(error))) from error
+        raise InputError("\n".join(f"{where}: {mistake}" for mistake in format_validation_error(error))) from error
     lab._source = text
     return lab

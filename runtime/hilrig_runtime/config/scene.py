@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hilrig_runtime.config.types import Colour, Flag, Name, Number, Positive, Section, Vector2
+from hilrig_runtime.config.types import Color, Flag, Name, Number, Positive, Section, Vector2
 
 
 class TableConfig(Section):
@@ -42,7 +42,7 @@ class PartConfig(Section):
     mass_kg: Positive = 0.2
     ferromagnetic: Flag = True
     """Whether the magnet holds it."""
-    colour: Colour = "#c8ccd0"
+    colour: Color = "#c8ccd0"
     position_mm: Vector2
     """Where its middle is: x, y. It stands on what is below: a tray or the table."""
     yaw_deg: Number = 0.0
@@ -76,7 +76,7 @@ class TrayConfig(Section):
     """Places along its width."""
     pitch_mm: Positive = 70.0
     """Distance between neighbouring places."""
-    colour: Colour = "#4a5560"
+    colour: Color = "#4a5560"
 
     @model_validator(mode="after")
     def _places_are_on_it(self) -> "TrayConfig":

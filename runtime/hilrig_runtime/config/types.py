@@ -9,7 +9,7 @@ from hilrig_schemas.topics import NAME_PATTERN
 
 _NAME: Final = rf"^{NAME_PATTERN}$"
 _COLOUR: Final = r"^#[0-9a-fA-F]{6}$"
-PATTERNS: Final = {
+PATTERN_DESCRIPTIONS: Final = {
     _NAME: "1 to 63 letters, digits, - and _, beginning with a letter or digit",
     _COLOUR: "a colour as #2f6fc4",
 }
@@ -18,7 +18,7 @@ PATTERNS: Final = {
 # TOML has types of its own: a number in quotes is a mistake.
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=_NAME)]
-Colour = Annotated[str, Field(pattern=_COLOUR)]
+Color = Annotated[str, Field(pattern=_COLOUR)]
 Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]

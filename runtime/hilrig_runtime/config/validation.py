@@ -5,10 +5,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hilrig_runtime.config.types import PATTERNS
+from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS
 
 
-def mistakes_in(error: ValidationError) -> list[str]:
+def format_validation_error(error: ValidationError) -> list[str]:
     """A sentence for each mistake that a person made, with its place."""
     return [_sentence(mistake) for mistake in _causes(error)]
 
@@ -45,7 +45,7 @@ def _sentence(mistake: Any) -> str:
     if mistake["type"] == "value_error":
         return f"{place}: {mistake['ctx']['error']}" if place else str(mistake["ctx"]["error"])
     if mistake["type"] == "string_pattern_mismatch":
-        expected = PATTERNS[mistake["ctx"]["pattern"]]
+        expected = PATTERN_DESCRIPTIONS[mistake["ctx"]["pattern"]]
     else:
         expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
     return f"{place}: expected {expected}, found {mistake['input']!r}"

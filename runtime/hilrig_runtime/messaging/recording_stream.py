@@ -77,7 +77,7 @@ def decode_batch(payload: bytes) -> LogBatch:
     return batch
 
 
-def batches_kept(rigs: int, step_ms: float) -> int:
+def batch_cache_depth(rigs: int, step_ms: float) -> int:
     """How many batches of a lab's recording stream its sender keeps: 30 s of a few rigs, 10 s of hundreds.
 
     The memory that this takes has a bound, and so has what a recorder that comes back must take in at once.
@@ -86,7 +86,7 @@ def batches_kept(rigs: int, step_ms: float) -> int:
     return round(min(max(seconds, SHORTEST_KEPT_S), LONGEST_KEPT_S) * 1e9 / FLUSH_PERIOD_NS)
 
 
-class LogStream:
+class RecordingStream:
     """Collects entries from any thread, and sends them as `LogBatch` from the thread that calls `flush`."""
 
     def __init__(self, publisher: Publisher, source: str, incarnation: int) -> None:

@@ -1,60 +1,62 @@
-"""The messages of many rigs, together: one message on the bus instead of one a rig.
+"""Publishes one message of each of many rigs together: one message on the bus instead of one per rig.
 
-At 50 steps a second of 128 rigs, what a small message costs to send, to receive and to wake a thread for it is more
-than what is in it. So a simulation sends the states of a tick as one batch, for the edges, and only then each state
-on its rig's own key, which costs little while nobody listens there. Recorded is each message under its own key.
+At 50 steps a second of 128 rigs, sending and receiving a small message and waking a thread for it cost more than its
+content. So a simulation first publishes the states of a tick as one batch, for the edges, and only then each state on
+its rig's own key, which costs little without a subscriber. Each message is recorded under its rig's key.
 """
 
 from collections.abc import Callable, Sequence
 from itertools import repeat
 
 from hilrig_runtime.bus.api import Publisher
-from hilrig_runtime.messaging.recording_stream import LogStream
-from hilrig_runtime.process.health import Counters
+from hilrig_runtime.counters import Counters
+from hilrig_runtime.messaging.recording_stream import RecordingStream
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigBatch
 
 
-class BatchSender:
-    """Sends one message of each of some rigs at a time."""
+class BatchPublisher:
+    """Publishes one message of each of its rigs at a time, as a batch and on each rig's own key."""
 
-    def __init__(self, source: str, together: Publisher, log: LogStream, clock: Clock, counters: Counters) -> None:
-        self._put_together = together.put
-        self._log = log
+    def __init__(
+        self, source: str, batches: Publisher, recording_stream: RecordingStream, clock: Clock, counters: Counters
+    ) -> None:
+        self._put_batch = batches.put
+        self._recording_stream = recording_stream
         self._wall_ns = clock.wall_ns
         self._counters = counters
         self._source = source
         self._rigs: list[str] = []
         self._head = b""
-        """What all batches begin with, encoded."""
+        """The encoded fields that all batches have in common."""
         self._keys: list[str] = []
         self._puts: list[Callable[[bytes], None]] = []
         self._sequences: list[int] = []
 
     def add(self, rig: str, key: str, publisher: Publisher) -> None:
-        """Send for one more rig, behind the others; its own messages go on `key` too, through `publisher`."""
+        """Add a rig after the others; its messages are also published on `key` through `publisher`."""
         self._rigs.append(rig)
         self._keys.append(key)
         self._puts.append(publisher.put)
         self._sequences.append(0)
-        self._regroup()
+        self._encode_head()
 
     def remove(self, index: int) -> None:
-        """Send no more for a rig; those behind it move up."""
+        """Remove a rig; the rigs after it move up."""
         del self._rigs[index], self._keys[index], self._puts[index], self._sequences[index]
-        self._regroup()
+        self._encode_head()
 
-    def _regroup(self) -> None:
+    def _encode_head(self) -> None:
         self._head = RigBatch(source=self._source, rigs=self._rigs).SerializeToString()
 
-    def send(self, payloads: Sequence[bytes]) -> None:
+    def publish(self, payloads: Sequence[bytes]) -> None:
         """Publish and record the encoded messages of all rigs, in the order in which the rigs were added."""
-        # Anew each time: what a protobuf message has once held it keeps until it is gone itself.
+        # A new message each time: a protobuf message keeps the memory of its former content until it is freed.
         batch = RigBatch(messages=payloads)
         wall_ns = self._wall_ns()
-        self._put_together(self._head + batch.SerializeToString())
+        self._put_batch(self._head + batch.SerializeToString())
         for put, payload in zip(self._puts, payloads, strict=True):
             put(payload)
         self._sequences = [sequence + 1 for sequence in self._sequences]
-        self._log.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
+        self._recording_stream.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
         self._counters.published += len(payloads)

@@ -22,10 +22,10 @@ from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.liveliness import Absences
+from hilrig_runtime.process.liveliness import PeerDownTracker
 from hilrig_runtime.timing.clock import Clock
-from hilrig_schemas import Roster
-from hilrig_schemas.topics import ROSTER, alive_key, source_of_alive_key
+from hilrig_schemas import ServiceInfo
+from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_alive_key
 
 ASK_PERIOD_NS: Final = 10_000_000_000
 ASK_AGAIN_S: Final = 0.1
@@ -49,7 +49,7 @@ class ClockOffset:
     """Half of the round trip of the question."""
 
 
-def conflict(own: Roster, others: Iterable[Roster]) -> str:
+def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
     """Why a service must give way, for people; empty: it need not.
 
     It does to an elder of its kind that has its instance name or one of its rigs; of two that started in the same
@@ -68,7 +68,7 @@ def conflict(own: Roster, others: Iterable[Roster]) -> str:
     return ""
 
 
-def worst_offset(others: Iterable[Roster], own_incarnation: int, asked_ns: int, heard_ns: int) -> ClockOffset:
+def worst_offset(others: Iterable[ServiceInfo], own_incarnation: int, asked_ns: int, heard_ns: int) -> ClockOffset:
     """The clock that differs most from ours; the question left at `asked_ns`, all had answered at `heard_ns`, wall."""
     middle_ns, half_ns = (asked_ns + heard_ns) // 2, (heard_ns - asked_ns) // 2
     offsets = [
@@ -79,19 +79,19 @@ def worst_offset(others: Iterable[Roster], own_incarnation: int, asked_ns: int, 
     return max(offsets, key=lambda offset: abs(offset.offset_ns), default=ClockOffset())
 
 
-def rosters(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = ASK_TIMEOUT_S) -> list[Roster]:
+def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = ASK_TIMEOUT_S) -> list[ServiceInfo]:
     """What the services of a lab that answer say of themselves, by service and instance."""
     found = []
-    for answer in bus.ask(ROSTER.key(lab, service, "*"), timeout_s=timeout_s):
+    for answer in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
         try:
             if not answer.error:
-                found.append(Roster.FromString(answer.payload))
+                found.append(ServiceInfo.FromString(answer.payload))
         except DecodeError:
             continue
-    return sorted(found, key=lambda roster: (roster.service, roster.instance, roster.incarnation))
+    return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
 
 
-class Presence:
+class PeerRegistry:
     """Answers for one service, and watches for others of its kind.
 
     `rigs` gives the name of each of its rigs and where it is reached; `on_conflict` gets the reason to end.
@@ -101,7 +101,7 @@ class Presence:
         self,
         bus: Bus,
         lab: str,
-        own: Roster,
+        own: ServiceInfo,
         rigs: Callable[[], Sequence[tuple[str, str]]],
         clock: Clock,
         on_conflict: Callable[[str], None],
@@ -117,10 +117,12 @@ class Presence:
         self._on_conflict = on_conflict
         self._claimed = False
         self._closing = False
-        self._absences = Absences()
+        self._peers_down = PeerDownTracker()
         self._seen: SimpleQueue[tuple[str, bool]] = SimpleQueue()
         """Who came (True) or went, "<service>/<instance>"; what ends the watch has no name."""
-        self._declared: list[Handle] = [bus.serve(ROSTER.key(lab, own.service, own.instance), self._answer)]
+        self._declared: list[Handle] = [
+            bus.declare_queryable(SERVICE_INFO.key(lab, own.service, own.instance), self._answer)
+        ]
 
     def claim(self) -> None:
         """Make sure that nobody has these rigs, and keep an eye on it from now on; a second call does nothing.
@@ -130,15 +132,17 @@ class Presence:
         """
         if self._claimed:
             return
-        self.look_again()
+        self.recheck()
         self._claimed = True
         watched = alive_key(self._lab, "*", "*")
         self._declared.append(
-            self._bus.watch(watched, lambda key, alive: self._seen.put((source_of_alive_key(key), alive)))
+            self._bus.subscribe_liveliness(
+                watched, lambda key, alive: self._seen.put((source_of_alive_key(key), alive))
+            )
         )
         threading.Thread(target=self._watch, name="presence", daemon=True).start()
 
-    def look_again(self) -> None:
+    def recheck(self) -> None:
         """Look for an elder, for as long as the bus may take to be linked with everyone who is there.
 
         Raises:
@@ -146,7 +150,7 @@ class Presence:
         """
         reason = self._look()
         asked_s = 0.0
-        while not reason and asked_s < self._bus.settling_s:
+        while not reason and asked_s < self._bus.settle_timeout_s:
             time.sleep(ASK_AGAIN_S)
             asked_s += ASK_AGAIN_S
             reason = self._look()
@@ -160,8 +164,8 @@ class Presence:
         while self._declared:
             self._declared.pop().close()
 
-    def _roster(self) -> Roster:
-        own = Roster()
+    def _roster(self) -> ServiceInfo:
+        own = ServiceInfo()
         own.CopyFrom(self._own)
         for rig, address in self._rigs():
             own.rigs.append(rig)
@@ -175,7 +179,7 @@ class Presence:
 
     def _look(self) -> str:
         asked_ns = self._clock.wall_ns()
-        others = rosters(self._bus, self._lab, timeout_s=CLAIM_TIMEOUT_S)
+        others = list_services(self._bus, self._lab, timeout_s=CLAIM_TIMEOUT_S)
         self.clock_offset = worst_offset(others, self._own.incarnation, asked_ns, self._clock.wall_ns())
         return conflict(self._roster(), others)
 
@@ -183,7 +187,7 @@ class Presence:
         monotonic_ns = self._clock.monotonic_ns
         look_ns = monotonic_ns() + ASK_PERIOD_NS
         while not self._closing:
-            due_ns = self._absences.due_ns
+            due_ns = self._peers_down.due_ns
             next_ns = look_ns if due_ns is None else min(look_ns, due_ns)
             with suppress(Empty):
                 who, is_there = self._seen.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
@@ -210,11 +214,11 @@ class Presence:
         if who == f"{self._own.service}/{self._own.instance}":
             return
         if not is_there:
-            self._absences.went(who, now_ns)
-        elif self._absences.came(who):
+            self._peers_down.mark_down(who, now_ns)
+        elif self._peers_down.mark_up(who):
             logger.info("%s is on the bus again", who)
 
     def _tell_of_absences(self, now_ns: int) -> None:
-        gone = self._absences.lasting(now_ns)
+        gone = self._peers_down.overdue(now_ns)
         if gone:
             logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))

@@ -6,51 +6,17 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Final
 
 from hilrig_runtime.bus.api import Publisher
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.timing.clock import Clock
-from hilrig_runtime.timing.rate import Tick
 from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
-
-
-@dataclass(slots=True)
-class Counters:
-    """What a service counts; whoever knows a figure sets it, the reporter reads. Counts are since the start."""
-
-    rigs: int = 0
-    ticks: int = 0
-    overruns: int = 0
-    missed_steps: int = 0
-    received: int = 0
-    published: int = 0
-    lost_transport: int = 0
-    lost_recorder: int = 0
-    queue_depth: int = 0
-    queue_capacity: int = 0
-    connections: int = 0
-    requests: int = 0
-    malformed: int = 0
-    refused: int = 0
-    recordings: int = 0
-    bytes_written: int = 0
-    trouble: str = ""
-    latenesses_ns: list[int] = field(default_factory=list)
-    """Of the ticks since the last report."""
-
-    def count_tick(self, tick: Tick, period_ns: int) -> None:
-        """Count one tick of the service's loop."""
-        self.ticks += 1
-        self.latenesses_ns.append(tick.lateness_ns)
-        if tick.missed_steps or tick.lateness_ns > period_ns:
-            self.overruns += 1
-            self.missed_steps += tick.missed_steps
 
 
 class HealthReporter:

@@ -12,8 +12,8 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, end_when_closing_hangs, stop_on_signals, stop_with_stdin
-from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, prefer_latency, yield_to_others
+from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals, stop_with_stdin
+from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, lower_priority, set_short_slice
 
 ROUTER_RETRY_S: Final = 0.5
 
@@ -41,7 +41,7 @@ def run_service(
     stop_on_signals(stopping)
     if stop_with_parent:
         stop_with_stdin(stopping)
-    end_when_closing_hangs(stopping, close_timeout_s)
+    force_exit_after(stopping, close_timeout_s)
     bus = _open_bus(lab, name, instance, stopping)
     if bus is None:
         return
@@ -74,10 +74,10 @@ def _ask_for_time(name: str, lab: LabConfig) -> None:
     """Services whose punctuality is the product go first, the others may wait for their turn."""
     priority = REALTIME_PRIORITIES.get(name)
     if priority is None:
-        yield_to_others()
+        lower_priority()
         return
     # Before the bus is opened: its threads inherit both.
-    prefer_latency()
+    set_short_slice()
     if lab.realtime and not go_realtime(priority):
         logger.debug("the system grants no real-time policy: other programs may hold up this one")
 

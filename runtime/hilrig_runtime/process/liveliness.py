@@ -6,10 +6,10 @@ Pure: time is passed in.
 
 from typing import Final
 
-LASTS_NS: Final = 2_000_000_000
+PEER_DOWN_GRACE_NS: Final = 2_000_000_000
 
 
-class Absences:
+class PeerDownTracker:
     """See the module."""
 
     def __init__(self) -> None:
@@ -17,11 +17,11 @@ class Absences:
         """By who is gone and not told of yet, when he went, ns, monotonic clock."""
         self._told: set[str] = set()
 
-    def went(self, who: str, now_ns: int) -> None:
+    def mark_down(self, who: str, now_ns: int) -> None:
         """He is not there any more."""
         self._gone_ns.setdefault(who, now_ns)
 
-    def came(self, who: str) -> bool:
+    def mark_up(self, who: str) -> bool:
         """He is there; whether it was told that he was gone."""
         self._gone_ns.pop(who, None)
         told = who in self._told
@@ -31,11 +31,11 @@ class Absences:
     @property
     def due_ns(self) -> int | None:
         """When there is something to tell, if nobody comes back before; None: nobody is gone untold."""
-        return min(self._gone_ns.values()) + LASTS_NS if self._gone_ns else None
+        return min(self._gone_ns.values()) + PEER_DOWN_GRACE_NS if self._gone_ns else None
 
-    def lasting(self, now_ns: int) -> list[str]:
+    def overdue(self, now_ns: int) -> list[str]:
         """Who is gone for long enough to be told, sorted; each once."""
-        found = sorted(who for who, since_ns in self._gone_ns.items() if now_ns - since_ns >= LASTS_NS)
+        found = sorted(who for who, since_ns in self._gone_ns.items() if now_ns - since_ns >= PEER_DOWN_GRACE_NS)
         for who in found:
             del self._gone_ns[who]
             self._told.add(who)

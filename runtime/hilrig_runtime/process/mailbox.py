@@ -12,11 +12,11 @@ T = TypeVar("T")
 TIMEOUT_S: Final = 1.0
 
 
-class Turns:
-    """`call` is for other threads, `run_waiting` for the service's own."""
+class OwnerThreadExecutor:
+    """`call` is for other threads, `run_pending` for the service's own."""
 
     def __init__(self) -> None:
-        self.alone = threading.Lock()
+        self.exclusive = threading.Lock()
         """For whoever prepares on another thread what only one may change at a time."""
         self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
@@ -35,7 +35,7 @@ class Turns:
             done.cancel()
             raise OperationError("the service is too busy to answer") from error
 
-    def run_waiting(self) -> None:
+    def run_pending(self) -> None:
         """Do what waits."""
         while not self._waiting.empty():
             try:

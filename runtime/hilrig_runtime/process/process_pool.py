@@ -13,7 +13,7 @@ from hilrig_runtime.errors import OperationError
 
 
 @contextmanager
-def all_cores(tasks: int, workers: int | None = None) -> Iterator[Executor]:
+def process_pool(tasks: int, workers: int | None = None) -> Iterator[Executor]:
     """Give an executor; whoever leaves the context by an exception waits for no task that has not begun.
 
     Args:

@@ -16,13 +16,14 @@ from google.protobuf.message import Message
 from hilrig_runtime.bus.api import Bus, Handle, Publisher
 from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.messaging.endpoints import LatestOfBatches, Sender
-from hilrig_runtime.messaging.recording_stream import LogStream, batches_kept
-from hilrig_runtime.messaging.rig_batch import BatchSender
-from hilrig_runtime.process.discovery import Presence
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
+from hilrig_runtime.messaging.publisher import CommandSink, RigPublisher
+from hilrig_runtime.messaging.recording_stream import RecordingStream, batch_cache_depth
+from hilrig_runtime.messaging.rig_batch import BatchPublisher
+from hilrig_runtime.process.discovery import PeerRegistry
 from hilrig_runtime.process.health import HealthReporter
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
-from hilrig_schemas import Event, RigBatch, Roster
+from hilrig_schemas import Event, RigBatch, ServiceInfo
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -56,13 +57,13 @@ class Service:
         self.stopping = stopping or threading.Event()
         self._closing = ExitStack()
         self._closing.callback(bus.close)
-        self._event_senders: dict[str, Sender[Event]] = {}
-        self.batches_kept = batches_kept(len(lab.rigs), lab.sim.step_ms)
+        self._event_publishers: dict[str, RigPublisher[Event]] = {}
+        self.batch_cache_depth = batch_cache_depth(len(lab.rigs), lab.sim.step_ms)
         """How far back each recording stream of the lab can be repeated."""
         log_publisher = self._closing.enter_context(
-            bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batches_kept)
+            bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batch_cache_depth)
         )
-        self.log = LogStream(log_publisher, self.source, self.incarnation)
+        self.recording_stream = RecordingStream(log_publisher, self.source, self.incarnation)
         health_publisher = self._closing.enter_context(
             bus.publisher(HEALTH.key(lab.name, name, instance), HEALTH.traffic)
         )
@@ -70,12 +71,12 @@ class Service:
         self.counters = self.health.counters
         self._token: Handle | None = None
         self._failure = ""
-        roster = Roster(service=name, instance=instance, incarnation=self.incarnation)
+        roster = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
         self.addresses: Callable[[str], str] = lambda _: ""
         """Where a rig is reached, for the roster; the edge sets it."""
-        self._presence = Presence(bus, lab.name, roster, self._rigs_reached, clock, self.fail)
-        self._closing.callback(self._presence.close)
-        self.health.clock_offset = lambda: self._presence.clock_offset
+        self._registry = PeerRegistry(bus, lab.name, roster, self._rigs_reached, clock, self.fail)
+        self._closing.callback(self._registry.close)
+        self.health.clock_offset = lambda: self._registry.clock_offset
 
     def claim(self) -> None:
         """Make sure that no other service of its kind has one of its rigs, or its name; before a word is sent.
@@ -83,15 +84,15 @@ class Service:
         Raises:
             OperationError: one has.
         """
-        self._presence.claim()
+        self._registry.claim()
 
-    def look_for_elders(self) -> None:
+    def check_instance_conflict(self) -> None:
         """Look once more whether another service of its kind was there before; one that was may be found late.
 
         Raises:
             OperationError: as `claim`.
         """
-        self._presence.look_again()
+        self._registry.recheck()
 
     def ready(self) -> None:
         """Say that the service does its work now: its liveliness token appears; a second call does nothing.
@@ -101,26 +102,26 @@ class Service:
         """
         if self._token is None:
             self.claim()
-            token = self.bus.announce(alive_key(self.lab.name, self.name, self.instance))
+            token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 
-    def sender(
+    def rig_publisher(
         self,
         topic: RigTopic[MessageT],
         rig: str,
         *,
-        first: Callable[[bytes], None] | None = None,
-    ) -> Sender[MessageT]:
-        """An end that sends on a rig's topic; `first` gets each encoded message before that."""
+        control_path: CommandSink | None = None,
+    ) -> RigPublisher[MessageT]:
+        """An end that sends on a rig's topic; `control_path` gets each encoded message before that."""
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return Sender(key, publisher, self.log, self.clock, self.counters, first)
+        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters, control_path)
 
-    def latest_of_batches(
+    def latest_value_cache(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})
-    ) -> LatestOfBatches:
-        """The newest messages of each rig, out of the batches of everyone who sends them; see `LatestOfBatches`."""
-        values = LatestOfBatches(self.clock, self.counters, permitted)
+    ) -> LatestValueCache:
+        """The newest messages of each rig, out of the batches of everyone who sends them; see `LatestValueCache`."""
+        values = LatestValueCache(self.clock, self.counters, permitted)
         key = topic.key(self.lab.name, "*", "*")
         # A batch may hold one message only: there is room for one of each rig, and some for rigs that are added.
         waiting = len(self.rigs) + BATCHES_WAITING
@@ -132,11 +133,11 @@ class Service:
         key = topic.key(self.lab.name, self.name, self.instance)
         return self._closing.enter_context(self.bus.publisher(key, topic.traffic))
 
-    def batch_sender(self, topic: ServiceTopic[RigBatch]) -> BatchSender:
+    def batch_publisher(self, topic: ServiceTopic[RigBatch]) -> BatchPublisher:
         """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""
-        return BatchSender(self.source, self.publisher(topic), self.log, self.clock, self.counters)
+        return BatchPublisher(self.source, self.publisher(topic), self.recording_stream, self.clock, self.counters)
 
-    def add_to_batch(self, batch: BatchSender, topic: RigTopic[MessageT], rig: str) -> None:
+    def add_to_batch(self, batch: BatchPublisher, topic: RigTopic[MessageT], rig: str) -> None:
         """Let a batch sender send for one more rig, whose own messages go on `topic` too."""
         key = topic.key(self.lab.name, rig)
         batch.add(rig, key, self._closing.enter_context(self.bus.publisher(key, topic.traffic)))
@@ -147,14 +148,14 @@ class Service:
         event.wall_ns = self.clock.wall_ns()
         # Of the service as a whole: under its own name.
         rig = event.rig or self.name
-        sender = self._event_senders.get(rig)
-        if sender is None:
-            sender = self._event_senders[rig] = self.sender(EVENT, rig)
-        sender.send(event)
+        publisher = self._event_publishers.get(rig)
+        if publisher is None:
+            publisher = self._event_publishers[rig] = self.rig_publisher(EVENT, rig)
+        publisher.publish(event)
 
     def beat(self, now_ns: int) -> None:
         """Once a tick: send the log batch and the health report when they are due; monotonic clock, ns."""
-        self.log.flush_if_due(now_ns)
+        self.recording_stream.flush_if_due(now_ns)
         self.health.report_if_due(now_ns)
 
     def stop(self) -> None:
@@ -190,5 +191,5 @@ class Service:
         """Send what is left on the log stream, then close everything in reverse order; a second call does nothing."""
         with self._closing.pop_all():
             now_ns = self.clock.monotonic_ns()
-            self.log.flush(now_ns)
+            self.recording_stream.flush(now_ns)
             self.health.report(now_ns)

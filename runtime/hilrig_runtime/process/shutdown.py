@@ -22,7 +22,7 @@ from hilrig_runtime.errors import HilrigError, OperationError
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """A process that has not closed by then ends all the same."""
-CLOSED_PIPE: Final = 141
+EXIT_SIGPIPE: Final = 141
 """Exit code where whoever read the output has seen enough: what a shell says of a program that SIGPIPE ended."""
 TURN_S: Final = 0.5
 """Of waiting for a signal."""
@@ -80,7 +80,7 @@ def stop_with_stdin(stopping: threading.Event) -> None:
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
 
 
-def end_when_closing_hangs(stopping: threading.Event, timeout_s: float) -> None:
+def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
     """End the process `timeout_s` after `stopping` was set, if it is still there: a hung session ignores signals."""
 
     def watch() -> None:
@@ -105,7 +105,7 @@ def run_main(main: Callable[[], int | None]) -> int:
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     _drop_output()
-    return CLOSED_PIPE
+    return EXIT_SIGPIPE
 
 
 def _run_and_tell(main: Callable[[], int | None]) -> int:

@@ -22,7 +22,7 @@ _CLOCK_SKEW: Final = timedelta(minutes=5)
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class Credential:
     """A certificate with its private key."""
 
     certificate: x509.Certificate
@@ -41,7 +41,7 @@ class Identity:
         )
 
 
-def load(certificate_pem: bytes, key_pem: bytes) -> Identity:
+def load(certificate_pem: bytes, key_pem: bytes) -> Credential:
     """An identity that was written before.
 
     Raises:
@@ -50,10 +50,10 @@ def load(certificate_pem: bytes, key_pem: bytes) -> Identity:
     key = serialization.load_pem_private_key(key_pem, password=None)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise ValueError("not an elliptic key")
-    return Identity(x509.load_pem_x509_certificate(certificate_pem), key)
+    return Credential(x509.load_pem_x509_certificate(certificate_pem), key)
 
 
-def make_authority(name: str, now: datetime, days: int) -> Identity:
+def make_authority(name: str, now: datetime, days: int) -> Credential:
     """A self-signed authority that signs nothing but leaves."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = _name(name)
@@ -62,20 +62,20 @@ def make_authority(name: str, now: datetime, days: int) -> Identity:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(sign_certificates=True), critical=True)
     )
-    return Identity(builder.sign(key, hashes.SHA256()), key)
+    return Credential(builder.sign(key, hashes.SHA256()), key)
 
 
-def issue_server(authority: Identity, hosts: Sequence[str], now: datetime, days: int) -> Identity:
+def issue_server(authority: Credential, hosts: Sequence[str], now: datetime, days: int) -> Credential:
     """A certificate for the edge; `hosts` are the names and addresses by which clients reach it."""
     return _issue(authority, hosts[0], [ExtendedKeyUsageOID.SERVER_AUTH], _alternative_names(hosts), now, days)
 
 
-def issue_peer(authority: Identity, name: str, hosts: Sequence[str], now: datetime, days: int) -> Identity:
+def issue_peer(authority: Credential, name: str, hosts: Sequence[str], now: datetime, days: int) -> Credential:
     """A certificate for who connects and is connected to, as on the bus; `name` is what access control knows it by."""
     return _issue(authority, name, _BOTH_WAYS, _alternative_names(hosts), now, days)
 
 
-def issue_client(authority: Identity, name: str, role: str, now: datetime, days: int) -> Identity:
+def issue_client(authority: Credential, name: str, role: str, now: datetime, days: int) -> Credential:
     """A certificate for a controller; an empty role is left out."""
     extension = x509.UnrecognizedExtension(ROLE_OID, _utf8_string(role)) if role else None
     return _issue(authority, name, [ExtendedKeyUsageOID.CLIENT_AUTH], extension, now, days)
@@ -102,13 +102,13 @@ def role_of(certificate_der: bytes) -> str:
 
 
 def _issue(
-    authority: Identity,
+    authority: Credential,
     name: str,
     purposes: Sequence[x509.ObjectIdentifier],
     extension: x509.ExtensionType | None,
     now: datetime,
     days: int,
-) -> Identity:
+) -> Credential:
     key = ec.generate_private_key(ec.SECP256R1())
     issuer = authority.certificate
     builder = (
@@ -120,7 +120,7 @@ def _issue(
     )
     if extension is not None:
         builder = builder.add_extension(extension, critical=False)
-    return Identity(builder.sign(authority.key, hashes.SHA256()), key)
+    return Credential(builder.sign(authority.key, hashes.SHA256()), key)
 
 
 def _builder(

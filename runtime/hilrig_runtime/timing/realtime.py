@@ -55,7 +55,7 @@ def realtime_priority() -> int:
 
 
 @contextlib.contextmanager
-def one_ahead() -> Iterator[None]:
+def raise_priority() -> Iterator[None]:
     """Let this thread, and those that it starts meanwhile, go one priority before what it was: for who receives.
 
     Among threads of one priority none makes way: a loop that is busy would keep its own news waiting. Under the
@@ -72,7 +72,7 @@ def one_ahead() -> Iterator[None]:
         go_realtime(priority)
 
 
-def prefer_latency() -> None:
+def set_short_slice() -> None:
     """Ask for punctual wake-ups for this thread and for those that it starts from now on; no right is needed."""
     # A callback thread shares the interpreter with the loop: hand over ten times as often as by default.
     sys.setswitchinterval(0.0005)
@@ -89,7 +89,7 @@ def prefer_latency() -> None:
         libc.syscall(number, 0, attributes, 0)
 
 
-def yield_to_others() -> None:
+def lower_priority() -> None:
     """Step back behind whatever closes a loop on this machine: what is recorded may wait, it is queued."""
     if sys.platform == "win32":
         return
@@ -99,7 +99,7 @@ def yield_to_others() -> None:
         Path("/proc/self/autogroup").write_text(str(BACKGROUND_NICE))
 
 
-def freeze_garbage() -> None:
+def freeze_gc() -> None:
     """Collect once and leave what lives now alone: later collections look at what is new, and pause less long."""
     gc.collect()
     gc.freeze()

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"hilrig_schemas/v1/impairment.proto\x12\thilrig.v1\"5\n\x11ImpairmentRequest\x12\x10\n\x08set_json\x18\x01 \x01(\t\x12\x0e\n\x06\x61s_lab\x18\x02 \x01(\x08\"\xe2\x01\n\x10ImpairmentStatus\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x11\n\tways_json\x18\x03 \x01(\t\x12\x0c\n\x04seed\x18\x04 \x01(\x04\x12\x0e\n\x06source\x18\x05 \x01(\t\x12\x0e\n\x06states\x18\x06 \x01(\x04\x12\x13\n\x0bstates_lost\x18\x07 \x01(\x04\x12\x18\n\x10states_overtaken\x18\x08 \x01(\x04\x12\x10\n\x08\x63ommands\x18\t \x01(\x04\x12\x15\n\rcommands_lost\x18\n \x01(\x04\x12\x1a\n\x12\x63ommands_overtaken\x18\x0b \x01(\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"hilrig_schemas/v1/impairment.proto\x12\thilrig.v1\":\n\x11ImpairmentRequest\x12\x10\n\x08set_json\x18\x01 \x01(\t\x12\x13\n\x0brestore_lab\x18\x02 \x01(\x08\"\xe5\x01\n\x10ImpairmentStatus\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x12\n\nlinks_json\x18\x03 \x01(\t\x12\x0c\n\x04seed\x18\x04 \x01(\x04\x12\x0e\n\x06source\x18\x05 \x01(\t\x12\x0e\n\x06states\x18\x06 \x01(\x04\x12\x13\n\x0bstates_lost\x18\x07 \x01(\x04\x12\x19\n\x11states_superseded\x18\x08 \x01(\x04\x12\x10\n\x08\x63ommands\x18\t \x01(\x04\x12\x15\n\rcommands_lost\x18\n \x01(\x04\x12\x1b\n\x13\x63ommands_superseded\x18\x0b \x01(\x04\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,7 +32,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.impairmen
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_IMPAIRMENTREQUEST']._serialized_start=49
-  _globals['_IMPAIRMENTREQUEST']._serialized_end=102
-  _globals['_IMPAIRMENTSTATUS']._serialized_start=105
-  _globals['_IMPAIRMENTSTATUS']._serialized_end=331
+  _globals['_IMPAIRMENTREQUEST']._serialized_end=107
+  _globals['_IMPAIRMENTSTATUS']._serialized_start=110
+  _globals['_IMPAIRMENTSTATUS']._serialized_end=339
 # @@protoc_insertion_point(module_scope)

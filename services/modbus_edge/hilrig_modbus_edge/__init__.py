@@ -1,1 +1,1 @@
-"""The Modbus edge: controllers on one side, the bus on the other."""
+"""Modbus edge: connects Modbus TCP clients with the bus."""

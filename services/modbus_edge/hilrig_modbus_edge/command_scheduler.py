@@ -3,7 +3,7 @@
 The simulation latches only the newest command of each rig at its tick, so an older one can be dropped and the commands
 of several rigs can share a message. Each message costs the sender, threads of the bus on both sides and the simulation
 a wake-up (0.1 ms of processor time in all), which on a small machine is taken from the requests in progress. At 128
-rigs, a message a command leaves 63 % of the loops within one step; this schedule leaves 98 % (`bench/ablation.py`).
+rigs, one message per command keeps 63 % of the loops within one step, this schedule 98 % (`bench/ablation.py`).
 """
 
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigBatch
 
 COALESCE_WINDOW_NS: Final = 2_000_000
-"""Shortest time between two messages, ns, while there is time until the deadline: at most ten a step of 20 ms."""
+"""Shortest time between two messages before the deadline, ns: at most ten messages per step of 20 ms."""
 DEADLINE_MARGIN_NS: Final = 1_500_000
 """Time before the estimated tick at which no command is delayed any further, ns.
 
@@ -42,16 +42,16 @@ class _StateWrites:
 
 
 class CommandScheduler:
-    """Sends the commands of an edge's rigs, on the edge's event loop.
+    """Sends the commands of an edge's rigs; runs on the event loop of the edge.
 
     A command is sent at once, unless a message was sent within `COALESCE_WINDOW_NS`: then it waits for the rest of the
-    window, but never beyond the deadline before the next tick. A rig's further commands on the same state replace one
-    another until that deadline: a controller that polls as fast as it can sends one message a step instead of hundreds.
+    window, but never beyond the deadline before the next tick. Further commands of a rig on the same state
+    replace one another until that deadline: a busy-polling client causes one message per step instead of hundreds.
 
     Args:
-        source: name of the edge, for the messages.
+        source: name of the edge, put into the messages.
         put: publishes an encoded `RigBatch`.
-        newest_state: gives the newest state of a rig, whose arrival tells when the rig's simulation had its last tick.
+        newest_state: returns the newest state of a rig; its arrival is an estimate of the last tick of the simulation.
         step_ns: step of the simulation, ns.
         clock: monotonic time.
         call_at: calls a function on the event loop at a time of its clock, s.
@@ -61,7 +61,7 @@ class CommandScheduler:
         self,
         source: str,
         put: Callable[[bytes], None],
-        newest_state: Callable[[str], Arrival | None],
+        newest_state: Callable[[str], TimestampedPayload | None],
         step_ns: int,
         clock: Clock,
         call_at: Callable[[float, Callable[[], None]], TimerHandle],
@@ -73,7 +73,7 @@ class CommandScheduler:
         self._monotonic_ns = clock.monotonic_ns
         self._call_at = call_at
         self._pending: dict[str, bytes] = {}
-        """The newest command of each rig that waits, encoded."""
+        """By rig, its newest pending command, encoded."""
         self._writes: dict[str, _StateWrites] = {}
         self._flushed_ns = 0
         self._flush_due_ns = 0
@@ -93,7 +93,7 @@ class CommandScheduler:
             self._timer = self._call_at(due_ns * 1e-9, self.flush)
 
     def flush(self) -> None:
-        """Send the commands that wait."""
+        """Send the pending commands."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -104,7 +104,7 @@ class CommandScheduler:
             self._flushed_ns = self._monotonic_ns()
 
     def _send_time(self, rig: str, now_ns: int) -> int:
-        """Time at which a rig's new command is to be sent at the latest, ns, monotonic clock."""
+        """Return the latest time at which a new command of a rig is sent, ns, monotonic clock."""
         window_end_ns = self._flushed_ns + COALESCE_WINDOW_NS
         state = self._newest_state(rig)
         state_ns = 0 if state is None else state.arrived_ns
@@ -114,7 +114,7 @@ class CommandScheduler:
         writes.count += 1
         tick_ns = state_ns + self._step_ns
         if now_ns > tick_ns + self._step_ns:
-            # The simulation is silent: there is no tick to be in time for.
+            # The simulation publishes no states: there is no tick to estimate.
             return window_end_ns
         deadline_ns = tick_ns - DEADLINE_MARGIN_NS
         if writes.count <= SEPARATE_WRITES:

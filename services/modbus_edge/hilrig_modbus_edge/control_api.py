@@ -1,6 +1,6 @@
-"""What people ask of an edge over the bus: who holds a rig, what impairs it, rigs more or fewer.
+"""Queries that the edge answers on the bus: lease, impairment, and adding, removing or resetting rigs.
 
-A question comes on a thread of the bus and is answered on the loop, which alone touches devices.
+A query arrives on a thread of the bus and is handled on the event loop, the only thread that accesses devices.
 """
 
 import asyncio
@@ -15,68 +15,69 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import RigSettings, read_rig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event, ImpairmentRequest, LeaseRequest
 
-ANSWER_TIMEOUT_S: Final = 1.0
+REPLY_TIMEOUT_S: Final = 1.0
+"""Timeout for the event loop to handle a query, s."""
 
 
-class Rigs(Protocol):
-    """What can be done about an edge's rigs; each says what it did, for people."""
+class RigManager(Protocol):
+    """Operations on the rigs of an edge; each returns a human-readable result."""
 
     def add(self, rig: RigSettings) -> str:
-        """Serve one more rig."""
+        """Start to serve a rig."""
 
     def remove(self, rig: str) -> str:
-        """Serve a rig no more."""
+        """Stop serving a rig."""
 
     def reset(self, rig: str) -> str:
-        """Put a rig back to its start pose."""
+        """Move the arm of a rig to its start pose."""
 
 
-def serve_on_loop(bus: Bus, key: str, loop: asyncio.AbstractEventLoop, answer: Callable[[bytes], bytes]) -> Handle:
-    """Answer questions asked on `key` with `answer`, on the loop."""
+def serve_on_loop(bus: Bus, key: str, loop: asyncio.AbstractEventLoop, handler: Callable[[bytes], bytes]) -> Handle:
+    """Answer the queries on `key` with `handler`, called on the event loop."""
 
     def ask(payload: bytes) -> bytes:
         done: Future[bytes] = Future()
-        loop.call_soon_threadsafe(_settle, done, partial(answer, payload))
-        return done.result(ANSWER_TIMEOUT_S)
+        loop.call_soon_threadsafe(_set_result, done, partial(handler, payload))
+        return done.result(REPLY_TIMEOUT_S)
 
-    return bus.serve(key, ask)
+    return bus.declare_queryable(key, ask)
 
 
-def answer_lease(device: Device, payload: bytes) -> bytes:
-    """`LeaseRequest` to `LeaseStatus`."""
+def handle_lease_query(device: Device, payload: bytes) -> bytes:
+    """Handle a `LeaseRequest`; return a `LeaseStatus`."""
     request = LeaseRequest.FromString(payload)
-    released = device.release("released by hand") if request.release else ""
+    released = device.release("revoked by an operator (hilrig lease --release)") if request.release else ""
     status = device.lease_status()
     status.released = released
     return status.SerializeToString()
 
 
-def answer_impairment(device: Device, payload: bytes) -> bytes:
-    """`ImpairmentRequest` to `ImpairmentStatus`.
+def handle_impairment_query(device: Device, payload: bytes) -> bytes:
+    """Handle an `ImpairmentRequest`; return an `ImpairmentStatus`.
 
     Raises:
-        InputError: the impairment that is asked for is none.
+        InputError: the requested impairment is invalid.
     """
     request = ImpairmentRequest.FromString(payload)
     if request.set_json:
         try:
-            device.impaired.set(ImpairmentConfig.model_validate_json(request.set_json))
+            device.impairment.set(ImpairmentConfig.model_validate_json(request.set_json))
         except ValidationError as error:
-            raise InputError("; ".join(mistakes_in(error))) from error
-    elif request.as_lab:
-        device.impaired.set(None)
-    return device.impaired.status().SerializeToString()
+            raise InputError("; ".join(format_validation_error(error))) from error
+    elif request.restore_lab:
+        device.impairment.set(None)
+    return device.impairment.status().SerializeToString()
 
 
-def answer_control(rigs: Rigs, tell: Callable[[Event], None], payload: bytes) -> bytes:
-    """Add, take away or reset a rig: `Event` to `Event`, which `tell` gets too.
+def handle_control_query(rigs: RigManager, emit: Callable[[Event], None], payload: bytes) -> bytes:
+    """Add, remove or reset a rig as an `Event` requests; return the result as an `Event`, which is also emitted.
 
     Raises:
-        HilrigError: it can't be done.
+        HilrigError: the request is invalid or cannot be executed.
     """
     request = Event.FromString(payload)
     if request.kind == Event.RIG_ADDED:
@@ -86,16 +87,18 @@ def answer_control(rigs: Rigs, tell: Callable[[Event], None], payload: bytes) ->
     elif request.kind == Event.RESET:
         text = rigs.reset(request.rig)
     else:
-        raise OperationError("a request that the edge does not know")
-    answer = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
+        raise OperationError(
+            f"unknown control request of kind {request.kind}: client and edge must have the same hilrig version"
+        )
+    reply = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
     if request.kind != Event.RESET:
-        # Of a reset the simulation tells, when it is done.
-        tell(answer)
-    return answer.SerializeToString()
+        # The event of a reset is emitted by the simulation, when it has executed it.
+        emit(reply)
+    return reply.SerializeToString()
 
 
-def _settle(done: Future[bytes], answer: Callable[[], bytes]) -> None:
+def _set_result(done: Future[bytes], call: Callable[[], bytes]) -> None:
     try:
-        done.set_result(answer())
+        done.set_result(call())
     except Exception as error:
         done.set_exception(error)

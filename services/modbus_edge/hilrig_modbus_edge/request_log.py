@@ -1,49 +1,51 @@
-"""What controllers asked of a rig, and when: each request noted as it is answered, sent in batches.
+"""Request log of a rig: records each Modbus request with its timestamps, for publication in batches.
 
-A controller asks the same again and again, so a note is the number of what was asked, out of a table, and two times:
-half a microsecond. It is paid at the request: to make a whole batch at once would hold up whoever asks at that moment.
+Clients repeat the same few requests, so an entry is an index into a table of request kinds and two timestamps, which
+takes half a microsecond. The message is built entry by entry: building a whole batch at once would delay the request at
+that moment.
 """
 
 from typing import Final
 
 from hilrig_schemas import ModbusTraffic
 
-MOST: Final = 256
-"""Requests after which a batch is due though its time has not come: memory stays bounded under a flood."""
-_SINGLE: Final = frozenset({0x05, 0x06, 0x16})
-"""Functions whose third word is a value, not a count."""
-_COUNTED: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x0F, 0x10, 0x17})
+MAX_REQUESTS_PER_MESSAGE: Final = 256
+"""Number of requests after which a message is published before its period has passed: it bounds the memory."""
+_SINGLE_FUNCTIONS: Final = frozenset({0x05, 0x06, 0x16})
+"""Functions with an address, but without a quantity."""
+_QUANTITY_FUNCTIONS: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x0F, 0x10, 0x17})
+"""Functions with an address and a quantity."""
 
-_Kind = tuple[int, int, int]
-"""Function, address, count."""
+_RequestKind = tuple[int, int, int]
+"""Function, address, quantity."""
 
 
-class TrafficRecord:
-    """The requests of one rig since they were last taken."""
+class RequestLog:
+    """Requests of one rig since the last call of `drain`."""
 
     def __init__(self, rig: str) -> None:
         self._rig = rig
-        self._begin()
+        self._start_message()
 
-    def _begin(self) -> None:
+    def _start_message(self) -> None:
         message = self._message = ModbusTraffic(rig=self._rig)
-        # A list of their own would be as fast to fill, and then has to be copied.
+        # Appends directly to the message: separate lists would be as fast to fill, but have to be copied.
         self._add_index = message.kind_indexes.append
         self._add_arrived_ns = message.arrived_ns.append
         self._add_answered_after_ns = message.answered_after_ns.append
-        self._index_of: dict[tuple[_Kind, int, str], int] = {}
-        """Index of the message's kinds, by request, exception and controller."""
+        self._index_of: dict[tuple[_RequestKind, int, str], int] = {}
+        """By request kind, exception code and client: index in the kinds of the message."""
         self._index_of_head: dict[tuple[bytes, int, str], int] = {}
-        """The same by the first bytes of the request, which is 0.5 µs faster; they may hold a value, so several heads
-        have one kind."""
+        """By the first bytes of a request, exception code and client: the same index, found 0.5 µs faster. The bytes
+        may contain a value, so several heads have the same kind."""
 
     @property
     def count(self) -> int:
-        """How many were noted."""
+        """Number of recorded requests."""
         return len(self._message.kind_indexes)
 
-    def note(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
-        """Note one request: PDU, when it came and was answered (monotonic clock), exception code or 0, who asked."""
+    def record(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
+        """Record a request: PDU, arrival and response time (ns, monotonic clock), exception code or 0, and client."""
         head = pdu[:5], exception, controller
         index = self._index_of_head.get(head)
         if index is None:
@@ -52,15 +54,18 @@ class TrafficRecord:
         self._add_arrived_ns(arrived_ns)
         self._add_answered_after_ns(answered_ns - arrived_ns)
 
-    def take(self, closed_ns: int, wall_ns: int) -> ModbusTraffic:
-        """What was noted, closed at `closed_ns` of the monotonic and `wall_ns` of the wall clock; begin anew."""
+    def drain(self, closed_ns: int, wall_ns: int) -> ModbusTraffic:
+        """Return the recorded requests as a message and start a new one.
+
+        `closed_ns` and `wall_ns` are the same time on the monotonic and on the wall clock.
+        """
         message = self._message
         message.closed_ns = closed_ns
         message.wall_ns = wall_ns
-        self._begin()
+        self._start_message()
         return message
 
-    def _index(self, kind: _Kind, exception: int, controller: str) -> int:
+    def _index(self, kind: _RequestKind, exception: int, controller: str) -> int:
         kinds = self._message.kinds
         index = self._index_of.setdefault((kind, exception, controller), len(kinds))
         if index == len(kinds):
@@ -69,10 +74,10 @@ class TrafficRecord:
         return index
 
 
-def _kind_of(head: bytes) -> _Kind:
+def _kind_of(head: bytes) -> _RequestKind:
     function = head[0]
-    if len(head) == 5 and function in _COUNTED:
+    if len(head) == 5 and function in _QUANTITY_FUNCTIONS:
         return function, (head[1] << 8) | head[2], (head[3] << 8) | head[4]
-    if len(head) == 5 and function in _SINGLE:
+    if len(head) == 5 and function in _SINGLE_FUNCTIONS:
         return function, (head[1] << 8) | head[2], 1
     return function, 0, 0

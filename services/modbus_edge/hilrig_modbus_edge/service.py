@@ -1,7 +1,8 @@
-"""Between the devices and the bus: the edge service, on one asyncio loop that alone touches devices.
+"""Edge service: Modbus devices of the rigs on one asyncio event loop, the only thread that accesses them.
 
-States come on the bus's thread, which only keeps the newest of each rig; a device takes it when it is read. Events
-leave at once, commands in time for their tick. A tick every 20 ms does what can wait that long.
+States are received on a thread of the bus, which stores the newest one of each rig; a device fetches it when it is
+read. Events are published at once, commands in time for the next tick of the simulation. Periodic work is done in an
+edge tick every 20 ms.
 """
 
 import asyncio
@@ -10,45 +11,51 @@ from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
-from hilrig_modbus_edge.control_api import answer_control, answer_impairment, answer_lease, serve_on_loop
-from hilrig_modbus_edge.rig_endpoint import Seat
+from hilrig_modbus_edge.control_api import (
+    handle_control_query,
+    handle_impairment_query,
+    handle_lease_query,
+    serve_on_loop,
+)
+from hilrig_modbus_edge.rig_endpoint import RigEndpoint
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Tick
-from hilrig_runtime.timing.realtime import freeze_garbage
+from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_schemas import topics
 
 TICK_NS: Final = 20_000_000
+"""Period of the edge tick, ns."""
 FIRST_STATE_TIMEOUT_NS: Final = 2_000_000_000
-"""How long the first controllers wait for the simulation's first word; it is told by exception 04 afterwards."""
+"""Time that the first clients wait for the first state, ns; afterwards they get exception 04."""
 
 RIGS_PER_TURN: Final = 16
-"""Rigs that one turn of the event loop maintains in a tick, so that no request waits for all of them: with all of 128
-rigs in one turn the 99th percentile of a read is 60 % higher (`bench/ablation.py`)."""
-PORTS_TRIED: Final = 100
-"""For a rig that is added without one."""
+"""Number of rigs per turn of the event loop in an edge tick, so that no request waits for the work of all rigs. With
+128 rigs in one turn, the 99th percentile of a read is 60 % higher (`bench/ablation.py`)."""
+MAX_PORTS_TRIED: Final = 100
+"""Number of ports that are tried for a rig that is added without one."""
 
 
 def run(service: Service) -> None:
-    """Serve Modbus until the service is told to stop.
+    """Serve Modbus until the service is stopped.
 
     Raises:
-        OperationError: a rig's address can't be had.
+        OperationError: the address of a rig is unavailable.
     """
 
     with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
-        runner.run(Edge(service, runner.get_loop()).run())
+        runner.run(EdgeService(service, runner.get_loop()).run())
 
 
-class Edge:
-    """The rigs of one edge."""
+class EdgeService:
+    """Endpoints of the rigs of one edge."""
 
     def __init__(self, service: Service, loop: asyncio.AbstractEventLoop) -> None:
         self._service = service
         self._loop = loop
-        self._states = service.latest_of_batches(topics.STATES)
+        self._states = service.latest_value_cache(topics.STATES)
         self._commands = CommandScheduler(
             service.source,
             service.publisher(topics.COMMANDS).put,
@@ -57,148 +64,155 @@ class Edge:
             service.clock,
             loop.call_at,
         )
-        self._seats: dict[str, Seat] = {rig.name: self._seat(rig) for rig in service.rigs}
+        self._endpoints: dict[str, RigEndpoint] = {rig.name: self._new_endpoint(rig) for rig in service.rigs}
         now_ns = service.clock.monotonic_ns()
-        for number, seat in enumerate(self._seats.values()):
-            # Apart from each other: to encode the requests of all rigs at once would hold the next one up.
-            seat.traffic_due_ns = now_ns + number * TICK_NS
+        for number, endpoint in enumerate(self._endpoints.values()):
+            # Staggered: encoding the request logs of all rigs in one tick would delay requests.
+            endpoint.request_log_due_ns = now_ns + number * TICK_NS
         service.counters.rigs = len(service.rigs)
-        service.health.rig_reports = lambda: [seat.report() for seat in self._seats.values()]
+        service.health.rig_reports = lambda: [endpoint.report() for endpoint in self._endpoints.values()]
         service.addresses = self._address_of
         self._closing = ExitStack()
 
-    def _seat(self, rig: RigSettings) -> Seat:
-        return Seat(rig, self._service, self._states, self._commands, self._state_sessions)
+    def _new_endpoint(self, rig: RigSettings) -> RigEndpoint:
+        return RigEndpoint(rig, self._service, self._states, self._commands, self._announce_sessions)
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
         service, lab = self._service, self._service.lab
-        # Before the first word: another edge's controllers must not feel it.
+        # Before the first command: the clients of another edge must not be affected.
         service.claim()
         try:
-            # Sockets listen before the first state is there: whoever connects early is served as soon as it can be
-            # done. All or none: a rig without its port must not leave the others' open.
+            # Sockets are bound before the first state arrives: early clients are served as soon as possible. All or
+            # none: if the port of one rig is unavailable, the others must not stay open.
             try:
                 ports, tls_ports = lab.ports, lab.tls_ports
-                for rig, seat in self._seats.items():
-                    seat.bind(ports[rig], tls_ports.get(rig))
+                for rig, endpoint in self._endpoints.items():
+                    endpoint.bind(ports[rig], tls_ports.get(rig))
             except OperationError:
-                # Who has the port may be another edge of the lab, with which the bus was not linked yet.
-                service.look_for_elders()
+                # The port may be used by another edge of the lab that was not connected to the bus yet.
+                service.check_instance_conflict()
                 raise
-            self._state_sessions()
-            for seat in self._seats.values():
-                seat.device.begin()
-                self._answer_people(seat)
-            answer = partial(answer_control, self, service.emit)
+            self._announce_sessions()
+            for endpoint in self._endpoints.values():
+                endpoint.device.start()
+                self._declare_queries(endpoint)
+            handler = partial(handle_control_query, self, service.emit)
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
-            self._closing.enter_context(serve_on_loop(service.bus, key, self._loop, answer))
-            await self._first_states()
-            for seat in self._seats.values():
-                await seat.listen()
-            freeze_garbage()
+            self._closing.enter_context(serve_on_loop(service.bus, key, self._loop, handler))
+            await self._wait_for_first_states()
+            for endpoint in self._endpoints.values():
+                await endpoint.listen()
+            freeze_gc()
             service.ready()
-            await self._tick()
+            await self._run_ticks()
         finally:
             self._close()
 
-    # -- rigs come and go
+    # -- rigs added and removed at run time
 
     def add(self, rig: RigSettings) -> str:
-        """Serve one more rig, without a port of its own at the next free one; what was done, for people.
+        """Start to serve a rig, at the next free port if it has none; return a human-readable result.
 
         Raises:
-            OperationError: it is served already, or its address can't be had.
+            OperationError: it is already served, or its address is unavailable.
         """
-        if rig.name in self._seats:
-            raise OperationError(f"{rig.name!r} is served already")
-        seat = self._seat(rig)
+        if rig.name in self._endpoints:
+            raise OperationError(f"rig {rig.name!r} is already served by this edge; choose another name")
+        endpoint = self._new_endpoint(rig)
         with ExitStack() as undo:
-            undo.callback(seat.closing.close)
+            undo.callback(endpoint.closing.close)
             if rig.port is None:
-                self._bind_behind_the_others(seat)
+                self._bind_next_free_port(endpoint)
             else:
-                seat.bind_alone(rig.port)
+                endpoint.bind_single(rig.port)
             undo.pop_all()
-        self._seats[rig.name] = seat
-        self._answer_people(seat)
-        seat.device.begin()
-        listening = self._loop.create_task(seat.listen())
-        seat.closing.callback(listening.cancel)
-        self._changed((*self._service.rigs, rig))
-        return f"{rig.name} is at {seat.address}"
+        self._endpoints[rig.name] = endpoint
+        self._declare_queries(endpoint)
+        endpoint.device.start()
+        listening = self._loop.create_task(endpoint.listen())
+        endpoint.closing.callback(listening.cancel)
+        self._set_rigs((*self._service.rigs, rig))
+        return f"{rig.name} is served at {endpoint.address}"
 
     def remove(self, rig: str) -> str:
-        """Serve a rig no more; what was done, for people.
+        """Stop serving a rig; return a human-readable result.
 
         Raises:
-            OperationError: it is not served here.
+            OperationError: it is not served by this edge.
         """
-        self._seat_of(rig).shut("the rig was taken away")
-        del self._seats[rig]
-        self._state_sessions()
-        self._changed(tuple(other for other in self._service.rigs if other.name != rig))
-        return f"{rig} is served no more"
+        self._endpoint_of(rig).stop("rig removed")
+        del self._endpoints[rig]
+        self._announce_sessions()
+        self._set_rigs(tuple(other for other in self._service.rigs if other.name != rig))
+        return f"{rig} is no longer served"
 
     def reset(self, rig: str) -> str:
-        """Put a rig back to its start pose; what was done, for people.
+        """Move a rig to its start pose; return a human-readable result.
 
         Raises:
-            OperationError: it is not served here.
+            OperationError: it is not served by this edge.
         """
-        self._seat_of(rig).device.reset()
-        return f"{rig} goes back to its start pose"
+        self._endpoint_of(rig).device.reset()
+        return f"{rig} is reset to its start pose"
 
-    def _bind_behind_the_others(self, seat: Seat) -> None:
-        """Take the first port behind all that the lab's file gives, which nobody has: neither a rig that was added
-        before, at whichever edge, nor a stranger."""
+    def _bind_next_free_port(self, endpoint: RigEndpoint) -> None:
+        """Bind the first free port above all ports of lab.toml.
+
+        It may be used by a rig that was added before, at any edge, or by another program.
+
+        Raises:
+            OperationError: none of the ports is free.
+        """
         lab = self._service.lab
         first = max([*lab.ports.values(), *lab.tls_ports.values()]) + 1
-        last = min(first + PORTS_TRIED, 0x10000) - 1
+        last = min(first + MAX_PORTS_TRIED, 0x10000) - 1
         for port in range(first, last + 1):
             with suppress(OperationError):
-                seat.bind_alone(port)
+                endpoint.bind_single(port)
                 return
-        raise OperationError(f"no port from {first} to {last} is free: give one with --port")
+        raise OperationError(f"no port from {first} to {last} is free; choose another one with --port")
 
-    def _seat_of(self, rig: str) -> Seat:
-        if rig not in self._seats:
-            raise OperationError(f"{rig!r} is not served here")
-        return self._seats[rig]
+    def _endpoint_of(self, rig: str) -> RigEndpoint:
+        if rig not in self._endpoints:
+            raise OperationError(f"rig {rig!r} is not served by this edge; hilrig rig list shows all rigs")
+        return self._endpoints[rig]
 
-    def _changed(self, rigs: tuple[RigSettings, ...]) -> None:
+    def _set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
         self._service.rigs = rigs
         self._service.counters.rigs = len(rigs)
 
-    # -- what others ask
+    # -- queries
 
     def _address_of(self, rig: str) -> str:
-        seat = self._seats.get(rig)
-        return seat.address if seat else ""
+        endpoint = self._endpoints.get(rig)
+        return endpoint.address if endpoint else ""
 
-    def _answer_people(self, seat: Seat) -> None:
-        bus, lab, device = self._service.bus, self._service.lab, seat.device
-        for topic, answer in ((topics.LEASE, answer_lease), (topics.IMPAIRMENT, answer_impairment)):
+    def _declare_queries(self, endpoint: RigEndpoint) -> None:
+        bus, lab, device = self._service.bus, self._service.lab, endpoint.device
+        for topic, handler in ((topics.LEASE, handle_lease_query), (topics.IMPAIRMENT, handle_impairment_query)):
             key = topic.key(lab.name, device.rig)
-            seat.closing.enter_context(serve_on_loop(bus, key, self._loop, partial(answer, device)))
+            endpoint.closing.enter_context(serve_on_loop(bus, key, self._loop, partial(handler, device)))
 
-    def _state_sessions(self) -> None:
-        """Tell the log stream which sessions are open."""
-        sessions = [session for seat in self._seats.values() if (session := seat.device.session) is not None]
-        self._service.log.set_sessions([session.as_message() for session in sessions])
+    def _announce_sessions(self) -> None:
+        """Announce the open sessions to the recorder."""
+        sessions = [
+            session for endpoint in self._endpoints.values() if (session := endpoint.device.session) is not None
+        ]
+        self._service.recording_stream.set_sessions([session.as_message() for session in sessions])
 
     # -- time
 
-    async def _first_states(self) -> None:
+    async def _wait_for_first_states(self) -> None:
         clock, stopping = self._service.clock, self._service.stopping
         deadline_ns = clock.monotonic_ns() + FIRST_STATE_TIMEOUT_NS
         while clock.monotonic_ns() < deadline_ns and not stopping.is_set():
-            if all(seat.device.has_state for seat in self._seats.values()):
+            if all(endpoint.device.has_state for endpoint in self._endpoints.values()):
                 return
             self._service.beat(clock.monotonic_ns())
             await asyncio.sleep(TICK_NS * 1e-9)
 
-    async def _tick(self) -> None:
+    async def _run_ticks(self) -> None:
         service, counters = self._service, self._service.counters
         monotonic_ns = service.clock.monotonic_ns
         deadline_ns = monotonic_ns() + TICK_NS
@@ -207,17 +221,17 @@ class Edge:
             now_ns = monotonic_ns()
             missed = max(0, (now_ns - deadline_ns) // TICK_NS)
             counters.count_tick(Tick(deadline_ns, max(0, now_ns - deadline_ns), missed), TICK_NS)
-            for number, seat in enumerate(list(self._seats.values())):
+            for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)
-                seat.look_after(monotonic_ns())
+                endpoint.on_tick(monotonic_ns())
             service.beat(monotonic_ns())
             deadline_ns += (missed + 1) * TICK_NS
 
     def _close(self) -> None:
         self._closing.close()
-        for seat in self._seats.values():
-            seat.shut("the edge stops")
+        for endpoint in self._endpoints.values():
+            endpoint.stop("edge stopped")
         self._commands.flush()
-        self._state_sessions()
-        self._service.log.flush(self._service.clock.monotonic_ns())
+        self._announce_sessions()
+        self._service.recording_stream.flush(self._service.clock.monotonic_ns())

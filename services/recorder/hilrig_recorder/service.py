@@ -111,7 +111,7 @@ class Recorder:
             service.clock,
             self._sync_worker,
             instance=service.instance,
-            repeated_ns=service.batches_kept * FLUSH_PERIOD_NS + _MAX_ARRIVAL_DELAY_NS,
+            repeated_ns=service.batch_cache_depth * FLUSH_PERIOD_NS + _MAX_ARRIVAL_DELAY_NS,
             emit=self._emit,
             request_config=self._request_config,
             on_failed=self._on_failed,
@@ -127,9 +127,11 @@ class Recorder:
         unfinished = [path for path in find_unfinished(self._store.folder) if partition.contains(path.parent.name)]
         self._restore(unfinished)
         self._stream = service.bus.subscribe_recording(
-            LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batches_kept
+            LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batch_cache_depth
         )
-        self._control = service.bus.serve(CONTROL.key(lab.name, service.name, service.instance), self._handle_control)
+        self._control = service.bus.declare_queryable(
+            CONTROL.key(lab.name, service.name, service.instance), self._handle_control
+        )
         service.health.rig_reports = self._rig_reports
         self._maintenance = MaintenanceWorker(self._store.folder, unfinished, config, service.clock, self._errors.put)
 
@@ -149,7 +151,7 @@ class Recorder:
         """Record until the service is stopped, then record the messages published before."""
         service, clock = self._service, self._clock
         due_ns = clock.monotonic_ns()
-        service.log.set_sessions(self._manual_sessions.sessions)
+        service.recording_stream.set_sessions(self._manual_sessions.sessions)
         service.ready()
         while not service.stopping.is_set():
             due_ns = self._run_once(due_ns)
@@ -210,7 +212,7 @@ class Recorder:
         counters.recordings = len(sessions.recordings)
         counters.rigs = len({recording.rig for recording in sessions.recordings})
         counters.bytes_written = self._store.bytes_written
-        counters.trouble = self._store.alert
+        counters.alert = self._store.alert
         self._service.beat(now_ns)
 
     def _rig_reports(self) -> list[RigReport]:
@@ -257,7 +259,7 @@ class Recorder:
             else:
                 raise OperationError(f"unknown control request {event.kind}; expected SESSION_START or SESSION_END")
             self._service.emit(request.reply)
-            self._service.log.set_sessions(self._manual_sessions.sessions)
+            self._service.recording_stream.set_sessions(self._manual_sessions.sessions)
         except HilrigError as error:
             request.error = str(error)
         request.done.set()
@@ -275,7 +277,7 @@ class Recorder:
         config = None
         try:
             key = CONFIG.key(self._service.lab.name, rig)
-            for reply in self._service.bus.ask(key, timeout_s=_CONFIG_TIMEOUT_S):
+            for reply in self._service.bus.query(key, timeout_s=_CONFIG_TIMEOUT_S):
                 if not reply.error:
                     config = CONFIG.decode(reply.payload)
         except (DecodeError, OperationError) as error:

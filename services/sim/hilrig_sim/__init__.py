@@ -1,1 +1,1 @@
-"""The plant: a virtual SCARA arm, stepped in real time."""
+"""Simulation: a virtual SCARA arm per rig, stepped in real time."""

@@ -1,7 +1,7 @@
-"""Which command acts on a rig at a tick, how old it is, and what latency it closes the loop with.
+"""Latches the command that is applied to a rig at a tick, with its timeout and its basis for the loop latency.
 
-Pure: arrivals and time are passed in. A command is new where its session or its number differ from those of the one
-in force; a repeat only says that the edge is still there.
+Received messages and time are passed in. A command is new if its session or number differs from those of the latched
+one; a repetition only shows that the edge is alive.
 """
 
 import math
@@ -17,20 +17,20 @@ ZERO_EFFORT: Final = (0.0, 0.0, 0.0, 0.0)
 Effort = tuple[float, float, float, float]
 
 
-class Arrival(Protocol):
-    """A message as it came in."""
+class ReceivedCommand(Protocol):
+    """A received message."""
 
     @property
     def payload(self) -> bytes:
-        """Its bytes."""
+        """Encoded `TorqueCommand`."""
 
     @property
     def arrived_ns(self) -> int:
-        """When, ns, monotonic clock."""
+        """Arrival time, ns, monotonic clock."""
 
 
 class StepTimes:
-    """When the last steps were sampled: a ring, for commands that answer to a state of some steps ago."""
+    """Ring buffer of the sampling times of the last steps, for commands that are based on an earlier state."""
 
     def __init__(self, capacity: int = 8192) -> None:
         self._times_ns = [0] * capacity
@@ -38,19 +38,19 @@ class StepTimes:
         self._step = 0
 
     def add(self, step: int, sampled_ns: int) -> None:
-        """Steps are added one after the other."""
+        """Add the sampling time of the next step."""
         self._times_ns[step % self._capacity] = sampled_ns
         self._step = step
 
     def get(self, step: int) -> int | None:
-        """sampled_ns of a step; None: it is not kept any more, or has not been."""
+        """Return the sampling time of a step, ns; None: it is too old, or has not been sampled."""
         if 0 < step <= self._step and self._step - step < self._capacity:
             return self._times_ns[step % self._capacity]
         return None
 
 
 class _Command(NamedTuple):
-    """What matters of a command."""
+    """The used fields of a command."""
 
     seq: int
     session: str
@@ -62,75 +62,78 @@ class _Command(NamedTuple):
 
 
 @dataclass(slots=True)
-class CommandFollower:
-    """Follows the commands of one rig; its attributes say what acts from the latest tick on."""
+class CommandLatch:
+    """Latches the commands of one rig; the attributes describe the command that is applied from the latest tick on."""
 
     incarnation: int
-    """Of this run of the simulation: only steps of its own can be a basis."""
+    """Incarnation of this simulation: only its own steps can be a basis."""
     timeout_ns: int
-    """With no command for so long the effort is zero; 0: never."""
+    """Time without a message after which the effort is zero, ns; 0: never."""
     effort: Effort = ZERO_EFFORT
-    """What acts: N·m, N·m, N, N·m."""
+    """Applied effort: N·m, N·m, N, N·m."""
     magnet: bool = False
     session: str = ""
     seq: int = 0
-    """Of the command in force; 0: none yet."""
+    """Number of the latched command; 0: none yet."""
     safe: bool = True
-    """No fresh command: the effort is zero. The magnet stays as it is, so that nothing is dropped."""
+    """Commands have timed out: the effort is zero. The magnet is unchanged, so that no part falls."""
     is_new: bool = False
-    """A new command took effect at this tick."""
+    """A new command is applied from this tick on."""
     basis_step: int = 0
-    """The new command's; 0 where there is no new one, or its basis was not of this run."""
+    """Step that the new command is based on; 0: no new command, or its basis is of another incarnation."""
     arrived_ns: int = 0
-    """Of the new command, ns; 0 where there is none."""
+    """Arrival of the new command, ns; 0: no new command."""
     changed: bool = False
-    """`effort` or `magnet` may differ from those of the tick before."""
-    lost: bool = False
-    """The commands stopped coming at this tick."""
-    back: bool = False
-    """They came again at this tick."""
+    """`effort` or `magnet` may differ from those of the previous tick."""
+    command_lost: bool = False
+    """The commands timed out at this tick."""
+    command_resumed: bool = False
+    """Commands are received again since this tick."""
     reset: bool = False
-    """A reset was asked for at this tick."""
+    """A reset is requested for this tick."""
     silent_ns: int = 0
-    """How long nothing had been heard, where `lost` or `back`, ns."""
+    """Time without a message before `command_lost` or `command_resumed`, ns."""
     malformed: int = 0
-    """Messages that were no commands."""
-    _arrival: Arrival | None = None
-    _heard_ns: int = 0
+    """Number of malformed messages."""
+    _received: ReceivedCommand | None = None
+    _last_received_ns: int = 0
     _commanded: Effort = ZERO_EFFORT
     _resets: int | None = None
-    _is_plain: bool = True
+    _flags_clear: bool = True
 
-    def latch(self, arrival: Arrival | None, now_ns: int) -> None:
-        """Take the newest arrival, the same object as before where nothing came; `now_ns` is not before it."""
-        if not self._is_plain:
-            self.is_new = self.changed = self.lost = self.back = self.reset = False
+    def latch(self, arrival: ReceivedCommand | None, now_ns: int) -> None:
+        """Latch the newest received message for the next tick.
+
+        `arrival` is the same object as before if no message was received; it is not later than `now_ns`.
+        """
+        if not self._flags_clear:
+            self.is_new = self.changed = self.command_lost = self.command_resumed = self.reset = False
             self.basis_step = self.arrived_ns = 0
-            self._is_plain = True
-        self.overtake(arrival, now_ns)
+            self._flags_clear = True
+        self.relatch(arrival, now_ns)
 
-    def overtake(self, arrival: Arrival | None, now_ns: int) -> None:
-        """Take what came after `latch`, but before the tick that it was for: what it overtakes has never acted."""
-        if arrival is not self._arrival and arrival is not None:
-            self._is_plain = False
-            self._arrival = arrival
-            self._take(arrival, now_ns)
-        elif not self.safe and self.timeout_ns and now_ns - self._heard_ns > self.timeout_ns:
-            self._is_plain = False
-            self.safe = self.lost = self.changed = True
-            self.silent_ns = now_ns - self._heard_ns
+    def relatch(self, arrival: ReceivedCommand | None, now_ns: int) -> None:
+        """Latch a message that was received after `latch`, but before its tick: the previous one was never applied."""
+        if arrival is not self._received and arrival is not None:
+            self._flags_clear = False
+            self._received = arrival
+            self._apply(arrival, now_ns)
+        elif not self.safe and self.timeout_ns and now_ns - self._last_received_ns > self.timeout_ns:
+            self._flags_clear = False
+            self.safe = self.command_lost = self.changed = True
+            self.silent_ns = now_ns - self._last_received_ns
             self.effort = ZERO_EFFORT
-            # Where it came for this very tick, and that was held up for so long, it does not act.
+            # A command for this tick that timed out because the tick was late is not applied.
             self.is_new = False
             self.basis_step = self.arrived_ns = 0
 
-    def _take(self, arrival: Arrival, now_ns: int) -> None:
+    def _apply(self, arrival: ReceivedCommand, now_ns: int) -> None:
         command = _decode(arrival.payload)
         if command is None:
             self.malformed += 1
             return
-        was_silent_ns = now_ns - self._heard_ns
-        self._heard_ns = arrival.arrived_ns
+        was_silent_ns = now_ns - self._last_received_ns
+        self._last_received_ns = arrival.arrived_ns
         if command.seq != self.seq or command.session != self.session or self._resets is None:
             self.is_new = self.changed = True
             self.seq, self.session, self.magnet = command.seq, command.session, command.magnet
@@ -138,25 +141,25 @@ class CommandFollower:
             self.arrived_ns = arrival.arrived_ns
             self.basis_step = command.basis_step if command.basis_incarnation == self.incarnation else 0
         if self.safe:
-            # Not at the first command of all: nothing was lost before it. Nor was it where it came just in time.
-            self.back = self._resets is not None and not self.lost
-            self.lost = False
+            # Not for the first command, and not if it was received between `latch` and the tick.
+            self.command_resumed = self._resets is not None and not self.command_lost
+            self.command_lost = False
             self.silent_ns = was_silent_ns
             self.safe = False
             self.changed = True
             self.effort = self._commanded
-        # A count that fell is an edge that was started anew. A reset that is overtaken is asked for all the same.
+        # A lower count is that of a restarted edge. The reset request of a superseded command is kept.
         self.reset |= self._resets is not None and command.resets > self._resets
         self._resets = command.resets
 
 
 def _decode(payload: bytes) -> _Command | None:
-    """The command that some bytes are; None: they are none."""
+    """Decode a command; None: the message is malformed."""
     try:
         message = TorqueCommand.FromString(payload)
     except DecodeError:
         return None
-    # Taken as a list at once: to ask a repeated field for its numbers one by one takes twice as long.
+    # Copied into a list: reading the numbers of a repeated field one by one takes twice as long.
     effort = message.effort[:]
     if len(effort) != 4:
         return None
@@ -172,9 +175,14 @@ def _decode(payload: bytes) -> _Command | None:
 
 
 def _bounded(first: float, second: float, third: float, fourth: float) -> Effort:
-    most = LARGEST_EFFORT
-    # Of each rig at each step: what is within bounds is not looked at twice.
-    if -most <= first <= most and -most <= second <= most and -most <= third <= most and -most <= fourth <= most:
+    limit = LARGEST_EFFORT
+    # Fast path for efforts within the limits: this runs for each rig at each step.
+    if (
+        -limit <= first <= limit
+        and -limit <= second <= limit
+        and -limit <= third <= limit
+        and -limit <= fourth <= limit
+    ):
         return first, second, third, fourth
     return _finite(first), _finite(second), _finite(third), _finite(fourth)
 

@@ -1,4 +1,4 @@
-"""What the simulation tells people of: limits hit, parts picked and dropped, commands lost, resets, overruns."""
+"""Events of the simulation: joint limits, parts, lost commands, resets, divergence and overruns."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,110 +7,117 @@ from typing import Final
 from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import Event
 from hilrig_schemas.v1.event_pb2 import LimitData, OverrunData, PartData, WatchdogData
-from hilrig_sim.commands import CommandFollower
-from hilrig_sim.plant.limits import Happening, PlantEvent
+from hilrig_sim.commands import CommandLatch
+from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 
-QUIET_NS: Final = 250_000_000
-"""A rig's limit is told of at most once in so long: a joint may rattle at its stop."""
-OVERRUN_QUIET_NS: Final = 1_000_000_000
-"""Overruns are gathered for so long, ns."""
+LIMIT_QUIET_PERIOD_NS: Final = 250_000_000
+"""Time without an impact after which a limit is reported again, ns: a joint may chatter at its stop."""
+OVERRUN_PERIOD_NS: Final = 1_000_000_000
+"""Shortest time between two overrun events, ns."""
 
 
-class Reporter:
-    """Makes events out of what happened, and holds back those that would come in bursts."""
+class SimulationEvents:
+    """Emits the events of the simulation, rate-limited where they may occur in bursts."""
 
     def __init__(self, emit: Callable[[Event], None], rigs: Sequence[str], plant: Plant) -> None:
         self._emit = emit
         self._rigs = tuple(rigs)
         self._plant = plant
-        self._limit_told_ns: dict[tuple[int, int, bool], int] = {}
-        self._overrun_told_ns = -OVERRUN_QUIET_NS
+        self._last_impact_ns: dict[tuple[int, int, bool], int] = {}
+        self._overrun_reported_ns = -OVERRUN_PERIOD_NS
         self.overran = False
-        """Overruns were noted that were not told of."""
+        """Whether there are overruns that were not reported yet."""
         self._overrun_step = 0
         self._missed = 0
         self._worst_ns = 0
 
-    def regroup(self, rigs: Sequence[str], plant: Plant) -> None:
-        """Tell of these rigs from now on."""
+    def set_rigs(self, rigs: Sequence[str], plant: Plant) -> None:
+        """Replace the rigs, because one was added or removed."""
         self._rigs = tuple(rigs)
         self._plant = plant
-        self._limit_told_ns.clear()
+        self._last_impact_ns.clear()
 
-    def tell_of_plant(self, events: Sequence[PlantEvent], step: int, now_ns: int, sessions: Sequence[str]) -> None:
-        """What a step of the plant brought; `step` is the first whose state shows it."""
-        for happened in events:
-            is_limit = happened.happening is Happening.LIMIT_HIT
-            event = self._limit(happened, now_ns) if is_limit else self._part(happened)
+    def report_plant_events(
+        self, events: Sequence[PlantEvent], step: int, now_ns: int, sessions: Sequence[str]
+    ) -> None:
+        """Emit the events of a step of the plant; `step` is the first one whose state shows them."""
+        for plant_event in events:
+            is_limit = plant_event.kind is PlantEventKind.LIMIT_HIT
+            event = self._limit(plant_event, now_ns) if is_limit else self._part(plant_event)
             if event is not None:
-                event.rig = self._rigs[happened.rig]
-                event.session = sessions[happened.rig]
+                event.rig = self._rigs[plant_event.rig]
+                event.session = sessions[plant_event.rig]
                 event.step = step
                 self._emit(event)
 
-    def tell_of_commands(self, rig: int, follower: CommandFollower, step: int) -> None:
-        """Commands that stopped or came again, and resets."""
-        silence = WatchdogData(silent_ns=follower.silent_ns, timeout_ns=follower.timeout_ns)
+    def report_command_changes(self, rig: int, command: CommandLatch, step: int) -> None:
+        """Emit events for lost and resumed commands, and for resets."""
+        silence = WatchdogData(silent_ns=command.silent_ns, timeout_ns=command.timeout_ns)
         events = []
-        if follower.lost:
-            text = f"no command for {follower.silent_ns / 1e6:.0f} ms: zero torque"
+        if command.command_lost:
+            text = (
+                f"no command received for {command.silent_ns / 1e6:.0f} ms: torque set to zero until the next command"
+            )
             events.append(Event(kind=Event.COMMAND_LOST, severity=Event.WARNING, text=text, watchdog_data=silence))
-        if follower.back:
-            text = f"commands again after {follower.silent_ns / 1e6:.0f} ms"
+        if command.command_resumed:
+            text = f"commands received again after {command.silent_ns / 1e6:.0f} ms"
             events.append(Event(kind=Event.COMMAND_BACK, severity=Event.INFO, text=text, watchdog_data=silence))
-        if follower.reset:
-            events.append(Event(kind=Event.RESET, severity=Event.INFO, text="back at the start pose"))
+        if command.reset:
+            events.append(Event(kind=Event.RESET, severity=Event.INFO, text="reset to the start pose"))
         for event in events:
-            event.rig, event.session, event.step = self._rigs[rig], follower.session, step
+            event.rig, event.session, event.step = self._rigs[rig], command.session, step
             self._emit(event)
 
-    def tell_of_escape(self, rig: int, session: str, step: int) -> None:
-        """A rig whose motion was too fast for the step, and which is back at its start pose from `step` on."""
-        text = "the motion was too fast for the step: back at the start pose"
+    def report_divergence(self, rig: int, session: str, step: int) -> None:
+        """Emit the event of a diverged rig, which is at its start pose from `step` on."""
+        text = (
+            "the simulation diverged, because the motion was too fast for the step; reset to the start pose: use less "
+            "torque, or set a shorter sim.step_ms or more sim.substeps"
+        )
         event = Event(
             kind=Event.RESET, severity=Event.ERROR, text=text, rig=self._rigs[rig], session=session, step=step
         )
         self._emit(event)
 
-    def note_overrun(self, tick: Tick, step: int, step_ns: int) -> None:
-        """A tick that came more than a step late, or gave up deadlines; `tell_of_overruns` says so."""
+    def record_overrun(self, tick: Tick, step: int, step_ns: int) -> None:
+        """Record a tick that was more than a step late, or skipped steps; `report_overruns` reports it."""
         self.overran = True
         self._overrun_step = step
         self._missed += tick.missed_steps
-        # Behind the deadline that it was meant for: its lateness is against the one that was taken up again.
+        # Lateness against the original deadline: `lateness_ns` is against the one after the skipped steps.
         self._worst_ns = max(self._worst_ns, tick.lateness_ns + tick.missed_steps * step_ns)
 
-    def tell_of_overruns(self, now_ns: int) -> None:
-        """What was noted since they were last told of, all together and once in a while; `overran`: there is some."""
-        if now_ns - self._overrun_told_ns < OVERRUN_QUIET_NS:
+    def report_overruns(self, now_ns: int) -> None:
+        """Emit one event for all recorded overruns, rate-limited; call it while `overran` is set."""
+        if now_ns - self._overrun_reported_ns < OVERRUN_PERIOD_NS:
             return
         data = OverrunData(lateness_ns=self._worst_ns, missed_steps=self._missed)
         steps = f"{self._missed} step{'' if self._missed == 1 else 's'}"
-        text = f"the simulation came {self._worst_ns / 1e6:.1f} ms late and gave up {steps}"
+        text = f"simulation overrun: up to {self._worst_ns / 1e6:.1f} ms late, {steps} skipped"
         step = self._overrun_step
         self._emit(Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data))
-        self._overrun_told_ns = now_ns
+        self._overrun_reported_ns = now_ns
         self._missed = self._worst_ns = 0
         self.overran = False
 
     def _limit(self, hit: PlantEvent, now_ns: int) -> Event | None:
-        place = (hit.rig, hit.joint, hit.upper)
-        told_ns = self._limit_told_ns.get(place)
-        self._limit_told_ns[place] = now_ns
-        if told_ns is not None and now_ns - told_ns < QUIET_NS:
+        limit = (hit.rig, hit.joint, hit.upper)
+        previous_ns = self._last_impact_ns.get(limit)
+        self._last_impact_ns[limit] = now_ns
+        if previous_ns is not None and now_ns - previous_ns < LIMIT_QUIET_PERIOD_NS:
             return None
         linear = hit.joint in (0, 3)
         speed = f"{hit.speed * 1e3:.0f} mm/s" if linear else f"{math.degrees(hit.speed):.0f} °/s"
         if hit.joint == 0:
-            text = f"the tool came down on what is below it at {speed}"
+            text = f"the tool hit an object below it at {speed}"
         else:
-            text = f"joint {hit.joint} came to its {'upper' if hit.upper else 'lower'} stop at {speed}"
+            text = f"joint {hit.joint} hit its {'upper' if hit.upper else 'lower'} stop at {speed}"
         data = LimitData(joint=hit.joint, upper=hit.upper, speed=hit.speed)
         return Event(kind=Event.LIMIT_HIT, severity=Event.INFO, text=text, limit_data=data)
 
-    def _part(self, happened: PlantEvent) -> Event:
-        world, rig, part = self._plant.world, happened.rig, happened.part
+    def _part(self, plant_event: PlantEvent) -> Event:
+        world, rig, part = self._plant.world, plant_event.rig, plant_event.part
         name = world.part_names[rig][part]
         mass = float(world.mass[part, rig])
         data = PartData(
@@ -120,10 +127,10 @@ class Reporter:
             z=float(world.z[part, rig]),
             mass=mass,
         )
-        picked = happened.happening is Happening.PART_PICKED
+        picked = plant_event.kind is PlantEventKind.PART_PICKED
         return Event(
             kind=Event.PART_PICKED if picked else Event.PART_DROPPED,
             severity=Event.INFO,
-            text=f"the magnet {'took' if picked else 'let go of'} {name!r} ({mass:g} kg)",
+            text=f"the magnet {'picked' if picked else 'released'} {name!r} ({mass:g} kg)",
             part_data=data,
         )

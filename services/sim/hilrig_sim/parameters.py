@@ -1,4 +1,4 @@
-"""From a lab's configuration, as people write it, to the parameters of a rig in SI units, checked as a whole."""
+"""Converts the configuration of a lab to the parameters of its rigs in SI units, and validates them."""
 
 import math
 
@@ -19,10 +19,10 @@ from hilrig_sim.arm.stability import check_stable
 
 
 def rig_parameters(lab: LabConfig, rig: RigSettings) -> RigParameters:
-    """A rig's parameters out of its lab's configuration.
+    """Return the parameters of a rig.
 
     Raises:
-        InputError: values do not fit together, or the step would be unstable; it says what would be right.
+        InputError: values are inconsistent, or the step would be unstable.
     """
     try:
         parameters = RigParameters(
@@ -57,7 +57,7 @@ def _scene(config: SceneConfig) -> SceneParameters:
     trays = tuple(
         TrayParameters(
             name=tray.name,
-            size=_metres3(tray.size_mm),
+            size=_meters3(tray.size_mm),
             position=(tray.position_mm[0] / 1000, tray.position_mm[1] / 1000, table),
             yaw=math.radians(tray.yaw_deg),
             colour=tray.colour,
@@ -70,7 +70,7 @@ def _scene(config: SceneConfig) -> SceneParameters:
         x, y = part.position_mm[0] / 1000, part.position_mm[1] / 1000
         radius = part.footprint_radius_mm / 1000
         below = max((t.position[2] + t.size[2] for t in trays if on_tray(t, x, y, radius)), default=table)
-        size = _metres3(part.size_mm)
+        size = _meters3(part.size_mm)
         parts.append(
             PartParameters(
                 name=part.name,
@@ -95,7 +95,7 @@ def _scene(config: SceneConfig) -> SceneParameters:
 
 
 def on_tray(tray: TrayParameters, x: float, y: float, radius: float) -> bool:
-    """Whether a disc of `radius` about (x, y), m, is over any of a tray."""
+    """Return whether a disc of `radius` about (x, y), m, overlaps a tray."""
     c, s = math.cos(tray.yaw), math.sin(tray.yaw)
     dx, dy = x - tray.position[0], y - tray.position[1]
     u = max(abs(c * dx + s * dy) - tray.size[0] / 2, 0.0)
@@ -107,5 +107,5 @@ def _joints_si(joints: Vector4) -> Vector4:
     return (math.radians(joints[0]), math.radians(joints[1]), joints[2] / 1000, math.radians(joints[3]))
 
 
-def _metres3(lengths_mm: Vector3) -> Vector3:
+def _meters3(lengths_mm: Vector3) -> Vector3:
     return (lengths_mm[0] / 1000, lengths_mm[1] / 1000, lengths_mm[2] / 1000)

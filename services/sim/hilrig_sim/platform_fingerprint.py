@@ -1,4 +1,4 @@
-"""What the last bits of a simulation depend on: processor, its vector units, Python, numpy."""
+"""Platform fingerprint: processor, vector units, Python and numpy, which the last bits of a simulation depend on."""
 
 import platform
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def machine_name() -> str:
-    """This machine and its software as one line for people; machines of one name step a plant to the same bits."""
+    """Return the platform as one human-readable line; platforms with the same line compute bit-identical steps."""
     simd = np.show_config(mode="dicts").get("SIMD Extensions", {})
     units = sorted({*simd.get("baseline", []), *simd.get("found", [])})
     vectors = f" ({' '.join(units)})" if units else ""

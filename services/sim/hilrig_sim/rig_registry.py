@@ -1,8 +1,8 @@
-"""Which rigs a simulation has: those that it began with, and those that are added and taken away while it runs.
+"""Rigs of a simulation: serves their configuration, and adds and removes rigs at run time.
 
-A request comes on a thread of the bus. There the new plant is made, which takes a while; the simulation's own thread
-then moves every rig's state into it between two ticks, which does not, so that no other rig feels it. What is changed
-so holds until the simulation ends: the next one begins with the lab's file again.
+A request arrives on a thread of the bus, which creates the new plant, a slow operation. The thread of the simulation
+then copies the state of every rig into it between two ticks, which is fast, so that other rigs are not disturbed. The
+changes are active until the simulation stops; the next one starts with the rigs of lab.toml.
 """
 
 import json
@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, RigConfig, topics
 from hilrig_sim.arm.model import RigParameters
@@ -28,30 +28,30 @@ from hilrig_sim.platform_fingerprint import machine_name
 
 
 @dataclass(frozen=True, slots=True)
-class Constant:
-    """Answers every question alike."""
+class StaticReply:
+    """Answers every query with the same payload."""
 
     payload: bytes
 
-    def __call__(self, question: bytes) -> bytes:
-        """The answer, whatever is asked."""
-        del question
+    def __call__(self, query: bytes) -> bytes:
+        """Return the payload."""
+        del query
         return self.payload
 
 
-class Membership:
-    """Answers for each rig what it is, and changes which there are; a context manager."""
+class RigRegistry:
+    """Registry of the simulated rigs; a context manager."""
 
-    def __init__(self, service: Service, simulation: Simulation, turns: Turns) -> None:
+    def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
         self._service = service
         self._simulation = simulation
         self._turns = turns
         self._served: dict[str, Handle] = {}
         for rig, parameters in zip(service.rigs, simulation.parameters, strict=True):
             self._serve(rig.name, parameters)
-            self._tell(rig.name, parameters)
+            self._emit_start(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
-        self._control = service.bus.serve(key, self._answer)
+        self._control = service.bus.declare_queryable(key, self._handle_control)
         service.counters.rigs = len(service.rigs)
 
     def __enter__(self) -> Self:
@@ -65,69 +65,76 @@ class Membership:
             handle.close()
 
     def _serve(self, rig: str, parameters: RigParameters) -> None:
-        answer = Constant(configuration(self._service, rig, parameters).SerializeToString())
+        reply = StaticReply(configuration(self._service, rig, parameters).SerializeToString())
         key = topics.CONFIG.key(self._service.lab.name, rig)
-        self._served[rig] = self._service.bus.serve(key, answer)
+        self._served[rig] = self._service.bus.declare_queryable(key, reply)
 
-    def _tell(self, rig: str, parameters: RigParameters) -> None:
-        """Say that a simulation begins, and how it steps; a session that was going on records where it was replaced."""
+    def _emit_start(self, rig: str, parameters: RigParameters) -> None:
+        """Emit that a simulation starts, with its step: an open session then records that it was replaced."""
         sim = parameters.sim
         event = Event(kind=Event.CONFIGURATION, severity=Event.INFO, rig=rig)
         steps = f", {sim.substeps} sub-steps" if sim.substeps > 1 else ""
-        event.text = f"simulated from now on: step {sim.step * 1e3:g} ms, {sim.integrator}{steps}"
+        event.text = f"simulation started: step {sim.step * 1e3:g} ms, {sim.integrator}{steps}"
         event.configuration_data.text = json.dumps(asdict(sim))
         self._service.emit(event)
 
-    def _answer(self, payload: bytes) -> bytes:
+    def _handle_control(self, payload: bytes) -> bytes:
         try:
             request = Event.FromString(payload)
         except DecodeError as error:
-            raise OperationError("a request that can't be decoded") from error
-        with self._turns.alone:
+            raise OperationError(
+                "the control request can't be decoded: client and simulation must have the same hilrig version"
+            ) from error
+        with self._turns.exclusive:
             if request.kind == Event.RIG_ADDED:
                 text = self._add(read_rig(request.configuration_data.text))
             elif request.kind == Event.RIG_REMOVED:
                 text = self._remove(request.rig)
             else:
-                raise OperationError("a request that the simulation does not know")
-        answer = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
-        answer.configuration_data.text = request.configuration_data.text
-        self._turns.call(lambda: self._service.emit(answer))
-        return answer.SerializeToString()
+                raise OperationError(
+                    f"unknown control request of kind {request.kind}: client and simulation must have the same hilrig "
+                    "version"
+                )
+        reply = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
+        reply.configuration_data.text = request.configuration_data.text
+        self._turns.call(lambda: self._service.emit(reply))
+        return reply.SerializeToString()
 
     def _add(self, rig: RigSettings) -> str:
         service, simulation = self._service, self._simulation
         if rig.name in self._served:
-            raise OperationError(f"{rig.name!r} is simulated already")
+            raise OperationError(f"rig {rig.name!r} is already simulated here; choose another name")
         parameters = rig_parameters(service.lab, rig)
         plant = Plant([*simulation.parameters, parameters])
         self._turns.call(lambda: simulation.add(rig.name, plant))
         self._serve(rig.name, parameters)
-        self._changed((*service.rigs, rig))
+        self._set_rigs((*service.rigs, rig))
         return f"{rig.name} is simulated"
 
     def _remove(self, name: str) -> str:
         service, simulation = self._service, self._simulation
         names = [rig.name for rig in service.rigs]
         if name not in names:
-            raise OperationError(f"{name!r} is not simulated here")
+            raise OperationError(f"rig {name!r} is not simulated here; hilrig rig list shows all rigs")
         if len(names) == 1:
-            raise OperationError(f"{name!r} is the only rig: end the simulation instead")
+            raise OperationError(
+                f"rig {name!r} is the only rig of this simulation, and can't be removed; stop the simulation instead"
+            )
         index = names.index(name)
         others = [parameters for number, parameters in enumerate(simulation.parameters) if number != index]
         plant = Plant(others)
         self._turns.call(lambda: simulation.remove(index, plant))
         self._served.pop(name).close()
-        self._changed(tuple(rig for rig in service.rigs if rig.name != name))
-        return f"{name} is simulated no more"
+        self._set_rigs(tuple(rig for rig in service.rigs if rig.name != name))
+        return f"{name} is no longer simulated"
 
-    def _changed(self, rigs: tuple[RigSettings, ...]) -> None:
+    def _set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
         self._service.rigs = rigs
         self._service.counters.rigs = len(rigs)
 
 
 def configuration(service: Service, rig: str, parameters: RigParameters) -> RigConfig:
-    """What a rig is, for whoever asks."""
+    """Return the configuration of a rig, as published on the bus."""
     return RigConfig(
         rig=rig,
         incarnation=service.incarnation,

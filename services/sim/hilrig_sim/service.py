@@ -1,37 +1,37 @@
-"""The simulation as a service: a tick at each absolute deadline, and between two of them what people asked for."""
+"""Simulation service: a tick at each absolute deadline, and queued calls between two ticks."""
 
 import numpy as np
 
-from hilrig_runtime.process.mailbox import Turns
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
-from hilrig_runtime.timing.realtime import freeze_garbage
+from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
-from hilrig_sim.rig_registry import Membership
+from hilrig_sim.rig_registry import RigRegistry
 
 
 def run(service: Service) -> None:
-    """Simulate every rig of the lab until the service is to stop.
+    """Simulate every rig of the lab until the service is stopped.
 
     Raises:
-        InputError: the lab's parameters do not fit together.
+        InputError: the parameters of the lab are inconsistent.
     """
     lab = service.lab
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
-    turns = Turns()
-    with Membership(service, simulation, turns):
+    turns = OwnerThreadExecutor()
+    with RigRegistry(service, simulation, turns):
         rate = Rate(step_ns, service.clock)
-        freeze_garbage()
+        freeze_gc()
         service.ready()
         stopping = service.stopping
-        # What can't be computed is dealt with where it shows, not warned of.
+        # Non-finite numbers are detected and handled by the simulation, without warnings.
         with np.errstate(all="ignore"):
             while not stopping.is_set():
                 simulation.pre_encode(rate.next_ns)
                 tick = rate.wait()
                 simulation.tick(tick)
-                turns.run_waiting()
+                turns.run_pending()
                 service.beat(service.clock.monotonic_ns())

@@ -1,1 +1,1 @@
-"""The `hilrig` command: parses, wires and starts the others, nothing else."""
+"""The `hilrig` command line: parses options and starts the services and tools."""

@@ -1,4 +1,4 @@
-"""`hilrig` and `python -m hilrig_cli`: a command, and how its process ends."""
+"""Entry point of `hilrig` and `python -m hilrig_cli`: runs a command and returns its exit code."""
 
 import sys
 from typing import Final
@@ -6,27 +6,27 @@ from typing import Final
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.shutdown import run_main
 
-_OUR_OWN: Final = "hilrig"
-"""What begins so is in every installation."""
+_OWN_PACKAGE_PREFIX: Final = "hilrig"
+"""Prefix of hilrig's own packages, which every installation has."""
 
 
 def main() -> int:
-    """Entry point of the `hilrig` command; gives the exit code."""
+    """Run the `hilrig` command; return the exit code."""
     return run_main(_command)
 
 
 def _command() -> None:
-    # Here, because it takes a moment in which Ctrl-C may come.
+    # Imported here: the import takes a moment, in which Ctrl-C must work.
     from hilrig_cli.main import app
 
     try:
         app()
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith(_OUR_OWN):
+        if error.name is None or error.name.startswith(_OWN_PACKAGE_PREFIX):
             raise
         package = error.name.partition(".")[0]
         raise OperationError(
-            f"this command needs {package!r}, which is not installed here, for only some of hilrig's parts are: "
+            f"this command needs {package!r}, which is not installed here (only some parts of hilrig are): "
             "pip install 'hilrig[all]'"
         ) from error
 

@@ -1,4 +1,4 @@
-"""A folder of certificates with their keys, signed by one authority: what is there, what is due, what was written."""
+"""Certificate store: a folder with certificates and keys, signed by one certificate authority."""
 
 import os
 from collections.abc import Sequence
@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Final
 
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.security.x509 import Identity, load, make_authority, names_in
+from hilrig_runtime.security.x509 import Credential, load, make_authority, names_in
 
-AUTHORITY: Final = "ca"
-RENEWED_BEFORE: Final = timedelta(days=30)
-"""What ends so soon is made anew; of short-lived ones the last third."""
+AUTHORITY_NAME: Final = "ca"
+RENEWAL_PERIOD: Final = timedelta(days=30)
+"""Remaining validity below which a certificate is renewed; a third of the validity if that is shorter."""
 
 
-class CertificateFolder:
-    """`<name>.pem` and `<name>.key` for each name, and `ca.pem` and `ca.key`; made where it is not there.
+class CertificateStore:
+    """Stores `<name>.pem` and `<name>.key` for each name, and `ca.pem` and `ca.key`; creates the folder.
 
     Raises:
-        InputError: half of its authority is missing, so what it signed can't be added to.
-        OperationError: it can't be written.
+        InputError: the authority has a certificate without its key, or a key without its certificate.
+        OperationError: the folder can't be created.
     """
 
     def __init__(self, folder: Path, now: datetime, days: int, *, renew: bool = False) -> None:
@@ -28,52 +28,53 @@ class CertificateFolder:
         self._days = days
         self._renew = renew
         self.written: list[Path] = []
-        self._refuse_half_an_authority()
+        self._check_authority_complete()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OperationError(f"{folder}: can't be made: {error.strerror}") from error
+            raise OperationError(f"{folder}: can't be created: {error.strerror}") from error
 
-    def authority(self, name: str) -> Identity:
-        """The folder's authority; a new one, called `name`, where there is none.
+    def authority(self, name: str) -> Credential:
+        """Return the folder's authority; create one with the common name `name` if it is missing.
 
         Raises:
-            InputError: what is there is none.
+            InputError: the existing authority is not valid.
         """
-        authority = self._read(AUTHORITY)
+        authority = self._read(AUTHORITY_NAME)
         if authority is None:
             authority = make_authority(f"{name} {self._now:%Y-%m-%d}", self._now, 10 * self._days)
-            self.write(AUTHORITY, authority)
+            self.write(AUTHORITY_NAME, authority)
         return authority
 
-    def _refuse_half_an_authority(self) -> None:
-        """A host that was given `ca.pem` alone would lose all trust in the others by a new one."""
-        certificate, key = (self._folder / f"{AUTHORITY}{suffix}" for suffix in (".pem", ".key"))
+    def _check_authority_complete(self) -> None:
+        """Refuse half an authority: a new one on a host that has `ca.pem` only would invalidate all certificates."""
+        certificate, key = (self._folder / f"{AUTHORITY_NAME}{suffix}" for suffix in (".pem", ".key"))
         if certificate.exists() == key.exists():
             return
-        there, missing = (certificate, key) if certificate.exists() else (key, certificate)
+        present, missing = (certificate, key) if certificate.exists() else (key, certificate)
         raise InputError(
-            f"{there} has no {missing.name} beside it, so nothing can be signed here: run hilrig certs where the "
-            f"authority was made (or take {there} away, and a new authority is made, which nobody trusts yet)"
+            f"{present} has no {missing.name} in the same folder, so no certificate can be signed: run hilrig certs "
+            f"where the authority was created (or delete {present} to create a new authority, which no host trusts yet)"
         )
 
     def is_due(self, name: str, hosts: Sequence[str] = ()) -> bool:
-        """Whether a certificate is missing, about to end, or does not name all of `hosts`."""
+        """Whether a certificate is missing, is about to expire, or does not name all of `hosts`."""
         identity = None if self._renew else self._read(name)
         if identity is None:
             return True
         certificate = identity.certificate
-        left = certificate.not_valid_after_utc - self._now
-        return left < min(RENEWED_BEFORE, timedelta(days=self._days) / 3) or not set(hosts) <= names_in(certificate)
+        remaining = certificate.not_valid_after_utc - self._now
+        expires = remaining < min(RENEWAL_PERIOD, timedelta(days=self._days) / 3)
+        return expires or not set(hosts) <= names_in(certificate)
 
-    def names_for(self, name: str, hosts: Sequence[str]) -> list[str]:
-        """Host names and addresses for a certificate: `hosts`, and those that the one that is there names."""
+    def host_names(self, name: str, hosts: Sequence[str]) -> list[str]:
+        """Host names and addresses for a certificate: `hosts` and those of the existing certificate."""
         identity = self._read(name)
-        before = names_in(identity.certificate) if identity is not None else set()
-        return [*hosts, *sorted(before - set(hosts))]
+        existing = names_in(identity.certificate) if identity is not None else set()
+        return [*hosts, *sorted(existing - set(hosts))]
 
-    def write(self, name: str, identity: Identity) -> None:
-        """Write a certificate, and its key for its owner's eyes alone."""
+    def write(self, name: str, identity: Credential) -> None:
+        """Write a certificate and its key; the key is readable by its owner only."""
         for suffix, data, mode in ((".pem", identity.certificate_pem, 0o644), (".key", identity.key_pem, 0o600)):
             path = self._folder / f"{name}{suffix}"
             try:
@@ -83,7 +84,7 @@ class CertificateFolder:
                 raise OperationError(f"{path}: can't be written: {error.strerror}") from error
             self.written.append(path)
 
-    def _read(self, name: str) -> Identity | None:
+    def _read(self, name: str) -> Credential | None:
         files = [self._folder / f"{name}{suffix}" for suffix in (".pem", ".key")]
         if not all(path.exists() for path in files):
             return None
@@ -93,6 +94,6 @@ class CertificateFolder:
             raise OperationError(f"{error.filename}: can't be read: {error.strerror}") from error
         except ValueError as error:
             raise InputError(
-                f"{files[0]} and {files[1].name} are no certificate and key that can be used: {error}; "
-                "take them away, and they are made anew"
+                f"{files[0]}, {files[1].name}: not a valid certificate with its key: {error}; "
+                "delete both files to create them again"
             ) from error

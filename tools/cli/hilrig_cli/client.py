@@ -1,4 +1,4 @@
-"""Asking a running lab who is there, and its edges about their rigs."""
+"""Client side of a running lab: discovers its services and queries its edges."""
 
 import sys
 import time
@@ -7,101 +7,102 @@ from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
+from hilrig_cli.service_kinds import RIG_SERVICES
 from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.discovery import rosters
-from hilrig_schemas import Roster
+from hilrig_runtime.process.discovery import list_services
+from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
-ANSWER_WITHIN_S: Final = 3.0
-"""How long a service has to answer; a link to it may have to be made first."""
-PATIENCE_S: Final = 0.5
-"""Who waits longer is told for what."""
-SERVING: Final = ("sim", "edge")
-"""Services that have each rig, also one that was added."""
+QUERY_TIMEOUT_S: Final = 3.0
+"""Timeout of a query, including the time to set up the link to the service."""
+WAIT_MESSAGE_AFTER_S: Final = 0.5
+"""Waiting time after which a message is printed."""
 
 
-def ask_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, question: Message) -> list[MessageT]:
-    """Ask on a rig's topic, or on every rig's where `rig` is empty; the answers, at least one, in the lab's order.
+def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Message) -> list[MessageT]:
+    """Query a rig's topic, or that of every rig if `rig` is empty; return at least one reply, in the lab's order.
 
     Rigs that were added since the lab started come last.
 
     Raises:
         InputError: the lab has no such rig.
-        OperationError: nobody answers, or the edge refuses.
+        OperationError: no edge replies, or the edge refuses the request.
     """
-    payload = question.SerializeToString()
-    deadline_s = time.monotonic() + ANSWER_WITHIN_S
+    payload = request.SerializeToString()
+    deadline_s = time.monotonic() + QUERY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
         if rig:
             check_rig(bus, lab, rig)
         else:
-            # Else the first edge that answers would be taken for all.
-            all_rosters(bus, lab, {"edge"})
-        while not (answers := bus.ask(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
+            # Without a link to every edge, the reply of the first edge would be taken for that of all.
+            discover_services(bus, lab, {"edge"})
+        while not (replies := bus.query(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
             time.sleep(0.05)
-    for answer in answers:
-        if answer.error:
-            raise OperationError(f"rig {rig!r}: the edge refused: {answer.error}")
-    if not answers:
+    for reply in replies:
+        if reply.error:
+            raise OperationError(f"rig {rig!r}: the edge refused: {reply.error}")
+    if not replies:
         raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
-    places = {rig.name: place for place, rig in enumerate(lab.rigs)}
-    by_rig = {parse_rig_key(answer.key).rig: answer.payload for answer in answers}
-    return [topic.decode(by_rig[rig]) for rig in sorted(by_rig, key=lambda rig: (places.get(rig, len(places)), rig))]
+    positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
+    by_rig = {parse_rig_key(reply.key).rig: reply.payload for reply in replies}
+    order = sorted(by_rig, key=lambda rig: (positions.get(rig, len(positions)), rig))
+    return [topic.decode(by_rig[rig]) for rig in order]
 
 
-def all_rosters(bus: Bus, lab: LabConfig, services: Set[str]) -> list[Roster]:
-    """What the services of a lab say of themselves; waits `ANSWER_WITHIN_S` for those kinds of them, if it must."""
-    deadline_s = time.monotonic() + ANSWER_WITHIN_S
-    found: list[Roster] = []
-    # A link to each has to be made first: what one look finds and the next one too is all that there is.
+def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[ServiceInfo]:
+    """Discover the services of a lab; wait up to `QUERY_TIMEOUT_S` until each required kind of service is found."""
+    deadline_s = time.monotonic() + QUERY_TIMEOUT_S
+    found: list[ServiceInfo] = []
+    # Links are set up one after the other: discovery is complete when two successive queries return the same number.
     while time.monotonic() < deadline_s:
-        before, found = found, rosters(bus, lab.name)
-        if services <= {roster.service for roster in found} and len(found) == len(before):
+        before, found = found, list_services(bus, lab.name)
+        if required <= {info.service for info in found} and len(found) == len(before):
             break
         time.sleep(0.05)
     return found
 
 
 def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
-    """See that a lab has a rig: in its file, or added since.
+    """Check that a lab has a rig, in its file or added since.
 
     Raises:
-        InputError: it has not.
+        InputError: the lab has no such rig.
     """
     in_file = [known.name for known in lab.rigs]
     if rig in in_file:
         return
-    begun_s, told = time.monotonic(), False
+    start_s, message_printed = time.monotonic(), False
     while True:
-        found = rosters(bus, lab.name)
-        if any(rig in roster.rigs for roster in found):
+        found = list_services(bus, lab.name)
+        if any(rig in info.rigs for info in found):
             return
-        waited_s = time.monotonic() - begun_s
-        if _all_heard(found, in_file) or waited_s > ANSWER_WITHIN_S:
-            added = {name for roster in found if roster.service in SERVING for name in roster.rigs}
+        waited_s = time.monotonic() - start_s
+        if _all_responded(found, in_file) or waited_s > QUERY_TIMEOUT_S:
+            added = {name for info in found if info.service in RIG_SERVICES for name in info.rigs}
             raise lab.no_such_rig(rig, sorted(added))
-        if waited_s > PATIENCE_S and not told:
-            told = True
+        if waited_s > WAIT_MESSAGE_AFTER_S and not message_printed:
+            message_printed = True
             print(
-                f"hilrig: {rig!r} is not in lab.toml: looking for a service that it was added to, for up to "
-                f"{ANSWER_WITHIN_S:g} s",
+                f"hilrig: rig {rig!r} is not in lab.toml; waiting up to {QUERY_TIMEOUT_S:g} s for a service that it "
+                "was added to",
                 file=sys.stderr,
             )
         time.sleep(0.05)
 
 
-def _all_heard(found: Sequence[Roster], in_file: Sequence[str]) -> bool:
-    """Whether every service that can have a rig has answered.
+def _all_responded(found: Sequence[ServiceInfo], in_file: Sequence[str]) -> bool:
+    """Whether every service that can have a rig has responded.
 
-    Each simulation and each edge begins with rigs of the lab's file, and one has a rig that another does not: once all
-    of those are served, nobody is missing. (One that lost all of those rigs is known by the other kind of service.)
+    Each simulation and each edge starts with rigs of the lab's file, and no two of a kind have the same rig: once all
+    of these rigs are served, no service is missing. (A service that has lost all of these rigs is found by the other
+    kind of service.)
     """
     return all(
-        set(in_file) <= {rig for roster in found if roster.service == service for rig in roster.rigs}
-        for service in SERVING
+        set(in_file) <= {rig for info in found if info.service == service for rig in info.rigs}
+        for service in RIG_SERVICES
     )

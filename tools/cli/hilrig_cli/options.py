@@ -1,4 +1,4 @@
-"""Options that several commands share, said the same way everywhere."""
+"""Options that several commands share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ Config = Annotated[
         "--config",
         "-c",
         metavar="LAB.TOML",
-        help="The lab's file; without one there is one rig with the defaults.",
+        help="Configuration file of the lab; default: one rig with default settings.",
         show_default=False,
     ),
 ]
@@ -20,6 +20,6 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 
 
 def config_for_commands(context: typer.Context, config: Config = None) -> None:
-    """The callback of a group of commands: `-c` may stand before the command too; what stands behind it is nearer."""
+    """Callback of a command group: accepts `-c` before the command too; `-c` after the command takes precedence."""
     if config is not None and isinstance(context.command, TyperGroup):
         context.default_map = {name: {"config": str(config)} for name in context.command.commands}

@@ -25,7 +25,7 @@ from hilrig_console.subscriber import LabSubscriber
 from hilrig_console.view_model import ClientState, Frame
 from hilrig_runtime.errors import HilrigError, InputError
 
-PERIOD_S: Final = 0.2
+FRAME_PERIOD_S: Final = 0.2
 """Period of the frames, s."""
 MAX_BROWSERS: Final = 64
 """Upper limit of simultaneous event streams."""
@@ -159,7 +159,7 @@ async def _repeat(task: Callable[[], Awaitable[None]]) -> None:
             await task()
         except Exception:
             logger.exception("%s failed", task)
-        await asyncio.sleep(PERIOD_S)
+        await asyncio.sleep(FRAME_PERIOD_S)
 
 
 async def _error_response(request: Request, error: HilrigError) -> Response:

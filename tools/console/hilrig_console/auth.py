@@ -64,11 +64,11 @@ class AccessPolicy:
             return True
         kind, _, credentials = authorization.partition(" ")
         try:
-            given = base64.b64decode(credentials, validate=True).partition(b":")[2]
+            password = base64.b64decode(credentials, validate=True).partition(b":")[2]
         except (binascii.Error, ValueError):
             return False
         # Comparison in constant time, which reveals nothing about the password.
-        return kind.lower() == "basic" and hmac.compare_digest(given, self.password.encode())
+        return kind.lower() == "basic" and hmac.compare_digest(password, self.password.encode())
 
 
 class AuthMiddleware:

@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from hilrig_console.worker import Worker
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
-from hilrig_replay.io.index import RECORDING, RunEntry, RunIndex
+from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
-PERIOD_S: Final = 2.0
+LIST_PERIOD_S: Final = 2.0
 """Shortest period of listing the folder while a browser is connected, s."""
 LIST_REST_FACTOR: Final = 10
 """Pause after listing, as a multiple of its CPU time."""
@@ -99,7 +99,7 @@ class RecordingCatalog:
             entries, message = [], str(error)
         except HilrigError as error:
             entries, message = self._entries, f"can't list the recordings: {error}"
-        self._due_s = time.monotonic() + max(PERIOD_S, LIST_REST_FACTOR * spent_s)
+        self._due_s = time.monotonic() + max(LIST_PERIOD_S, LIST_REST_FACTOR * spent_s)
         if (entries, message) != (self._entries, self.error):
             self._entries, self.error = entries, message
             self._by_path = {entry.path: entry for entry in entries}
@@ -180,5 +180,6 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
-    row["open"] = entry.ended == RECORDING
+    row["error"] = row.pop("trouble")
+    row["open"] = entry.ended == IN_PROGRESS
     return row

@@ -39,9 +39,9 @@ class LoginThrottle:
 def _throttle_key(address: str) -> str:
     """Return the IPv4 address, or the /64 network of an IPv6 address, because a host may use any address in it."""
     try:
-        known = ipaddress.ip_address(address)
+        ip = ipaddress.ip_address(address)
     except ValueError:
         return address
-    if isinstance(known, ipaddress.IPv6Address) and known.ipv4_mapped is None:
-        return str(ipaddress.ip_network((int(known) >> 64 << 64, 64)))
-    return str(known)
+    if isinstance(ip, ipaddress.IPv6Address) and ip.ipv4_mapped is None:
+        return str(ipaddress.ip_network((int(ip) >> 64 << 64, 64)))
+    return str(ip)

@@ -11,7 +11,7 @@ from typing import Any, Final
 from google.protobuf.message import DecodeError
 
 from hilrig_console.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
-from hilrig_monitoring.lab_view import SILENT_S
+from hilrig_monitoring.lab_view import SILENT_AFTER_S
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, RigBatch, RigConfig
 from hilrig_sim.arm.model import ArmParameters, RigParameters
@@ -91,7 +91,7 @@ class PoseCache:
 
     def as_dict(self, now_s: float) -> dict[str, list[Any]]:
         """Return scene number, pose and part positions of each rig with a recent state."""
-        for name in [name for name, rig in self._rigs.items() if now_s - rig.received_s > SILENT_S]:
+        for name in [name for name, rig in self._rigs.items() if now_s - rig.received_s > SILENT_AFTER_S]:
             del self._rigs[name]
         return {
             name: [rig.scene, rig.pose, rig.parts] for name, rig in self._rigs.items() if rig.pose and rig.scene >= 0

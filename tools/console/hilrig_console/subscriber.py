@@ -17,12 +17,12 @@ from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import HilrigError
-from hilrig_runtime.process.discovery import rosters
+from hilrig_runtime.process.discovery import list_services
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import RigConfig
 from hilrig_schemas.topics import CONFIG, EVENT, HEALTH, STATES
 
-RETRY_S: Final = 2.0
+RECONNECT_DELAY_S: Final = 2.0
 """Delay between attempts to connect to the bus, s."""
 POLL_PERIOD_S: Final = 0.2
 """Period in which due queries are sent, s."""
@@ -84,7 +84,7 @@ class LabSubscriber:
                 # The page shows the error, and the next iteration connects again.
                 logger.exception("receiving from the bus failed")
                 self._set_bus_error("receiving from the bus failed; see the log of the console")
-            self._stopping.wait(RETRY_S)
+            self._stopping.wait(RECONNECT_DELAY_S)
 
     def _set_bus_error(self, error: str) -> None:
         with self._model.lock:
@@ -107,7 +107,7 @@ class LabSubscriber:
                 states = None
             if is_viewed and self._is_service_query_due(now_s, now_s - queried_s):
                 queried_s = now_s
-                found = rosters(bus, self._lab.name)
+                found = list_services(bus, self._lab.name)
                 with self._model.lock:
                     self._model.set_addresses(found)
             self._query_configurations(bus)
@@ -133,7 +133,7 @@ class LabSubscriber:
         except DecodeError:
             return
         with self._model.lock:
-            self._model.view.hear(health, time.monotonic())
+            self._model.view.update(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
         del key
@@ -146,10 +146,10 @@ class LabSubscriber:
 
 
 def _config(bus: Bus, lab: str, rig: str) -> RigConfig | None:
-    for answer in bus.ask(CONFIG.key(lab, rig), timeout_s=0.5):
-        if answer.payload and not answer.error:
+    for reply in bus.query(CONFIG.key(lab, rig), timeout_s=0.5):
+        if reply.payload and not reply.error:
             try:
-                return CONFIG.decode(answer.payload)
+                return CONFIG.decode(reply.payload)
             except DecodeError:
                 continue
     return None

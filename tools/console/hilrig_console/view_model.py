@@ -13,7 +13,7 @@ from typing import Any
 from hilrig_console.events import EventBuffer
 from hilrig_console.poses import PoseCache
 from hilrig_monitoring.lab_view import LabView
-from hilrig_schemas import Roster
+from hilrig_schemas import ServiceInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +65,13 @@ class ViewModel:
         """Set the reason why the bus is unavailable; empty: connected."""
         self._bus_error = error
 
-    def set_addresses(self, rosters: list[Roster]) -> None:
+    def set_addresses(self, infos: list[ServiceInfo]) -> None:
         """Set the addresses of the rigs from the announcements of the edges."""
         self._addresses = {
             rig: address
-            for roster in rosters
-            if roster.service == "edge"
-            for rig, address in zip(roster.rigs, roster.addresses, strict=False)
+            for info in infos
+            if info.service == "edge"
+            for rig, address in zip(info.rigs, info.addresses, strict=False)
         }
 
     def has_unknown_addresses(self, now_s: float) -> bool:
@@ -90,7 +90,12 @@ class ViewModel:
         for rig in values["rigs"]:
             rig["address"] = self._addresses.get(rig["rig"], "")
         # The time changes the message every second: a page without messages reports a lost connection.
-        return {"lab": self._lab, "at_s": now_s, "link": self._bus_error, "scenes": len(self.poses.scenes)} | values
+        return {
+            "lab": self._lab,
+            "at_s": now_s,
+            "bus_error": self._bus_error,
+            "scenes": len(self.poses.scenes),
+        } | values
 
 
 def _json(value: Any) -> str:

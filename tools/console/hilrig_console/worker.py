@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from hilrig_runtime.errors import HilrigError, OperationError
-from hilrig_runtime.timing.realtime import yield_to_others
+from hilrig_runtime.timing.realtime import lower_priority
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
 
@@ -89,7 +89,7 @@ class Worker:
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
     # Ctrl-C is sent to all processes of a terminal; this process ends with its parent.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    yield_to_others()
+    lower_priority()
     worker = factory(*arguments)
     with contextlib.suppress(EOFError, OSError):
         while True:

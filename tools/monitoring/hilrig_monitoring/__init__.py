@@ -1,1 +1,1 @@
-"""Monitoring of a running lab: service reports combined, for `top`, the console and Prometheus."""
+"""Monitoring of a running lab: combines health reports for `hilrig top`, the console and Prometheus."""

@@ -1,7 +1,7 @@
-"""How a lab is, out of its services' health reports: what `hilrig top`, `metrics` and `console` show.
+"""Status of a lab, combined from health reports: the data of `hilrig top`, `hilrig metrics` and `hilrig console`.
 
-Each service reports once a second what it knows: the simulation the loop latencies of each rig, the edge who holds it,
-the recorder which rigs it writes. Here they come together. Pure: reports and time are passed in.
+Each service reports once a second: the simulation reports the loop latencies of each rig, the edge its lease holder,
+the recorder the rigs that it records. No I/O: reports and time are passed in.
 """
 
 from collections import deque
@@ -11,21 +11,22 @@ from typing import Any, Final
 from hilrig_schemas import Health
 
 WINDOW_S: Final = 10.0
-"""Percentiles of the loop latency are over so long."""
-SILENT_S: Final = 3.5
-"""A service that was not heard for so long is shown as silent, and what it said of its rigs is forgotten."""
-FORGOTTEN_S: Final = 600.0
-"""A service that was silent for so long is not spoken of any more: it was taken away, or is called otherwise now."""
+"""Window of the loop latency percentiles."""
+SILENT_AFTER_S: Final = 3.5
+"""Time without a report after which a service is shown as silent and its rig reports are discarded."""
+REMOVED_AFTER_S: Final = 600.0
+"""Time without a report after which a service is removed: it was stopped, or has another name now."""
 
 
 @dataclass(slots=True)
-class ServiceView:
-    """One service."""
+class ServiceStatus:
+    """Status of one service."""
 
     health: Health
-    heard_s: float
+    reported_s: float
+    """Time of its last report."""
     cpu_share: float = 0.0
-    """Of one processor, between the last two reports."""
+    """CPU usage between the last two reports, in processors."""
 
     @property
     def name(self) -> str:
@@ -34,8 +35,8 @@ class ServiceView:
 
 
 @dataclass(slots=True)
-class RigView:
-    """One rig; what nobody says now is empty."""
+class RigStatus:
+    """Status of one rig; a field is empty if no service reports it now."""
 
     rig: str
     controller: str = ""
@@ -43,16 +44,16 @@ class RigView:
     connections: int = 0
     watchdog_tripped: bool = False
     safe: bool = True
-    """No fresh command: no effort."""
+    """Whether the torques are zero because there is no current command."""
     recording: bool = False
     simulated: bool = False
     served: bool = False
     lateness_p99_ns: int = 0
-    """Of the simulation's ticks in the last second, ns."""
+    """99th percentile of the simulation's tick lateness in the last second, ns."""
     overruns: int = 0
     """Ticks of the simulation that began more than a step late, since its start."""
     loops_us: list[int] = field(default_factory=list)
-    """Loop latencies within the window, µs, in order of size."""
+    """Loop latencies within the window, µs, sorted."""
 
     def loop_ms(self, share: float) -> float | None:
         """A percentile of the loop latency, ms; None: no command took effect within the window."""
@@ -61,7 +62,7 @@ class RigView:
 
     @property
     def state(self) -> str:
-        """What matters most of it, in two words."""
+        """Most important state of the rig, as a short text."""
         if not self.served:
             return "no edge"
         if not self.simulated:
@@ -74,59 +75,59 @@ class RigView:
 
 
 class LabView:
-    """What was heard of a lab."""
+    """Status of a lab, updated by health reports."""
 
     def __init__(self, rigs: tuple[str, ...] = ()) -> None:
         self._rigs = rigs
-        self._services: dict[str, ServiceView] = {}
+        self._services: dict[str, ServiceStatus] = {}
         self._loops: dict[str, deque[tuple[float, tuple[int, ...]]]] = {}
 
-    def hear(self, health: Health, now_s: float) -> None:
-        """Take a report that came at `now_s`."""
-        self._forget(now_s)
-        view = ServiceView(health, now_s)
-        before = self._services.get(view.name)
+    def update(self, health: Health, now_s: float) -> None:
+        """Update the status with a report that arrived at `now_s`."""
+        self._evict(now_s)
+        status = ServiceStatus(health, now_s)
+        before = self._services.get(status.name)
         if before is not None and before.health.incarnation == health.incarnation:
-            passed_ns = health.uptime_ns - before.health.uptime_ns
-            spent_ns = health.cpu_ns - before.health.cpu_ns
-            view.cpu_share = spent_ns / passed_ns if passed_ns > 0 else before.cpu_share
-        self._services[view.name] = view
+            elapsed_ns = health.uptime_ns - before.health.uptime_ns
+            cpu_ns = health.cpu_ns - before.health.cpu_ns
+            status.cpu_share = cpu_ns / elapsed_ns if elapsed_ns > 0 else before.cpu_share
+        self._services[status.name] = status
         for report in health.rig_reports:
             if report.loop_us:
                 self._loops.setdefault(report.rig, deque()).append((now_s, tuple(report.loop_us)))
 
-    def _forget(self, now_s: float) -> None:
-        for name in [name for name, view in self._services.items() if now_s - view.heard_s > FORGOTTEN_S]:
+    def _evict(self, now_s: float) -> None:
+        for name in [name for name, one in self._services.items() if now_s - one.reported_s > REMOVED_AFTER_S]:
             del self._services[name]
         for rig in [rig for rig, loops in self._loops.items() if not loops or now_s - loops[-1][0] > WINDOW_S]:
             del self._loops[rig]
 
-    def services(self) -> list[ServiceView]:
-        """Every service that was heard, by name."""
+    def services(self) -> list[ServiceStatus]:
+        """Every service that has reported, sorted by name."""
         return [self._services[name] for name in sorted(self._services)]
 
-    def is_silent(self, service: ServiceView, now_s: float) -> bool:
-        """Whether a service was not heard for too long."""
-        return now_s - service.heard_s > SILENT_S
+    def is_silent(self, service: ServiceStatus, now_s: float) -> bool:
+        """Whether a service has not reported for longer than `SILENT_AFTER_S`."""
+        return now_s - service.reported_s > SILENT_AFTER_S
 
-    def rigs(self, now_s: float) -> list[RigView]:
-        """Every rig of the lab's file, in its order, then the others that somebody speaks of."""
-        found = {rig: RigView(rig) for rig in self._rigs}
+    def rigs(self, now_s: float) -> list[RigStatus]:
+        """Every rig of the lab's file, in its order, then the other rigs that services report."""
+        found = {rig: RigStatus(rig) for rig in self._rigs}
         for service in self.services():
             if self.is_silent(service, now_s):
                 continue
             for report in service.health.rig_reports:
-                view = found.setdefault(report.rig, RigView(report.rig))
+                status = found.setdefault(report.rig, RigStatus(report.rig))
                 if service.health.service == "sim":
-                    view.simulated, view.safe = True, report.safe
-                    view.lateness_p99_ns = service.health.lateness_p99_ns
-                    view.overruns = service.health.overruns
+                    status.simulated, status.safe = True, report.safe
+                    status.lateness_p99_ns = service.health.lateness_p99_ns
+                    status.overruns = service.health.overruns
                 elif service.health.service == "edge":
-                    view.served = True
-                    view.controller, view.session = report.controller, report.session
-                    view.connections, view.watchdog_tripped = report.connections, report.watchdog_tripped
+                    status.served = True
+                    status.controller, status.session = report.controller, report.session
+                    status.connections, status.watchdog_tripped = report.connections, report.watchdog_tripped
                 else:
-                    view.recording = view.recording or report.recording
+                    status.recording = status.recording or report.recording
         for rig, loops in self._loops.items():
             while loops and now_s - loops[0][0] > WINDOW_S:
                 loops.popleft()
@@ -134,27 +135,27 @@ class LabView:
                 found[rig].loops_us = sorted(value for _, values in loops for value in values)
         return list(found.values())
 
-    def troubles(self, now_s: float) -> list[str]:
-        """What an operator should know, a sentence each."""
-        told = []
+    def alerts(self, now_s: float) -> list[str]:
+        """Alerts for the operator: silent services and the alerts of services, one line each."""
+        found = []
         for service in self.services():
             health = service.health
             if self.is_silent(service, now_s):
-                told.append(f"{service.name} on {health.host}: silent for {now_s - service.heard_s:.0f} s")
-            elif health.trouble:
-                told.append(f"{service.name} on {health.host}: {health.trouble}")
-        return told
+                found.append(f"{service.name} on {health.host}: silent for {now_s - service.reported_s:.0f} s")
+            elif health.alert:
+                found.append(f"{service.name} on {health.host}: {health.alert}")
+        return found
 
     def as_dict(self, now_s: float) -> dict[str, Any]:
-        """Everything as plain values, for JSON; times in ms, None where there is none."""
+        """The status as plain values, for JSON; times in ms, None if unknown."""
         return {
             "services": [_service_row(service, self.is_silent(service, now_s)) for service in self.services()],
             "rigs": [_rig_row(rig) for rig in self.rigs(now_s)],
-            "troubles": self.troubles(now_s),
+            "alerts": self.alerts(now_s),
         }
 
 
-def _service_row(service: ServiceView, silent: bool) -> dict[str, Any]:
+def _service_row(service: ServiceStatus, silent: bool) -> dict[str, Any]:
     health = service.health
     return {
         "service": health.service,
@@ -178,11 +179,11 @@ def _service_row(service: ServiceView, silent: bool) -> dict[str, Any]:
         "clock_offset_ms": health.clock_offset_ns / 1e6,
         "clock_uncertainty_ms": health.clock_uncertainty_ns / 1e6,
         "clock_peer": health.clock_peer,
-        "trouble": health.trouble,
+        "alert": health.alert,
     }
 
 
-def _rig_row(rig: RigView) -> dict[str, Any]:
+def _rig_row(rig: RigStatus) -> dict[str, Any]:
     return {
         "rig": rig.rig,
         "state": rig.state,

@@ -1,4 +1,4 @@
-"""Listening to a running lab: its health reports into a `LabView`."""
+"""Subscription to the health reports of a running lab, which update a `LabView`."""
 
 import threading
 import time
@@ -11,52 +11,52 @@ from hilrig_monitoring.lab_view import LabView
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.discovery import rosters
+from hilrig_runtime.process.discovery import list_services
 from hilrig_schemas.topics import HEALTH
 
-FIRST_REPORTS_S: Final = 3.0
-"""Every service reports within a second; a link to it may have to be made first."""
+FIRST_REPORTS_TIMEOUT_S: Final = 3.0
+"""Timeout for the first reports: the time to set up the links, and one report period of 1 s."""
 
 
 class LabWatch:
-    """A `LabView` that is kept up to date; a context manager. Its lock is held while the view changes."""
+    """Context manager that keeps a `LabView` up to date; `lock` is held while the view changes."""
 
     def __init__(self, lab: LabConfig) -> None:
         self.lab = lab
         self.view = LabView(tuple(rig.name for rig in lab.rigs))
         self.lock = threading.Lock()
-        self._heard: dict[str, int] = {}
+        self._report_counts: dict[str, int] = {}
         self._bus = ZenohBus(lab.bus, "tool")
-        self._bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._hear)
+        self._bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._on_health)
 
     def wait(self) -> None:
-        """Wait until every service that is there was heard twice, so that its share of a processor is known.
+        """Wait until every running service has reported twice, so that its CPU usage is known.
 
         Raises:
-            OperationError: none was heard.
+            OperationError: no service has reported.
         """
-        deadline_s = time.monotonic() + FIRST_REPORTS_S
+        deadline_s = time.monotonic() + FIRST_REPORTS_TIMEOUT_S
         while time.monotonic() < deadline_s:
-            expected = {f"{roster.service}/{roster.instance}" for roster in rosters(self._bus, self.lab.name)}
+            expected = {f"{info.service}/{info.instance}" for info in list_services(self._bus, self.lab.name)}
             with self.lock:
-                if expected and all(self._heard.get(name, 0) > 1 for name in expected):
+                if expected and all(self._report_counts.get(name, 0) > 1 for name in expected):
                     return
             time.sleep(0.1)
         with self.lock:
             if not self.view.services():
                 raise OperationError(
-                    f"nothing is heard of lab {self.lab.name!r}: is it running (hilrig up), with this lab.toml?"
+                    f"no service of lab {self.lab.name!r} found: is it running (hilrig up), with this lab.toml?"
                 )
 
-    def _hear(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+    def _on_health(self, key: str, payload: bytes) -> None:  # noqa: ARG002
         try:
             health = HEALTH.decode(payload)
         except DecodeError:
             return
         with self.lock:
-            self.view.hear(health, time.monotonic())
+            self.view.update(health, time.monotonic())
             name = f"{health.service}/{health.instance}"
-            self._heard[name] = self._heard.get(name, 0) + 1
+            self._report_counts[name] = self._report_counts.get(name, 0) + 1
 
     def __enter__(self) -> Self:
         return self

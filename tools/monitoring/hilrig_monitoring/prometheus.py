@@ -1,4 +1,4 @@
-"""A lab as Prometheus metrics: the text exposition format, version 0.0.4, and the little server that gives it out."""
+"""Prometheus exporter of a lab: text exposition format, version 0.0.4, and its HTTP server."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -6,71 +6,71 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
-from hilrig_monitoring.lab_view import LabView, ServiceView
+from hilrig_monitoring.lab_view import LabView, ServiceStatus
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
-    ("uptime_seconds", "gauge", "Since the start of the process.", "uptime_ns", 1e-9),
-    ("cpu_seconds_total", "counter", "Processor time used, all threads.", "cpu_ns", 1e-9),
-    ("resident_bytes", "gauge", "Memory resident.", "resident_bytes", 1),
+    ("uptime_seconds", "gauge", "Time since the start of the process.", "uptime_ns", 1e-9),
+    ("cpu_seconds_total", "counter", "CPU time used by all threads.", "cpu_ns", 1e-9),
+    ("resident_bytes", "gauge", "Resident memory.", "resident_bytes", 1),
     ("rigs", "gauge", "Rigs served.", "rigs", 1),
     ("ticks_total", "counter", "Ticks of the service's loop.", "ticks", 1),
     ("overruns_total", "counter", "Ticks that began more than a period late.", "overruns", 1),
-    ("missed_steps_total", "counter", "Deadlines given up.", "missed_steps", 1),
-    ("lateness_p50_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_p50_ns", 1e-9),
-    ("lateness_p99_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_p99_ns", 1e-9),
-    ("lateness_max_seconds", "gauge", "Lateness of the ticks of the last second.", "lateness_max_ns", 1e-9),
-    ("realtime_priority", "gauge", "Of the real-time policy; 0: the ordinary policy.", "realtime_priority", 1),
+    ("missed_steps_total", "counter", "Steps skipped because of overruns.", "missed_steps", 1),
+    ("lateness_p50_seconds", "gauge", "Tick lateness in the last second, p50.", "lateness_p50_ns", 1e-9),
+    ("lateness_p99_seconds", "gauge", "Tick lateness in the last second, p99.", "lateness_p99_ns", 1e-9),
+    ("lateness_max_seconds", "gauge", "Tick lateness in the last second, maximum.", "lateness_max_ns", 1e-9),
+    ("realtime_priority", "gauge", "SCHED_FIFO priority; 0: ordinary policy.", "realtime_priority", 1),
     ("received_per_second", "gauge", "Messages received.", "received_hz", 1),
     ("published_per_second", "gauge", "Messages published.", "published_hz", 1),
-    ("lost_transport_total", "counter", "Messages missing from what others sent.", "lost_transport", 1),
+    ("lost_transport_total", "counter", "Messages lost on the bus.", "lost_transport", 1),
     ("lost_recorder_total", "counter", "Messages dropped because a queue was full.", "lost_recorder", 1),
     ("queue_entries", "gauge", "Entries in the service's queue.", "queue_depth", 1),
     ("connections", "gauge", "Modbus connections open.", "connections", 1),
     ("requests_total", "counter", "Modbus requests answered.", "requests", 1),
-    ("malformed_total", "counter", "Connections closed for malformed framing.", "malformed", 1),
+    ("malformed_total", "counter", "Connections closed because of malformed frames.", "malformed", 1),
     ("refused_total", "counter", "Connections and writes refused.", "refused", 1),
-    ("recordings", "gauge", "Files open.", "recordings", 1),
-    ("written_bytes_total", "counter", "Written to recordings.", "bytes_written", 1),
-    ("clock_offset_seconds", "gauge", "The wall clock that differs most, less this one's.", "clock_offset_ns", 1e-9),
+    ("recordings", "gauge", "Open recordings.", "recordings", 1),
+    ("written_bytes_total", "counter", "Bytes written to recordings.", "bytes_written", 1),
+    ("clock_offset_seconds", "gauge", "Largest wall clock offset to another service.", "clock_offset_ns", 1e-9),
 )
 
 
 def exposition(view: LabView, lab: str, now_s: float) -> str:
-    """Everything that a view knows, as text; `now_s` is of the clock that the view was kept with."""
+    """Format all metrics of a view as text; `now_s` is a time of the clock that the view is updated with."""
     return "".join(f"{line}\n" for line in _lines(view, lab, now_s))
 
 
 def _lines(view: LabView, lab: str, now_s: float) -> Iterator[str]:
     services = view.services()
 
-    def of_services(name: str, kind: str, text: str, value: Callable[[ServiceView], float]) -> Iterator[str]:
-        # How a service that is silent was is over; what it counted stays.
-        told = (s for s in services if kind == "counter" or name == "up" or not view.is_silent(s, now_s))
-        labelled = ((_labels(lab=lab, service=s.health.service, instance=s.health.instance), value(s)) for s in told)
-        yield from _family(name, kind, text, labelled)
+    def of_services(name: str, kind: str, text: str, value: Callable[[ServiceStatus], float]) -> Iterator[str]:
+        # Gauges of a silent service are outdated; its counters remain valid.
+        valid = (s for s in services if kind == "counter" or name == "up" or not view.is_silent(s, now_s))
+        labeled = ((_labels(lab=lab, service=s.health.service, instance=s.health.instance), value(s)) for s in valid)
+        yield from _family(name, kind, text, labeled)
 
-    yield from of_services("up", "gauge", "Whether it was heard lately.", lambda s: not view.is_silent(s, now_s))
+    yield from of_services("up", "gauge", "Whether the service reports.", lambda s: not view.is_silent(s, now_s))
     for name, kind, text, field, scale in _SERVICE_METRICS:
         yield from of_services(name, kind, text, lambda s, field=field, scale=scale: getattr(s.health, field) * scale)  # type: ignore[misc]
     rigs = view.rigs(now_s)
 
     def of_rigs(name: str, text: str, values: Iterable[bool]) -> Iterator[str]:
-        named = ((_labels(lab=lab, rig=rig.rig), float(value)) for rig, value in zip(rigs, values, strict=True))
-        yield from _family(name, "gauge", text, named)
+        labeled = ((_labels(lab=lab, rig=rig.rig), float(value)) for rig, value in zip(rigs, values, strict=True))
+        yield from _family(name, "gauge", text, labeled)
 
-    yield from of_rigs("rig_held", "Whether a controller holds it.", [bool(rig.controller) for rig in rigs])
-    yield from of_rigs("rig_recording", "Whether a recording is open.", [rig.recording for rig in rigs])
-    yield from of_rigs("rig_watchdog_tripped", "Whether its watchdog tripped.", [rig.watchdog_tripped for rig in rigs])
-    yield from of_rigs("rig_served", "Whether an edge serves it.", [rig.served for rig in rigs])
-    yield from of_rigs("rig_simulated", "Whether a simulation steps it.", [rig.simulated for rig in rigs])
+    yield from of_rigs("rig_held", "Whether a controller holds the lease.", [bool(rig.controller) for rig in rigs])
+    yield from of_rigs("rig_recording", "Whether the rig is recorded.", [rig.recording for rig in rigs])
+    yield from of_rigs("rig_watchdog_tripped", "Whether the watchdog tripped.", [rig.watchdog_tripped for rig in rigs])
+    yield from of_rigs("rig_served", "Whether an edge serves the rig.", [rig.served for rig in rigs])
+    yield from of_rigs("rig_simulated", "Whether a simulation steps the rig.", [rig.simulated for rig in rigs])
     quantiles = (
         (_labels(lab=lab, rig=rig.rig, quantile=f"{share:g}"), value / 1e3)
         for rig in rigs
         for share in (0.5, 0.99)
         if (value := rig.loop_ms(share)) is not None
     )
-    yield from _family("rig_loop_seconds", "gauge", "Loop latency of the last seconds.", quantiles)
+    yield from _family("rig_loop_seconds", "gauge", "Loop latency in the last 10 s.", quantiles)
 
 
 def _family(name: str, kind: str, text: str, values: Iterable[tuple[str, float]]) -> Iterator[str]:
@@ -88,10 +88,10 @@ def _labels(**labels: str) -> str:
 
 
 def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> ThreadingHTTPServer:
-    """A server that answers GET /metrics with what `text` gives; whoever makes it runs and closes it.
+    """Create a server that answers GET /metrics with the result of `text`; the caller runs and closes it.
 
     Raises:
-        OSError: the address can't be had.
+        OSError: the address is unavailable.
     """
 
     class Handler(BaseHTTPRequestHandler):
@@ -100,7 +100,7 @@ def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> Threadi
         def do_GET(self) -> None:
             """Answer one request."""
             if self.path.partition("?")[0] != "/metrics":
-                self.send_error(HTTPStatus.NOT_FOUND, "metrics are at /metrics")
+                self.send_error(HTTPStatus.NOT_FOUND, "the metrics are at /metrics")
                 return
             body = text().encode()
             self.send_response(HTTPStatus.OK)
@@ -110,7 +110,7 @@ def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> Threadi
             self.wfile.write(body)
 
         def log_message(self, format: str, *arguments: object) -> None:
-            """Scrapes are too many to be told of."""
+            """Do not log requests: there is one per scrape."""
 
     server = ThreadingHTTPServer(address, Handler)
     server.daemon_threads = True
@@ -118,5 +118,5 @@ def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> Threadi
 
 
 def text_of(view: LabView, lab: str) -> str:
-    """`exposition` now."""
+    """Format all metrics of a view at the current time."""
     return exposition(view, lab, time.monotonic())

@@ -22,12 +22,12 @@ from hilrig_study.theory.gain_theory import GainTheory
 
 Floats = NDArray[np.float64]
 
-FAILED: Final = "#5b5b5b"
-BOUNDARY: Final = "#d62728"
-DELAY_MARGIN: Final = "#ffffff"
-JITTER_MARGIN: Final = "#f5a623"
-MEAN_SQUARE: Final = "#ff5fc8"
-_LETTERS: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+FAILED_COLOR: Final = "#5b5b5b"
+STABILITY_LIMIT_COLOR: Final = "#d62728"
+DELAY_MARGIN_COLOR: Final = "#ffffff"
+JITTER_MARGIN_COLOR: Final = "#f5a623"
+MEAN_SQUARE_COLOR: Final = "#ff5fc8"
+_TRACE_LETTERS: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def traces(study: StudyConfig, folder: Path) -> list[Trace]:
     """
     names = [controller.name for controller in study.controllers]
     found = []
-    for letter, point in zip(_LETTERS, study.traces, strict=False):
+    for letter, point in zip(_TRACE_LETTERS, study.traces, strict=False):
         number = names.index(point.controller) if point.controller else 0
         cells = cell_at(study, point.x, point.y, number)
         results, outcome = run_cells(study, cells, folder, keep=True)
@@ -97,7 +97,7 @@ def plane_figure(
     finite = cost[np.isfinite(cost)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.1, 10.0)
     norm = LogNorm(max(low, 1e-9), max(high, low * 1.01, 1.1e-9))
-    axes.set_facecolor(FAILED)
+    axes.set_facecolor(FAILED_COLOR)
     mesh = axes.pcolormesh(
         study.x.points,
         study.y.points,
@@ -131,11 +131,11 @@ def plane_figure(
         (True, "#7CFC00", "live: as predicted"),
         (False, "#ff4d4d", "live: not as predicted"),
     ):
-        mine = [marker for marker in markers if marker.as_predicted is as_predicted]
-        if mine:
+        rows = [marker for marker in markers if marker.as_predicted is as_predicted]
+        if rows:
             axes.scatter(
-                [marker.x for marker in mine],
-                [marker.y for marker in mine],
+                [marker.x for marker in rows],
+                [marker.y for marker in rows],
                 c=color,
                 edgecolors="black",
                 s=46,
@@ -147,7 +147,7 @@ def plane_figure(
     axes.set_xlabel(study.x.label, color=TEXT_COLOR)
     axes.set_ylabel(study.y.label, color=TEXT_COLOR)
     axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=TEXT_COLOR)
-    axes.scatter([], [], marker="s", c=FAILED, label="a run failed")
+    axes.scatter([], [], marker="s", c=FAILED_COLOR, label="a run failed")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")
     return figure
@@ -177,12 +177,18 @@ def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], p
     random = not all(math.isnan(entry.mean_square_until) for entry in theory)
     if other == "delay_ms":
         label = "spectral radius 1, constant delay only" if random else "exact: spectral radius 1"
-        lines.append((label, BOUNDARY, "-", [entry.stable_until_ms for entry in theory]))
-        lines.append((f"delay margin{unknown}", DELAY_MARGIN, "--", [_margin_ms(entry, "delay") for entry in theory]))
+        lines.append((label, STABILITY_LIMIT_COLOR, "-", [entry.stable_until_ms for entry in theory]))
+        lines.append(
+            (f"delay margin{unknown}", DELAY_MARGIN_COLOR, "--", [_margin_ms(entry, "delay") for entry in theory])
+        )
     if other in ("delay_ms", "jitter_ms"):
-        lines.append((f"jitter margin{unknown}", JITTER_MARGIN, ":", [_margin_ms(entry, "jitter") for entry in theory]))
+        lines.append(
+            (f"jitter margin{unknown}", JITTER_MARGIN_COLOR, ":", [_margin_ms(entry, "jitter") for entry in theory])
+        )
     if random:
-        lines.append(("mean-square stability limit", MEAN_SQUARE, "-.", [entry.mean_square_until for entry in theory]))
+        lines.append(
+            ("mean-square stability limit", MEAN_SQUARE_COLOR, "-.", [entry.mean_square_until for entry in theory])
+        )
     largest = float(max(study.x.points.max() if other == what[0] else study.y.points.max(), 1e-9))
     for label, color, style, values_ms in lines:
         values = np.array(values_ms)[order]
@@ -207,7 +213,9 @@ def _draw_radius(axes: Axes, study: StudyConfig, swept: SweepResult, number: int
         return
     radius = swept.plane(study, number, swept.radius)
     if np.isfinite(radius).all() and radius.min() < 1 < radius.max():
-        axes.contour(study.x.points, study.y.points, radius, levels=[1.0], colors=[BOUNDARY], linewidths=1.8)
+        axes.contour(
+            study.x.points, study.y.points, radius, levels=[1.0], colors=[STABILITY_LIMIT_COLOR], linewidths=1.8
+        )
 
 
 def _draw_traces(panels: Sequence[Axes], shown: Sequence[Trace], study: StudyConfig) -> None:

@@ -14,7 +14,7 @@ import pyarrow.parquet
 
 from hilrig_runtime.errors import OperationError
 from hilrig_study.study_config import StudyConfig
-from hilrig_study.sweep import CELL, SweepResult
+from hilrig_study.sweep import CELL_DTYPE, SweepResult
 
 JOINTS = ("theta1", "theta2", "d3", "theta4")
 
@@ -23,7 +23,7 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
     """Return one row per run: parameters, outcome and spectral radius; units are in the names, angles in rad."""
     names = np.array([controller.name for controller in study.controllers])
     columns: dict[str, Any] = {"controller": names[swept.cells["controller"]].tolist()}
-    for name in (CELL.names or ())[3:]:
+    for name in (CELL_DTYPE.names or ())[3:]:
         columns[name] = np.ascontiguousarray(swept.cells[name])
     for name in ("cost", "settled", "failed_s", "loop_p50_ms", "loop_p99_ms"):
         columns[name] = np.ascontiguousarray(swept.results[name])

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from hilrig_runtime.config.impairment import ImpairmentSetting, Ways
+from hilrig_runtime.config.impairment import ImpairmentSetting, LinkImpairments
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_NAMES, RigParameters
 from hilrig_sim.parameters import rig_parameters
@@ -280,12 +280,12 @@ class StudyConfig(Section):
                 rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),),
             )
         except ValidationError as error:
-            raise InputError("; ".join(mistakes_in(error))) from error
+            raise InputError("; ".join(format_validation_error(error))) from error
 
-    def ways(self, controller: int) -> Ways:
+    def link_impairments(self, controller: int) -> LinkImpairments:
         """Return the link impairments of a controller, without the swept values."""
         own = self.controllers[controller].impairment
-        return (self.impairment if own is None else own).ways
+        return (self.impairment if own is None else own).links
 
     def linear_plant(self) -> LinearPlant:
         """Return the linear model of the arm at the task's pose.
@@ -321,7 +321,7 @@ def load_study(path: Path) -> StudyConfig:
     try:
         study = StudyConfig.model_validate(values)
     except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {mistake}" for mistake in mistakes_in(error))) from error
+        raise InputError("\n".join(f"{path}: {message}" for message in format_validation_error(error))) from error
     study.linear_plant()
     study.loop.timing()
     return study

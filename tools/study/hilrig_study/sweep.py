@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_modbus_edge.impairment.model import Impairment
-from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment
-from hilrig_runtime.process.process_pool import all_cores
+from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, LinkImpairment, NoLoss, UniformDelay
+from hilrig_runtime.process.process_pool import process_pool
 from hilrig_study.simulation.plants import ArmPlant, LinearArms, StudyPlant
 from hilrig_study.simulation.simulated_loop import Outcome, simulate
 from hilrig_study.simulation.timing import LoopTiming, Timeline, poll_count, timeline
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 MAX_BATCH_RUNS: Final = 1000
 """Upper limit of runs per batch, chosen so that the arrays of a batch fit into the cache of a core."""
 
-CELL: Final = np.dtype(
+CELL_DTYPE: Final = np.dtype(
     [
         ("controller", "<i4"),
         ("ix", "<i4"),
@@ -47,7 +47,7 @@ CELL: Final = np.dtype(
 )
 """Row type of a run's parameters."""
 
-RESULT: Final = np.dtype(
+RESULT_DTYPE: Final = np.dtype(
     [
         ("cost", "<f8"),
         ("settled", "|b1"),
@@ -65,9 +65,9 @@ class SweepResult:
     """Results of all runs of a study, and the theory."""
 
     cells: NDArray[np.void]
-    """(R,), fields as `CELL`."""
+    """(R,), fields as `CELL_DTYPE`."""
     results: NDArray[np.void]
-    """(R,), fields as `RESULT`."""
+    """(R,), fields as `RESULT_DTYPE`."""
     radius: Floats
     """Spectral radius of each run's loop, (R,); NaN: its delay is random, or its controller has no linear model."""
     theory: tuple[GainTheory, ...]
@@ -76,11 +76,11 @@ class SweepResult:
 
     def plane(self, study: StudyConfig, controller: int, values: NDArray[np.generic]) -> Floats:
         """Return the mean over the runs of each cell, (len(y), len(x)), of one value per run, (R,)."""
-        mine = self.cells["controller"] == controller
+        rows = self.cells["controller"] == controller
         shape = (len(study.y.points), len(study.x.points))
         total, count = np.zeros(shape), np.zeros(shape)
-        where = (self.cells["iy"][mine], self.cells["ix"][mine])
-        np.add.at(total, where, values[mine].astype(np.float64))
+        where = (self.cells["iy"][rows], self.cells["ix"][rows])
+        np.add.at(total, where, values[rows].astype(np.float64))
         np.add.at(count, where, 1.0)
         return total / count
 
@@ -91,7 +91,7 @@ _Theory = tuple[GainTheory, dict[float, float]]
 
 
 def all_cells(study: StudyConfig) -> NDArray[np.void]:
-    """Return all runs of a study, (R,), fields as `CELL`."""
+    """Return all runs of a study, (R,), fields as `CELL_DTYPE`."""
     x, y = study.x.points, study.y.points
     controllers, iy, ix, runs = (
         index.ravel()
@@ -103,7 +103,7 @@ def all_cells(study: StudyConfig) -> NDArray[np.void]:
             indexing="ij",
         )
     )
-    cells = np.zeros(len(ix), CELL)
+    cells = np.zeros(len(ix), CELL_DTYPE)
     cells["controller"], cells["ix"], cells["iy"], cells["run"] = controllers, ix, iy, runs
     cells["gain"], cells["step_ms"], cells["poll_ms"] = 1.0, study.loop.step_ms, study.loop.poll_ms
     cells[study.x.what], cells[study.y.what] = x[ix], y[iy]
@@ -141,7 +141,7 @@ def run_cells(
     outcome = simulate(
         plant, controller, scenario, lines, ticks=ticks, holding=plant_model.holding, keep=np.full(len(cells), keep)
     )
-    results = np.zeros(len(cells), RESULT)
+    results = np.zeros(len(cells), RESULT_DTYPE)
     results["cost"], results["settled"], results["failed_s"] = outcome.cost, outcome.settled, outcome.failed_s
     results["error_rms"] = outcome.error_rms.T
     percentiles: dict[int, tuple[float, float]] = {}
@@ -155,39 +155,39 @@ def run_cells(
 
 
 def cell_at(study: StudyConfig, x: float, y: float, controller: int = 0) -> NDArray[np.void]:
-    """Return the run of any point of the plane, (1,), fields as `CELL`."""
+    """Return the run of any point of the plane, (1,), fields as `CELL_DTYPE`."""
     axes = {"x": {"what": study.x.what, "values": (x,)}, "y": {"what": study.y.what, "values": (y,)}}
     plane = {"x": AxisConfig.model_validate(axes["x"]), "y": AxisConfig.model_validate(axes["y"]), "runs": 1}
     cells = all_cells(study.model_copy(update=plane))
-    mine: NDArray[np.void] = cells[cells["controller"] == controller]
-    return mine
+    rows: NDArray[np.void] = cells[cells["controller"] == controller]
+    return rows
 
 
 def timelines(study: StudyConfig, cells: NDArray[np.void], timing: LoopTiming, ticks: int) -> list[Timeline]:
     """Return the timeline of each run, all of one controller; runs with equal timing share one object."""
-    ways = study.ways(int(cells["controller"][0]))
+    links = study.link_impairments(int(cells["controller"][0]))
     polls = poll_count(timing, ticks)
-    known: dict[tuple[float, ...], Timeline] = {}
+    cache: dict[tuple[float, ...], Timeline] = {}
     lines = []
     for cell in cells:
         delay_ns, jitter_ms, loss = round(float(cell["delay_ms"]) * 1e6), float(cell["jitter_ms"]), float(cell["loss"])
-        random = jitter_ms > 0 or loss > 0 or not ways.do_nothing
+        random = jitter_ms > 0 or loss > 0 or not links.is_inactive
         # The draws depend only on the study's seed and the run number: all cells use common random numbers.
         key = (delay_ns, jitter_ms, loss, float(cell["run"]) if random else 0.0)
-        if key not in known:
+        if key not in cache:
             seed = np.random.SeedSequence(study.seed, spawn_key=(int(cell["run"]),))
             states, commands, added = (np.random.SeedSequence(s.entropy, spawn_key=s.spawn_key) for s in seed.spawn(3))
-            more = WayImpairment(
+            more = LinkImpairment(
                 delay=UniformDelay(low_ms=0, high_ms=jitter_ms) if jitter_ms else ConstantDelay(),
                 loss=BernoulliLoss(rate=loss) if loss else NoLoss(),
             )
-            state_ns, state_lost = Impairment(ways.state, states).draw(ticks)
-            command_ns, command_lost = Impairment(ways.command, commands).draw(polls)
+            state_ns, state_lost = Impairment(links.state, states).draw(ticks)
+            command_ns, command_lost = Impairment(links.command, commands).draw(polls)
             more_ns, more_lost = Impairment(more, added).draw(polls)
-            known[key] = timeline(
+            cache[key] = timeline(
                 timing, ticks, state_ns, command_ns + more_ns + delay_ns, state_lost, command_lost | more_lost
             )
-        lines.append(known[key])
+        lines.append(cache[key])
     return lines
 
 
@@ -216,12 +216,12 @@ def sweep(
     batch_rows = list(_batches(cells))
     delays = sorted(set(cells["delay_ms"].tolist()))
     keys = np.unique(cells[["controller", "gain", "step_ms", "poll_ms"]]) if theory else cells[:0]
-    results = np.zeros(len(cells), RESULT)
+    results = np.zeros(len(cells), RESULT_DTYPE)
     radius = np.full(len(cells), np.nan)
     found: list[GainTheory] = []
     constant = _constant(study, cells)
     total, done = len(batch_rows) * 20 + len(keys), 0
-    with all_cores(len(batch_rows) + len(keys), workers) as executor:
+    with process_pool(len(batch_rows) + len(keys), workers) as executor:
         batches: dict[Future[NDArray[np.void]], NDArray[np.intp]] = {
             executor.submit(_results_of, study, cells[rows], folder): rows for rows in batch_rows
         }
@@ -237,20 +237,20 @@ def sweep(
             done += 1
             progress(done / total)
         for theory_future, row in theories.items():
-            answer = theory_future.result()
-            if answer is None:
+            result = theory_future.result()
+            if result is None:
                 continue
-            found.append(answer[0])
+            found.append(result[0])
             controller, gain, step_ms, poll_ms = row
-            mine = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
-            mine &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
-            radius[mine] = [answer[1][delay] for delay in cells["delay_ms"][mine].tolist()]
+            rows = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
+            rows &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
+            radius[rows] = [result[1][delay] for delay in cells["delay_ms"][rows].tolist()]
     return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - start_s)
 
 
 def _constant(study: StudyConfig, cells: NDArray[np.void]) -> NDArray[np.bool_]:
     """Return which runs have no random values, (R,)."""
-    unimpaired = np.array([study.ways(number).do_nothing for number in range(len(study.controllers))])
+    unimpaired = np.array([study.link_impairments(number).is_inactive for number in range(len(study.controllers))])
     return np.asarray((cells["jitter_ms"] == 0) & (cells["loss"] == 0) & unimpaired[cells["controller"]])
 
 
@@ -280,14 +280,14 @@ def _mean_square_until(study: StudyConfig, key: _TheoryKey) -> float:
     controller, gain, step_ms, poll_ms = key
     config, axes = study.controllers[controller], (study.x, study.y)
     others = [axis for axis in axes if axis.what in ("delay_ms", "jitter_ms", "loss")]
-    random = not study.ways(controller).do_nothing or any(axis.what != "delay_ms" for axis in others)
+    random = not study.link_impairments(controller).is_inactive or any(axis.what != "delay_ms" for axis in others)
     predicts = config.kind == "lqr" and config.compensate
     if len(others) != 1 or "gain" not in {axis.what for axis in axes} or not random or predicts or poll_ms != step_ms:
         return math.nan
     timing = study.loop.timing(step_ms, poll_ms)
 
     def ages_at(value: float) -> NDArray[np.int64]:
-        cell = np.zeros(1, CELL)
+        cell = np.zeros(1, CELL_DTYPE)
         cell["controller"], cell["step_ms"], cell["poll_ms"], cell[others[0].what] = controller, step_ms, poll_ms, value
         (line,) = timelines(study, cell, timing, CHAIN_TICKS)
         return line.ages()

@@ -1,1 +1,1 @@
-"""One rig as a Modbus device: write access, the watchdog, sessions, commands and events."""
+"""One rig as a Modbus device: write access, watchdog, sessions, commands, impairment and events."""

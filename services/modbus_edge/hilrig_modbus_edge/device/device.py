@@ -1,8 +1,8 @@
-"""One rig as a Modbus device: what a request reads, and what it writes.
+"""One rig as a Modbus device: serves reads from the newest state and publishes writes as commands.
 
-Pure but for a clock and an outlet that are passed in. A read shows one state of the simulation, whole: the newest
-one, fetched when the read is executed. A write goes out as one `TorqueCommand` before the answer does. Whoever runs
-a device calls `check` every few milliseconds, and at the deadline that `Outlet.watch` was told.
+The device does no I/O: clock and output port are passed in. A read shows one state of the simulation as a whole: the
+newest one when the read is executed. A write is published as one `TorqueCommand` before its response is sent. The
+owner calls `check` every few milliseconds, and at the deadline that was passed to `DeviceOutput.watch`.
 """
 
 import random
@@ -12,63 +12,75 @@ from typing import Final
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client, Host, address_of
-from hilrig_modbus_edge.device.command_publisher import Commander
-from hilrig_modbus_edge.device.events import Journal, times
+from hilrig_modbus_edge.device.command_publisher import CommandPublisher
+from hilrig_modbus_edge.device.events import EventEmitter, repeat_suffix
+from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
+from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session
-from hilrig_modbus_edge.device.settings import MS, DeviceSettings, Outlet
+from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import WatchdogState
-from hilrig_modbus_edge.device.write_access import Tenure
-from hilrig_modbus_edge.impairment.controller import ImpairedLoop
+from hilrig_modbus_edge.device.write_access import WriteAccess
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
-from hilrig_modbus_edge.registers import map as registers
 from hilrig_modbus_edge.registers.image import StateImage
-from hilrig_modbus_edge.registers.map import PAPER_END, POSITION, Status, Table
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_modbus_edge.registers.map import (
+    DISCRETE_END,
+    ECHO_ADDRESS,
+    EXTENDED_END,
+    INPUT_END,
+    MAGNET_COIL,
+    PAPER_END,
+    POSITION_ADDRESS,
+    RESET_COIL,
+    RegisterTable,
+    Status,
+)
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
 
-# A name in an enumeration is looked up by a function; what each request asks for is looked up once.
-_INPUT_REGISTER: Final = Table.INPUT_REGISTER
-HOSTS_KEPT: Final = 64
-"""Hosts remembered though they have no connection now."""
+# Looking up an enumeration member is a function call: the one that each request needs is looked up once.
+_INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER
+MAX_REMEMBERED_HOSTS: Final = 64
+"""Number of hosts above which those without a connection are removed."""
 
 
 class Device:
-    """See the module. Not thread-safe: one thread owns it."""
+    """Modbus device of one rig. Not thread-safe: one thread owns it."""
 
     def __init__(
         self,
         rig: str,
         settings: DeviceSettings,
         clock: Clock,
-        outlet: Outlet,
-        newest_state: Callable[[], Arrival | None],
-        letters: random.Random | None = None,
+        output: DeviceOutput,
+        newest_state: Callable[[], TimestampedPayload | None],
+        rng: random.Random | None = None,
     ) -> None:
         self.rig = rig
         self.clients: set[Client] = set()
         self._hosts: dict[str, Host] = {}
         self._monotonic_ns = clock.monotonic_ns
         self._state = StateImage()
-        self._journal = Journal(rig, outlet)
-        self._commander = Commander(rig, clock, outlet, settings.repeat_ns)
-        self.impaired = ImpairedLoop(
-            rig, settings.impairment, clock, outlet, self._commander, self._journal, newest_state
+        self._events = EventEmitter(rig, output)
+        self._commands = CommandPublisher(rig, clock, output, settings.repeat_ns)
+        self.impairment = ImpairmentController(
+            rig, settings.impairment, clock, output, self._commands, self._events, newest_state
         )
-        begin_session = self.impaired.begin_session
-        self._tenure = Tenure(rig, settings, clock, outlet, self._commander, self._journal, letters, begin_session)
-        self.lease = self._tenure.lease
-        self.watchdog = self._tenure.watchdog
+        self._write_access = WriteAccess(
+            rig, settings, clock, output, self._commands, self._events, rng, self.impairment.start_session
+        )
+        self.lease = self._write_access.lease
+        self.watchdog = self._write_access.watchdog
 
     @property
     def session(self) -> Session | None:
-        """The session that is open."""
-        return self._tenure.session
+        """The open session; None: none is open."""
+        return self._write_access.session
 
     # -- connections
 
     def connect(self, host: str, port: int, *, may_write: bool = True) -> Client:
-        """A controller connected."""
+        """Add a connection and return its client."""
         known = self._hosts.setdefault(host, Host(host))
         client = Client(address_of(host, port), known, may_write, last_request_ns=self._monotonic_ns())
         known.clients.add(client)
@@ -76,117 +88,117 @@ class Device:
         return client
 
     def disconnect(self, client: Client, reason: str) -> None:
-        """A controller's connection ended; its lease ends with it, its torque stands until the watchdog trips."""
+        """Remove a connection and release its lease; its torque stays applied until the watchdog trips."""
         if client not in self.clients:
             return
         self.clients.remove(client)
         client.host.clients.remove(client)
-        self._tenure.disconnected(client, reason)
-        # Within a session, what a host was served stays the basis of its next connection: a chain of one-shot commands
-        # is one loop.
-        if len(self._hosts) > HOSTS_KEPT:
+        self._write_access.on_disconnect(client, reason)
+        # Within a session, the state that a host was served stays the basis of its next connection: a sequence of
+        # one-shot commands is one loop.
+        if len(self._hosts) > MAX_REMEMBERED_HOSTS:
             self._hosts = {address: host for address, host in self._hosts.items() if host.clients}
 
-    def connection_refused(self, address: str, reason: str, count: int) -> None:
-        """A controller was not let in, `count` times since this was last said."""
-        text = f"{address} may not connect to {self.rig}: {reason}{times(count)}"
-        self._journal.tell_of_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
+    def report_refused_connection(self, address: str, reason: str, count: int) -> None:
+        """Emit an event for `count` refused connections of a host."""
+        text = f"{address}: connection to {self.rig} refused: {reason}{repeat_suffix(count)}"
+        self._events.emit_for_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
 
     def connections_of(self, host: str) -> int:
-        """How many connections a host has."""
+        """Return the number of connections of a host."""
         return len(self._hosts[host].clients) if host in self._hosts else 0
 
     # -- reads
 
-    def read_registers(self, client: Client, table: Table, address: int, count: int) -> bytes:
-        """Registers as they go into an answer, big-endian.
+    def read_registers(self, client: Client, table: RegisterTable, address: int, count: int) -> bytes:
+        """Return registers as they are encoded in a response, big-endian.
 
         Raises:
-            ModbusError: 02 where there is no such register, 04 where no state has come yet.
+            ModbusError: 02 a register does not exist, 04 no state was received yet.
         """
         end = address + count
         if table is _INPUT_REGISTER:
-            if end > registers.INPUT_END:
+            if end > INPUT_END:
                 raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
             return self._input_image(client)[2 * address : 2 * end]
-        if end <= POSITION:
-            return bytes(self._commander.torque[2 * address : 2 * end])
+        if end <= POSITION_ADDRESS:
+            return bytes(self._commands.torque[2 * address : 2 * end])
         if end <= PAPER_END:
-            positions = self._show(client).position_words
-            if address >= POSITION:
-                return positions[2 * (address - POSITION) : 2 * (end - POSITION)]
-            return bytes(self._commander.torque[2 * address :]) + positions[: 2 * (end - POSITION)]
-        if address >= registers.ECHO and end <= registers.EXTENDED_END:
-            image = self._commander.echo.to_bytes(2, "big") + (self.watchdog.timeout_ns // MS).to_bytes(2, "big")
-            return image[2 * (address - registers.ECHO) : 2 * (end - registers.ECHO)]
+            positions = self._serve_state(client).position_words
+            if address >= POSITION_ADDRESS:
+                return positions[2 * (address - POSITION_ADDRESS) : 2 * (end - POSITION_ADDRESS)]
+            return bytes(self._commands.torque[2 * address :]) + positions[: 2 * (end - POSITION_ADDRESS)]
+        if address >= ECHO_ADDRESS and end <= EXTENDED_END:
+            image = self._commands.echo.to_bytes(2, "big") + (self.watchdog.timeout_ns // MS).to_bytes(2, "big")
+            return image[2 * (address - ECHO_ADDRESS) : 2 * (end - ECHO_ADDRESS)]
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
-    def read_bits(self, client: Client, table: Table, address: int, count: int) -> int:
-        """Bits as a number, the first one least significant.
+    def read_bits(self, client: Client, table: RegisterTable, address: int, count: int) -> int:
+        """Return bits as a number, the first one least significant.
 
         Raises:
-            ModbusError: 02 where there is no such bit.
+            ModbusError: 02 a bit does not exist.
         """
-        if table is Table.DISCRETE_INPUT:
-            if address + count > registers.DISCRETE_END:
+        if table is RegisterTable.DISCRETE_INPUT:
+            if address + count > DISCRETE_END:
                 raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-            self._look()
+            self.refresh_state()
             return (self._status(client) >> address) & ((1 << count) - 1)
-        if count == 1 and address == registers.MAGNET:
-            return int(self._commander.magnet)
-        if count == 1 and address == registers.RESET:
+        if count == 1 and address == MAGNET_COIL:
+            return int(self._commands.magnet)
+        if count == 1 and address == RESET_COIL:
             return 0
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
     def check_readable(self, address: int, count: int) -> None:
-        """Nothing, if these holding registers can be read now.
+        """Check that holding registers can be read now.
 
         Raises:
-            ModbusError: 02 where there is no such register, 04 where no state has come yet.
+            ModbusError: 02 a register does not exist, 04 no state was received yet.
         """
         end = address + count
-        if end > PAPER_END and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
+        if end > PAPER_END and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        if POSITION < end <= PAPER_END and self._look().arrival is None:
+        if POSITION_ADDRESS < end <= PAPER_END and self.refresh_state().arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
 
     # -- writes
 
     def check_writable(self, address: int, count: int) -> None:
-        """Nothing, if a controller may write all of these holding registers.
+        """Check that a client may write all of these holding registers.
 
         Raises:
-            ModbusError: 02 otherwise.
+            ModbusError: 02 a register does not exist or is read-only.
         """
         end = address + count
-        if end > POSITION and not (address >= registers.ECHO and end <= registers.EXTENDED_END):
+        if end > POSITION_ADDRESS and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
     def write_registers(self, client: Client, address: int, words: bytes, arrived_ns: int) -> None:
-        """Write holding registers, all of them or none; torques go out at once.
+        """Write holding registers, all or none; torques are published at once.
 
         Raises:
-            ModbusError: 02 where one is not the controller's to write, 04 a time-out outside the lab's bounds,
-                06 another controller holds the rig, 01 this one may only read.
+            ModbusError: 02 a register does not exist or is read-only, 04 the watchdog timeout is outside the bounds
+                of the lab, 06 another client holds the lease, 01 the client is read-only.
         """
         end = address + len(words) // 2
-        if end <= POSITION:
+        if end <= POSITION_ADDRESS:
             fed_ns = self.watchdog.fed_ns
-            self._tenure.accept(client, arrived_ns)
-            self._commander.torque[2 * address : 2 * end] = words
-            if not self._commander.write(client, arrived_ns):
-                self._tenure.lost(fed_ns)
+            self._write_access.authorize_write(client, arrived_ns)
+            self._commands.torque[2 * address : 2 * end] = words
+            if not self._commands.publish_write(client, arrived_ns):
+                self._write_access.revert_watchdog_feed(fed_ns)
             return
         self.check_writable(address, len(words) // 2)
         timeout_ns = self.watchdog.timeout_ns
-        if end == registers.EXTENDED_END:
+        if end == EXTENDED_END:
             timeout_ns = int.from_bytes(words[-2:], "big") * MS
-            self._tenure.check_timeout(timeout_ns)
-        self._tenure.accept(client, arrived_ns)
-        if address == registers.ECHO:
-            self._commander.echo = int.from_bytes(words[:2], "big")
-        self._tenure.set_timeout(timeout_ns)
-        self._commander.say_session()
+            self._write_access.check_timeout(timeout_ns)
+        self._write_access.authorize_write(client, arrived_ns)
+        if address == ECHO_ADDRESS:
+            self._commands.echo = int.from_bytes(words[:2], "big")
+        self._write_access.set_timeout(timeout_ns)
+        self._commands.publish_session()
 
     def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int) -> None:
         """Switch the magnet, or reset the rig.
@@ -194,87 +206,85 @@ class Device:
         Raises:
             ModbusError: as `write_registers`.
         """
-        if address not in (registers.MAGNET, registers.RESET):
+        if address not in (MAGNET_COIL, RESET_COIL):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
         fed_ns = self.watchdog.fed_ns
-        self._tenure.accept(client, arrived_ns)
-        if address == registers.MAGNET:
-            self._commander.magnet = on
+        self._write_access.authorize_write(client, arrived_ns)
+        if address == MAGNET_COIL:
+            self._commands.magnet = on
         elif on:
-            self._commander.reset()
+            self._commands.reset()
         else:
-            self._commander.say_session()
+            self._commands.publish_session()
             return
-        if not self._commander.write(client, arrived_ns):
-            self._tenure.lost(fed_ns)
+        if not self._commands.publish_write(client, arrived_ns):
+            self._write_access.revert_watchdog_feed(fed_ns)
 
     # -- time
 
     def check(self, now_ns: int) -> None:
-        """Do what has become due: trip, lose the lease, end the session, repeat the command; ns, monotonic clock."""
-        self._tenure.check(now_ns)
-        self._commander.repeat_if_due(now_ns)
-        self.impaired.check(now_ns)
+        """Do everything that is due: trip, lease expiry, end of session, repetition, schedule; ns, monotonic clock."""
+        self._write_access.check(now_ns)
+        self._commands.repeat_if_due(now_ns)
+        self.impairment.check(now_ns)
 
     def send_due(self, now_ns: int) -> None:
-        """Send the commands that have come to the end of an impaired way; ns, monotonic clock."""
-        self._commander.send_due(now_ns)
+        """Publish the delayed commands that are due; ns, monotonic clock."""
+        self._commands.send_due(now_ns)
 
-    def begin(self) -> None:
-        """Say the first word: no torque; and impair the loop, where the lab says so."""
-        self._commander.say()
-        self.impaired.begin()
+    def start(self) -> None:
+        """Publish the first command, zero torque, and apply the impairment of lab.toml."""
+        self._commands.publish_internal()
+        self.impairment.start()
 
-    def shut(self, reason: str) -> None:
-        """The edge stops: no torque, no lease, no session."""
-        self._tenure.shut(reason)
+    def stop(self, reason: str) -> None:
+        """Set the torque to zero, release the lease and end the session, because the edge stops."""
+        self._write_access.stop(reason)
 
     @property
     def has_state(self) -> bool:
-        """Whether a state has come, so that positions can be read."""
-        return self._look().arrival is not None
+        """Whether a state was received, so that positions can be read."""
+        return self.refresh_state().arrival is not None
 
-    def look(self) -> None:
-        """See the newest state without showing it to anyone, so that what is said of the last one stays true."""
-        self._look()
+    def refresh_state(self) -> StateImage:
+        """Update the register image to the newest state, without serving it to a client, and return the image."""
+        arrival = self.impairment.newest_state()
+        state = self._state
+        if arrival is not state.arrival and arrival is not None:
+            state.update(arrival)
+            self._events.step = state.step
+        return state
 
-    # -- the teacher
+    # -- operator
 
     def release(self, reason: str) -> str:
-        """Take the rig from its controller: who held it; empty: nobody. See `Tenure.release`."""
-        return self._tenure.release(reason)
+        """Revoke the lease; return the previous holder, empty: none. See `WriteAccess.release`."""
+        return self._write_access.release(reason)
 
     def reset(self) -> None:
-        """Put the arm back to its start pose, without torque; the controller that holds it goes on from there."""
-        self._commander.reset()
-        self._commander.say()
+        """Move the arm to its start pose with zero torque; the lease holder continues from there."""
+        self._commands.reset()
+        self._commands.publish_internal()
 
     def lease_status(self) -> LeaseStatus:
-        """How the lease and the watchdog stand."""
-        status = self._tenure.status()
+        """Return the status of lease, session, watchdog and connections."""
+        status = self._write_access.status()
         status.connections = len(self.clients)
         return status
 
     # -- inside
 
-    def _look(self) -> StateImage:
-        arrival = self.impaired.newest_state()
-        state = self._state
-        if arrival is not state.arrival and arrival is not None:
-            state.take(arrival)
-            self._journal.step = state.step
-        return state
-
-    def _show(self, client: Client) -> StateImage:
-        state = self._look()
+    def _serve_state(self, client: Client) -> StateImage:
+        """Return the newest state and record that `client` is served it."""
+        state = self.refresh_state()
         if state.arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
-        # Stamped after the look at the bus: a state is never shown before it came.
-        client.shown((state.basis, self._monotonic_ns()))
+        # The time is taken after the newest state was fetched: a state is never served before it arrived.
+        client.record_served((state.basis, self._monotonic_ns()))
         return state
 
     def _input_image(self, client: Client) -> bytes:
-        state = self._show(client)
+        state = self._serve_state(client)
         holder = self.lease.holder
         lease = 0 if holder is None else 1 if holder is client else 2
         return state.input_words(

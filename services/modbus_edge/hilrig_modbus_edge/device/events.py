@@ -1,29 +1,37 @@
-"""A rig's events, each with the session and the step that it belongs to."""
+"""Events of a rig: each carries the session and the simulation step; lease events are rate-limited per host."""
 
-from hilrig_modbus_edge.device.settings import Outlet
+from typing import Final
+
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.rate_limiter import RateLimiter
+from hilrig_modbus_edge.device.settings import MS
 from hilrig_schemas import Event
 
+LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
+"""Shortest time between two lease events of one kind and host, ns."""
 
-class Journal:
-    """Tells what happens to one rig."""
 
-    def __init__(self, rig: str, outlet: Outlet) -> None:
+class EventEmitter:
+    """Emits the events of one rig."""
+
+    def __init__(self, rig: str, output: DeviceOutput) -> None:
         self.session = ""
-        """Id of the session that is open; empty: none."""
+        """Id of the open session; empty: none."""
         self.step = 0
-        """Step of the newest state that was seen."""
+        """Step of the newest received state."""
         self._rig = rig
-        self._outlet = outlet
+        self._output = output
 
     def event(self, kind: Event.Kind, severity: Event.Severity, text: str) -> Event:
-        """An event, to be filled in and told."""
+        """Return a new event, to be completed and emitted."""
         return Event(rig=self._rig, session=self.session, kind=kind, severity=severity, text=text, step=self.step)
 
-    def tell(self, event: Event) -> None:
-        """Send an event."""
-        self._outlet.emit(event)
+    def emit(self, event: Event) -> None:
+        """Publish an event."""
+        self._output.emit(event)
 
-    def tell_of_controller(
+    def emit_for_controller(
         self,
         kind: Event.Kind,
         severity: Event.Severity,
@@ -33,14 +41,68 @@ class Journal:
         reason: str = "",
         holder: str = "",
     ) -> None:
-        """Send an event about a controller, "host:port"; `holder` is who holds the rig, where that is another one."""
+        """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
         event.controller_data.reason = reason
         event.controller_data.holder = holder
-        self.tell(event)
+        self.emit(event)
 
 
-def times(count: int) -> str:
-    """How often, for the end of a sentence; nothing for once."""
+class LeaseEventReporter:
+    """Reports acquired, released and denied leases as events, rate-limited per host.
+
+    A client may open a new connection for every request, dozens of times a second. Per host, the first acquisition of
+    a second is reported and the others are counted. A holder that keeps the lease for a second is always reported.
+    Time is passed in.
+    """
+
+    def __init__(self, rig: str, events: EventEmitter) -> None:
+        self._rig = rig
+        self._events = events
+        self._acquisitions = RateLimiter(LEASE_EVENT_PERIOD_NS)
+        self._denials = RateLimiter(LEASE_EVENT_PERIOD_NS)
+        self._pending_acquire: tuple[str, int] | None = None
+        """Address of the lease holder and time of the acquisition (ns), if it was suppressed."""
+
+    def lease_acquired(self, client: Client, now_ns: int) -> None:
+        """Report that a client acquired the lease; ns, monotonic clock."""
+        count = self._acquisitions.record(client.host.address, now_ns)
+        self._pending_acquire = None if count else (client.address, now_ns)
+        if count:
+            self._emit_acquired(client.address, count)
+
+    def lease_released(self, client: Client, reason: str, *, disconnected: bool) -> None:
+        """Report that the holder has no lease any more; `disconnected`: its connection was closed."""
+        if self._pending_acquire is not None:
+            self._pending_acquire = None
+            if disconnected:
+                return
+            self._emit_acquired(client.address)
+        verb = "released" if disconnected else "lost"
+        text = f"{client.address} {verb} the lease of {self._rig}: {reason}"
+        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, client.address, reason=reason)
+
+    def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
+        """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""
+        count = self._denials.record((client.host.address, bool(holder)), now_ns)
+        if count:
+            text = f"{client.address}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
+            self._events.emit_for_controller(
+                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=holder
+            )
+
+    def check(self, now_ns: int) -> None:
+        """Report a suppressed acquisition after its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`."""
+        if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
+            address, self._pending_acquire = self._pending_acquire[0], None
+            self._emit_acquired(address)
+
+    def _emit_acquired(self, address: str, count: int = 1) -> None:
+        text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
+        self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
+
+
+def repeat_suffix(count: int) -> str:
+    """Return " (N times)" for the end of a message; empty for one occurrence."""
     return f" ({count} times)" if count > 1 else ""

@@ -1,24 +1,28 @@
-"""Tell of what happens again and again once in a while, with a count: a log that floods is not read."""
+"""Rate limit of repeated events and log messages: counts the suppressed ones."""
 
 from collections.abc import Hashable
 
 
-class Throttle:
-    """At most one telling a key and period; the rest is counted. Pure: time is passed in."""
+class RateLimiter:
+    """Allows one report per key and period, and counts the occurrences between two reports. Time is passed in."""
 
     def __init__(self, period_ns: int, keys: int = 256) -> None:
         self._period_ns = period_ns
         self._keys = keys
-        self._told: dict[Hashable, tuple[int, int]] = {}
+        self._reported: dict[Hashable, tuple[int, int]] = {}
+        """By key: time of the last report, ns, and the number of occurrences since then."""
 
-    def count(self, key: Hashable, now_ns: int) -> int:
-        """Count one; how many there were since the last telling if it is time to tell, else 0; ns, monotonic clock."""
-        told_ns, untold = self._told.get(key, (now_ns - self._period_ns, 0))
-        untold += 1
-        if now_ns - told_ns < self._period_ns:
-            self._told[key] = (told_ns, untold)
+    def record(self, key: Hashable, now_ns: int) -> int:
+        """Record one occurrence at `now_ns`, monotonic clock.
+
+        Returns the number of occurrences since the last report if a report is due, else 0.
+        """
+        reported_ns, suppressed = self._reported.get(key, (now_ns - self._period_ns, 0))
+        count = suppressed + 1
+        if now_ns - reported_ns < self._period_ns:
+            self._reported[key] = (reported_ns, count)
             return 0
-        if len(self._told) >= self._keys:
-            self._told.clear()
-        self._told[key] = (now_ns, 0)
-        return untold
+        if len(self._reported) >= self._keys:
+            self._reported.clear()
+        self._reported[key] = (now_ns, 0)
+        return count

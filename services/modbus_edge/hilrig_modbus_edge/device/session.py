@@ -1,7 +1,7 @@
-"""A rig's session: what begins when a controller takes the rig and ends when it has been gone for a while.
+"""Session of a rig: starts when a client acquires the lease, ends a grace time after the lease was released.
 
-A controller that comes back from the same host within the grace time goes on with its session, so that a program
-that reconnects, or a chain of one-shot commands, is one recording. Pure: time is passed in.
+A client that reconnects from the same host within the grace time continues its session. So a program that reconnects,
+or a sequence of one-shot commands, is one recording. Time is passed in.
 """
 
 from dataclasses import dataclass
@@ -12,24 +12,24 @@ from hilrig_schemas import OpenSession
 
 @dataclass(slots=True)
 class Session:
-    """One session while it is open."""
+    """One open session."""
 
     rig: str
     id: str
     number: int
-    """Of the rig's sessions since the edge started, from 1."""
+    """Number among the rig's sessions since the edge started, from 1."""
     controller: str
-    """Address of the controller that began it, "host:port"."""
+    """Address of the client that started it, "host:port"."""
     host: Host
-    """The machine that it came from."""
+    """Host of that client."""
     start_wall_ns: int
-    gone_ns: int | None = None
-    """Since when no controller holds the rig, ns, monotonic clock; None: one does."""
+    released_ns: int | None = None
+    """Time at which the lease was released, ns, monotonic clock; None: the lease is held."""
 
-    def over(self, now_ns: int, grace_ns: int) -> bool:
-        """Whether its controller has been gone for the grace time."""
-        return self.gone_ns is not None and now_ns - self.gone_ns >= grace_ns
+    def expired(self, now_ns: int, grace_ns: int) -> bool:
+        """Return whether nobody has held the lease for the grace time."""
+        return self.released_ns is not None and now_ns - self.released_ns >= grace_ns
 
     def as_message(self) -> OpenSession:
-        """As log streams state it."""
+        """Return the session as it is announced to the recorder."""
         return OpenSession(rig=self.rig, session=self.id, controller=self.controller, start_wall_ns=self.start_wall_ns)

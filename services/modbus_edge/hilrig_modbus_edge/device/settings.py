@@ -1,46 +1,18 @@
-"""What a lab says of its devices, and where a device's words go."""
+"""Settings of a device, converted from lab.toml to nanoseconds."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import EdgeConfig
-from hilrig_runtime.messaging.endpoints import Arrival
-from hilrig_schemas import Event, TorqueCommand
 
 MS: Final = 1_000_000
-"""A millisecond, ns."""
-
-
-class Outlet(Protocol):
-    """Where a device's words go."""
-
-    def send_command(self, command: TorqueCommand) -> None:
-        """A new command; the message is reused after the call."""
-
-    def repeat_command(self, command: TorqueCommand) -> None:
-        """The standing command again, for those who wait to hear that it still holds."""
-
-    def emit(self, event: Event) -> None:
-        """Something happened."""
-
-    def sessions_changed(self) -> None:
-        """A session began or ended."""
-
-    def watch(self, deadline_ns: int) -> None:
-        """The watchdog began to watch: `check` must be called at the deadline."""
-
-    def send_at(self, deadline_ns: int) -> None:
-        """A command is on an impaired way: `send_due` must be called at the deadline, and not much later."""
-
-    def follow_states(self, arrive: Callable[[Arrival], None] | None) -> None:
-        """Call `arrive` with every state that comes, on any thread; None: no more."""
+"""One millisecond, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """What a lab says of its devices, in nanoseconds."""
+    """Times and impairment of a device; times in ns."""
 
     watchdog_ns: int = 1_000 * MS
     watchdog_min_ns: int = 100 * MS
@@ -52,7 +24,7 @@ class DeviceSettings:
 
     @classmethod
     def of(cls, edge: EdgeConfig, impairment: ImpairmentConfig) -> "DeviceSettings":
-        """As configured."""
+        """Return the settings of a rig from its lab's configuration."""
         return cls(
             watchdog_ns=round(edge.watchdog_ms * MS),
             watchdog_min_ns=round(edge.watchdog_min_ms * MS),

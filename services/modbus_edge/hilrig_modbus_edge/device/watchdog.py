@@ -1,14 +1,14 @@
-"""The watchdog: torque goes to zero when the controller stops writing.
+"""Watchdog of a rig: sets the torque to zero when the client stops writing.
 
-Writes feed it, reads do not: a controller whose control task has died can go on polling. It starts to watch with the
-first write, trips once, latches, and the next write re-arms it. Pure: time is passed in.
+Writes feed the watchdog; reads do not, because a client whose control task has crashed may continue to poll. The first
+write arms it. It trips once and latches; the next write re-arms it. Time is passed in.
 """
 
 from enum import IntEnum
 
 
 class WatchdogState(IntEnum):
-    """As the extended map shows it."""
+    """State of a watchdog, with its value in the extended register map."""
 
     OFF = 0
     WAITING = 1
@@ -17,17 +17,17 @@ class WatchdogState(IntEnum):
 
 
 class Watchdog:
-    """Watches the writes of one rig; `timeout_ns` 0 turns it off."""
+    """Monitors the writes to one rig; `timeout_ns` 0 turns it off."""
 
     def __init__(self, timeout_ns: int) -> None:
         self.timeout_ns = timeout_ns
         self.tripped = False
         self.fed_ns: int | None = None
-        """Last write while it watches, ns; None: it does not watch."""
+        """Time of the last write while it is armed, ns; None: it is not armed."""
 
     @property
     def state(self) -> WatchdogState:
-        """What it is doing."""
+        """Current state."""
         if self.tripped:
             return WatchdogState.TRIPPED
         if not self.timeout_ns:
@@ -36,21 +36,21 @@ class Watchdog:
 
     @property
     def deadline_ns(self) -> int | None:
-        """When it will trip if nothing is written, ns; None: it won't."""
+        """Time at which it trips without a further write, ns; None: it is not armed."""
         return self.fed_ns + self.timeout_ns if self.fed_ns is not None and self.timeout_ns else None
 
     def feed(self, now_ns: int) -> bool:
-        """A write was accepted; True: it re-armed a watchdog that had tripped."""
+        """Record an accepted write; return True if this re-armed a tripped watchdog."""
         self.fed_ns = now_ns
         rearmed, self.tripped = self.tripped, False
         return rearmed
 
-    def rest(self) -> None:
-        """Stop watching until the next write: there is nothing to stop."""
+    def disarm(self) -> None:
+        """Disarm it until the next write, because there is no torque to stop."""
         self.fed_ns = None
 
     def check(self, now_ns: int) -> int:
-        """Trip if it is time: how long nothing was written, ns, at the very trip; else 0."""
+        """Trip if the deadline has passed; return the time since the last write (ns) when it trips, else 0."""
         deadline_ns = self.deadline_ns
         if deadline_ns is None or self.fed_ns is None or now_ns < deadline_ns:
             return 0

@@ -1,45 +1,79 @@
-"""Who writes to a rig, for how long, and what happens when he stops: lease, watchdog and session together.
+"""Write access to a rig: lease, watchdog and session.
 
-A write is accepted from the lease's holder, and feeds the watchdog; the lease runs from the last request of any kind.
-A session begins with a lease and outlives it by a grace time. Pure: time is passed in, or read from a clock that was.
+The first client that writes acquires the lease. A write of the lease holder is accepted and feeds the watchdog. The
+lease expires a timeout after the holder's last request of any kind. A session starts with a lease and ends a grace
+time after it. Time is passed in or read from the given clock.
 """
 
 import random
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Generic, NoReturn, Protocol, TypeVar
 
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.command_publisher import Commander
-from hilrig_modbus_edge.device.events import Journal
-from hilrig_modbus_edge.device.lease import Lease
-from hilrig_modbus_edge.device.lease_events import Handover
+from hilrig_modbus_edge.device.command_publisher import CommandPublisher
+from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter
+from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session
-from hilrig_modbus_edge.device.settings import MS, DeviceSettings, Outlet
+from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_runtime.process.session_id import session_id
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
 
-HANDOVER_PERIOD_NS: Final = 1_000 * MS
-"""From host to host a rig goes once in so long: two that take turns with each write would make a recording of each."""
+HOST_CHANGE_PERIOD_NS: Final = 1_000 * MS
+"""Shortest time between two changes of the host that writes, ns: two hosts that write alternately would otherwise
+create a recording per write."""
 
 
-class Tenure:
-    """See the module."""
+class Holder(Protocol):
+    """A client that can hold a lease; compared by identity."""
+
+    last_request_ns: int
+    """Time of its last request, ns, monotonic clock."""
+
+
+HolderT = TypeVar("HolderT", bound=Holder)
+
+
+class Lease(Generic[HolderT]):
+    """Exclusive write permission: at most one holder, which keeps it while it sends requests. Time is passed in."""
+
+    def __init__(self, timeout_ns: int) -> None:
+        self.timeout_ns = timeout_ns
+        self.holder: HolderT | None = None
+
+    def acquire(self, client: HolderT) -> bool:
+        """Give the lease to `client` if it is free; return whether `client` holds it now."""
+        if self.holder is None:
+            self.holder = client
+        return self.holder is client
+
+    def release(self) -> HolderT | None:
+        """Release the lease and return the previous holder."""
+        holder, self.holder = self.holder, None
+        return holder
+
+    def expired(self, now_ns: int) -> bool:
+        """Return whether the holder has sent no request for the timeout."""
+        return self.holder is not None and now_ns - self.holder.last_request_ns >= self.timeout_ns
+
+
+class WriteAccess:
+    """Decides which client may write to a rig, and stops the rig when the writes stop."""
 
     def __init__(
         self,
         rig: str,
         settings: DeviceSettings,
         clock: Clock,
-        outlet: Outlet,
-        commander: Commander,
-        journal: Journal,
-        letters: random.Random | None = None,
-        begin_session: Callable[[], None] = lambda: None,
+        output: DeviceOutput,
+        commands: CommandPublisher,
+        events: EventEmitter,
+        rng: random.Random | None = None,
+        on_session_start: Callable[[], None] = lambda: None,
     ) -> None:
         self.lease: Lease[Client] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
@@ -48,49 +82,49 @@ class Tenure:
         self._settings = settings
         self._monotonic_ns = clock.monotonic_ns
         self._wall_ns = clock.wall_ns
-        self._outlet = outlet
-        self._commander = commander
-        self._journal = journal
-        self._letters = random.SystemRandom() if letters is None else letters
-        self._handover = Handover(rig, journal)
+        self._output = output
+        self._commands = commands
+        self._events = events
+        self._rng = random.SystemRandom() if rng is None else rng
+        self._lease_events = LeaseEventReporter(rig, events)
         self._session_count = 0
         self._last_writer = ""
-        self._handover_due_ns = 0
-        """When another host may end a session again, ns, monotonic clock."""
-        self._begin_session = begin_session
+        self._host_change_ns = 0
+        """Earliest time at which another host may end a session, ns, monotonic clock."""
+        self._on_session_start = on_session_start
 
-    def accept(self, client: Client, now_ns: int) -> None:
-        """Accept a write that is right otherwise; ns, monotonic clock.
+    def authorize_write(self, client: Client, now_ns: int) -> None:
+        """Authorize a valid write and feed the watchdog; ns, monotonic clock.
 
         Raises:
-            ModbusError: 06 another controller holds the rig, 01 this one may only read.
+            ModbusError: 06 another client holds the lease, 01 the client is read-only.
         """
         if self.lease.holder is not client:
-            self._take_lease(client, now_ns)
+            self._acquire_lease(client, now_ns)
         watchdog = self.watchdog
         if watchdog.fed_ns is not None:
             watchdog.fed_ns = now_ns
             return
         if watchdog.feed(now_ns):
-            text = f"{client.address} writes again: the watchdog is armed"
-            event = self._journal.event(Event.WATCHDOG_REARM, Event.INFO, text)
+            text = f"watchdog of {self._rig} re-armed: {client.address} writes again"
+            event = self._events.event(Event.WATCHDOG_REARM, Event.INFO, text)
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
-            self._journal.tell(event)
+            self._events.emit(event)
         self._watch()
 
-    def lost(self, fed_ns: int | None) -> None:
-        """The write that was just accepted is lost on an impaired way: it was no word to the watchdog.
+    def revert_watchdog_feed(self, fed_ns: int | None) -> None:
+        """Undo the watchdog feed: the accepted write was dropped by the emulated network.
 
-        `fed_ns` is when the watchdog was fed before; None: it did not watch, and watches from this write on.
+        `fed_ns`: time of the feed before it; None: the watchdog was not armed, and stays armed by this write.
         """
         if fed_ns is not None:
             self.watchdog.fed_ns = fed_ns
 
     def check_timeout(self, timeout_ns: int) -> None:
-        """Nothing, if a controller may set the watchdog's time-out so.
+        """Check a watchdog timeout that a client sets.
 
         Raises:
-            ModbusError: 04 it is outside the lab's bounds.
+            ModbusError: 04 the timeout is outside the bounds of the lab.
         """
         settings = self._settings
         if timeout_ns != settings.watchdog_ns and not (
@@ -99,50 +133,51 @@ class Tenure:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
 
     def set_timeout(self, timeout_ns: int) -> None:
-        """Set the watchdog's time-out; it holds from the last write on."""
+        """Set the watchdog timeout; it counts from the last write."""
         self.watchdog.timeout_ns = timeout_ns
         self._watch()
 
-    def disconnected(self, client: Client, reason: str) -> None:
-        """A connection ended; the lease ends with it, the torque stands until the watchdog trips."""
+    def on_disconnect(self, client: Client, reason: str) -> None:
+        """Release the lease of a closed connection; its torque stays applied until the watchdog trips."""
         if self.lease.holder is client:
-            self._lose_lease(reason, of_itself=True)
+            self._release_lease(reason, disconnected=True)
 
     def check(self, now_ns: int) -> None:
-        """Trip, lose the lease, end the session: what has become due; ns, monotonic clock."""
+        """Do everything that is due: watchdog trip, lease expiry, end of the session; ns, monotonic clock."""
         silent_ns = self.watchdog.check(now_ns)
         if silent_ns:
             self._trip(silent_ns, now_ns)
-        self._handover.check(now_ns)
+        self._lease_events.check(now_ns)
         if self.lease.expired(now_ns):
-            self._lose_lease(f"no request for {self._settings.lease_ns / 1e9:g} s")
-        if self.session is not None and self.session.over(now_ns, self._settings.grace_ns):
-            self._end_session("the controller is gone")
+            self._release_lease(f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)")
+        if self.session is not None and self.session.expired(now_ns, self._settings.grace_ns):
+            self._end_session("no lease holder for the grace time (edge.session_grace_ms)")
 
     def release(self, reason: str) -> str:
-        """Take the rig from its controller, for the teacher: who held it; empty: nobody.
+        """Revoke the lease, on request of an operator; return the previous holder, empty: none.
 
-        For the lease's time-out that connection does not get it back: others could not be faster than its next write.
+        For the lease timeout that connection cannot acquire it again. Otherwise its next write would do so before any
+        other client could.
         """
         holder = self.lease.holder
         if holder is None:
             return ""
-        holder.barred_until_ns = self._monotonic_ns() + self._settings.lease_ns
-        self._lose_lease(reason)
+        holder.lease_cooldown_until_ns = self._monotonic_ns() + self._settings.lease_ns
+        self._release_lease(reason)
         return holder.address
 
-    def shut(self, reason: str) -> None:
-        """The edge stops: no torque, no lease, no session."""
-        self._lose_lease(reason)
-        self.watchdog.rest()
-        self._commander.zero()
+    def stop(self, reason: str) -> None:
+        """Set the torque to zero, release the lease and end the session, because the edge stops."""
+        self._release_lease(reason)
+        self.watchdog.disarm()
+        self._commands.zero()
         if self.session is not None:
             self._end_session(reason)
         else:
-            self._commander.say()
+            self._commands.publish_internal()
 
     def status(self) -> LeaseStatus:
-        """How the lease and the watchdog stand."""
+        """Return the status of lease, session and watchdog."""
         holder = self.lease.holder
         return LeaseStatus(
             rig=self._rig,
@@ -155,96 +190,102 @@ class Tenure:
 
     @property
     def _holder(self) -> str:
-        """Address of who holds the rig; empty: nobody."""
+        """Address of the lease holder; empty: none."""
         holder = self.lease.holder
         return "" if holder is None else holder.address
 
-    def _take_lease(self, client: Client, now_ns: int) -> None:
+    def _acquire_lease(self, client: Client, now_ns: int) -> None:
         session = self.session
         if not client.may_write:
-            reason = "its certificate has not the role operator, so it may read only"
-            self._refuse(client, now_ns, reason, ExcCodes.ILLEGAL_FUNCTION)
-        if now_ns < client.barred_until_ns:
-            self._refuse(client, now_ns, "the rig was taken from it", ExcCodes.DEVICE_BUSY)
+            reason = "read-only: the client certificate lacks the role operator; use a certificate with that role"
+            self._deny(client, now_ns, reason, ExcCodes.ILLEGAL_FUNCTION)
+        if now_ns < client.lease_cooldown_until_ns:
+            wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
+            reason = f"its lease was revoked; write again in {wait_s:.1f} s"
+            self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
         if self.lease.holder is not None:
-            self._refuse(client, now_ns, f"{self._holder} holds it", ExcCodes.DEVICE_BUSY)
+            reason = f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release"
+            self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
         if session is not None and session.host.address != client.host.address:
-            if now_ns < self._handover_due_ns:
-                reason = f"{session.host.address} took it less than a second ago"
-                self._refuse(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
-            self._handover_due_ns = now_ns + HANDOVER_PERIOD_NS
-            self._end_session(f"{client.address} took the rig")
-        self.lease.take(client)
+            if now_ns < self._host_change_ns:
+                reason = f"{session.host.address} acquired the lease less than 1 s ago; write again in 1 s"
+                self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
+            self._host_change_ns = now_ns + HOST_CHANGE_PERIOD_NS
+            self._end_session(f"{client.address} acquired the lease")
+        self.lease.acquire(client)
         self._last_writer = client.address
-        self._go_on_with_session(client)
-        self._handover.taken(client, now_ns)
+        self._start_or_continue_session(client)
+        self._lease_events.lease_acquired(client, now_ns)
 
-    def _refuse(self, client: Client, now_ns: int, reason: str, code: ExcCodes) -> None:
-        self._handover.refused(client, reason, self._holder, now_ns)
+    def _deny(self, client: Client, now_ns: int, reason: str, code: ExcCodes) -> NoReturn:
+        self._lease_events.lease_denied(client, reason, self._holder, now_ns)
         raise ModbusError(code)
 
-    def _lose_lease(self, reason: str, *, of_itself: bool = False) -> None:
+    def _release_lease(self, reason: str, *, disconnected: bool = False) -> None:
         holder = self.lease.release()
         if holder is None:
             return
         if self.session is not None:
-            self.session.gone_ns = self._monotonic_ns()
-        if not self._commander.moves:
-            # There is nothing to stop.
-            self.watchdog.rest()
-        self._handover.left(holder, reason, of_itself=of_itself)
+            self.session.released_ns = self._monotonic_ns()
+        if not self._commands.has_torque:
+            # There is no torque to stop.
+            self.watchdog.disarm()
+        self._lease_events.lease_released(holder, reason, disconnected=disconnected)
 
-    def _go_on_with_session(self, client: Client) -> None:
+    def _start_or_continue_session(self, client: Client) -> None:
         if self.session is not None:
-            self.session.gone_ns = None
+            self.session.released_ns = None
             return
         self._session_count += 1
         wall_ns = self._wall_ns()
-        identity = session_id(self._rig, wall_ns, self._letters)
+        identity = session_id(self._rig, wall_ns, self._rng)
         self.session = Session(self._rig, identity, self._session_count, client.address, client.host, wall_ns)
-        self._commander.session = self._journal.session = identity
-        # A time-out that the one before set by register was his, and so was his echo word.
+        self._commands.session = self._events.session = identity
+        # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
-        self._commander.echo = 0
-        event = self._journal.event(Event.SESSION_START, Event.INFO, f"session {identity} of {client.address}")
+        self._commands.echo = 0
+        event = self._events.event(Event.SESSION_START, Event.INFO, f"session {identity} started by {client.address}")
         event.session_data.controller = client.address
-        event.session_data.reason = "a controller took the rig"
-        self._journal.tell(event)
-        self._outlet.sessions_changed()
-        self._begin_session()
+        event.session_data.reason = "lease acquired"
+        self._events.emit(event)
+        self._output.sessions_changed()
+        self._on_session_start()
 
     def _end_session(self, reason: str) -> None:
         session, self.session = self.session, None
         if session is None:
             return
-        # The next session's first command is not based on what this one read, however long ago.
-        session.host.forget_served()
-        event = self._journal.event(Event.SESSION_END, Event.INFO, f"session {session.id} is over: {reason}")
+        # The first command of the next session must not be based on a state that was read in this one.
+        session.host.clear_served()
+        event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.controller
         event.session_data.reason = reason
-        # The simulation learns from a command that the session is over; it is new, for it belongs to no session.
-        self._commander.session = self._journal.session = ""
-        self._commander.say()
-        self._journal.tell(event)
-        self._outlet.sessions_changed()
+        # This command tells the simulation that the session has ended. It is a new one, because it has no session.
+        self._commands.session = self._events.session = ""
+        self._commands.publish_internal()
+        self._events.emit(event)
+        self._output.sessions_changed()
 
     def _trip(self, silent_ns: int, now_ns: int) -> None:
-        self._commander.zero()
-        self._commander.say()
+        self._commands.zero()
+        self._commands.publish_internal()
         holder = self.lease.holder
         if holder is None:
-            why = f"{self._last_writer} is gone"
+            cause = f"{self._last_writer} no longer holds the lease"
         elif now_ns - holder.last_request_ns >= self.watchdog.timeout_ns:
-            why = f"{holder.address} is silent"
+            cause = f"{holder.address} sends no requests"
         else:
-            why = f"{holder.address} reads but does not write"
-        text = f"torque to zero: {why}, no write for {silent_ns // MS} ms"
-        event = self._journal.event(Event.WATCHDOG_TRIP, Event.WARNING, text)
+            cause = f"{holder.address} reads but does not write"
+        text = (
+            f"watchdog of {self._rig} tripped: no write for {silent_ns // MS} ms, torque set to zero: {cause}; "
+            "the next write re-arms it"
+        )
+        event = self._events.event(Event.WATCHDOG_TRIP, Event.WARNING, text)
         event.watchdog_data.silent_ns = silent_ns
         event.watchdog_data.timeout_ns = self.watchdog.timeout_ns
-        self._journal.tell(event)
+        self._events.emit(event)
 
     def _watch(self) -> None:
         deadline_ns = self.watchdog.deadline_ns
         if deadline_ns is not None:
-            self._outlet.watch(deadline_ns)
+            self._output.watch(deadline_ns)

@@ -1,1 +1,1 @@
-"""Impairment of a rig's control loop: the random model, delay lines, schedules and their controller."""
+"""Network impairment emulation: the random model, delay lines and schedules."""

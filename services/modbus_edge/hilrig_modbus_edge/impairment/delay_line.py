@@ -1,104 +1,105 @@
-"""Messages on an impaired way: each has its time of arrival, and the newest wins, as among datagrams.
+"""Delay lines: messages of an impaired link, delayed and dropped as sampled; the newest delivered message wins.
 
-A message that takes longer than a newer one is overtaken by it and dropped: control has no use for it. So those that
-wait are in the order of their arrival too, and each costs the same however many wait. Pure: time is passed in.
+A message whose delay ends after that of a newer one is superseded and dropped, because control has no use for it. So
+the messages in flight are in the order of their delivery, and each costs the same however many are in flight. Time is
+passed in.
 """
 
 from collections import deque
 from collections.abc import Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 
 T = TypeVar("T")
-Fates = Iterator[tuple[int, bool]]
-"""Of the messages to come: delay, ns, and whether it is lost (`Impairment.each`)."""
+ImpairmentSamples = Iterator[tuple[int, bool]]
+"""For each message: its delay, ns, and whether it is dropped (`Impairment.samples`)."""
 
 
-class Arrived(NamedTuple, Generic[T]):
-    """A message at the end of its way."""
+class Delivered(NamedTuple, Generic[T]):
+    """A message whose delay has passed."""
 
     item: T
     injected_ns: int
-    """How long it was held up on purpose."""
+    """Injected delay, ns."""
 
 
-class Line(Generic[T]):
-    """One way. Times are ns of the monotonic clock."""
+class DelayLine(Generic[T]):
+    """Delay line of one link. Times are ns of the monotonic clock."""
 
-    def __init__(self, fates: Fates) -> None:
-        self._waiting: deque[tuple[int, int, T]] = deque()
-        self.follow(fates)
+    def __init__(self, samples: ImpairmentSamples) -> None:
+        self._in_flight: deque[tuple[int, int, T]] = deque()
+        self.set_samples(samples)
 
-    def follow(self, fates: Fates) -> None:
-        """Have other fates from now on, and count anew; what is on its way stays so."""
-        self._fates = fates
+    def set_samples(self, samples: ImpairmentSamples) -> None:
+        """Use other samples for the next messages and restart the counters; messages in flight keep their delay."""
+        self._samples = samples
         self.count = 0
-        """Messages that set out."""
+        """Number of messages put into the line."""
         self.lost = 0
-        """Of them, lost on purpose."""
-        self.overtaken = 0
-        """Overtaken: by a newer one, or by what made all of them void."""
+        """Number of messages that the samples dropped."""
+        self.superseded = 0
+        """Number of messages dropped in flight: because a newer one was faster, or by `drop_in_flight`."""
 
     @property
     def next_ns(self) -> int | None:
-        """When the next one arrives; None: none is on its way."""
-        return self._waiting[0][0] if self._waiting else None
+        """Time at which the next message is due; None: none is in flight."""
+        return self._in_flight[0][0] if self._in_flight else None
 
     def put(self, item: T, now_ns: int) -> bool:
-        """Let a message set out; False: it is lost."""
-        delay_ns, lost = next(self._fates)
+        """Put a message into the line; return False if it is dropped."""
+        delay_ns, lost = next(self._samples)
         self.count += 1
         if lost:
             self.lost += 1
             return False
         release_ns = now_ns + delay_ns
-        waiting = self._waiting
-        while waiting and waiting[-1][0] > release_ns:
-            waiting.pop()
-            self.overtaken += 1
-        waiting.append((release_ns, delay_ns, item))
+        in_flight = self._in_flight
+        while in_flight and in_flight[-1][0] > release_ns:
+            in_flight.pop()
+            self.superseded += 1
+        in_flight.append((release_ns, delay_ns, item))
         return True
 
-    def take(self, now_ns: int) -> Arrived[T] | None:
-        """The next one that has arrived; None: there is none."""
-        if not self._waiting or self._waiting[0][0] > now_ns:
+    def pop_due(self, now_ns: int) -> Delivered[T] | None:
+        """Remove and return the next message whose delay has passed; None: none."""
+        if not self._in_flight or self._in_flight[0][0] > now_ns:
             return None
-        _, delay_ns, item = self._waiting.popleft()
-        return Arrived(item, delay_ns)
+        _, delay_ns, item = self._in_flight.popleft()
+        return Delivered(item, delay_ns)
 
-    def take_newest(self, now_ns: int) -> Arrived[T] | None:
-        """The newest one that is on its way, which arrives now: the way is free again; None: there is none."""
-        if not self._waiting:
+    def release_newest(self, now_ns: int) -> Delivered[T] | None:
+        """Deliver the newest message in flight now, and drop the others; None: none is in flight."""
+        if not self._in_flight:
             return None
-        release_ns, delay_ns, item = self._waiting.pop()
-        self.void()
-        return Arrived(item, min(delay_ns, now_ns - (release_ns - delay_ns)))
+        release_ns, delay_ns, item = self._in_flight.pop()
+        self.drop_in_flight()
+        return Delivered(item, min(delay_ns, now_ns - (release_ns - delay_ns)))
 
-    def void(self) -> bool:
-        """Drop all that are on their way; whether there were any."""
-        count = len(self._waiting)
-        self.overtaken += count
-        self._waiting.clear()
+    def drop_in_flight(self) -> bool:
+        """Drop all messages in flight; return whether there were any."""
+        count = len(self._in_flight)
+        self.superseded += count
+        self._in_flight.clear()
         return bool(count)
 
 
-class StateWay:
-    """The states of one rig on their way to the controller: looked at when a register is read, so without timers."""
+class DelayedStates:
+    """Delay line of the states of one rig; evaluated when a register is read, so it needs no timers."""
 
-    def __init__(self, fates: Fates, shown: Arrival | None) -> None:
-        self.line: Line[Arrival] = Line(fates)
-        self._shown = shown
-        self._arrivals: deque[Arrival] = deque()
+    def __init__(self, samples: ImpairmentSamples, initial: TimestampedPayload | None) -> None:
+        self.line: DelayLine[TimestampedPayload] = DelayLine(samples)
+        self._newest = initial
+        self._arrivals: deque[TimestampedPayload] = deque()
         self.arrive = self._arrivals.append
-        """A state came to the edge; called on the bus's thread."""
+        """Add a received state; may be called on the bus's thread."""
 
-    def newest(self, now_ns: int) -> Arrival | None:
-        """The newest state that has come to the end of its way; the same object until the next one has."""
+    def newest(self, now_ns: int) -> TimestampedPayload | None:
+        """Return the newest state whose delay has passed; the same object until there is a newer one."""
         line, arrivals = self.line, self._arrivals
         while arrivals:
             arrival = arrivals.popleft()
             line.put(arrival, arrival.arrived_ns)
-        while (arrived := line.take(now_ns)) is not None:
-            self._shown = arrived.item._replace(injected_ns=arrived.injected_ns)
-        return self._shown
+        while (delivered := line.pop_due(now_ns)) is not None:
+            self._newest = delivered.item._replace(injected_ns=delivered.injected_ns)
+        return self._newest

@@ -1,48 +1,49 @@
-"""Which impairment is in force: as lab.toml and its schedule say, or as set by hand. Pure: time is passed in."""
+"""Selects the impairment that is active: lab.toml, its schedule, or an operator's override. Time is passed in."""
 
 from typing import Literal
 
-from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, Ways
+from hilrig_runtime.config.impairment import ImpairmentConfig, ImpairmentSetting, LinkImpairments
 
-Source = Literal["lab.toml", "schedule", "hand"]
+Source = Literal["lab.toml", "schedule", "override"]
+"""Origin of the active impairment; "override": set by an operator (`hilrig impair`)."""
 
 
-class Course:
-    """The impairment of one rig as time goes on; a schedule runs from the start of each session."""
+class ImpairmentSchedule:
+    """The active impairment of one rig over time; the schedule restarts with each session."""
 
     def __init__(self, lab: ImpairmentConfig) -> None:
         self.source: Source = "lab.toml"
-        """Who said what is in force."""
+        """Origin of the active impairment."""
         self._lab = self._config = lab
         self._setting: ImpairmentSetting = lab
         self._start_ns: int | None = None
         self._next = 0
 
     @property
-    def ways(self) -> Ways:
-        """What is in force."""
-        return self._setting.ways
+    def links(self) -> LinkImpairments:
+        """Active impairment of both links."""
+        return self._setting.links
 
     @property
     def seed(self) -> int:
-        """Its seed."""
+        """Seed of the active impairment."""
         return self._config.seed
 
-    def set_by_hand(self, config: ImpairmentConfig) -> None:
-        """From now on this holds, in the sessions to come too; the lab's schedule rests."""
-        self._begin(config, "hand")
+    def set_override(self, config: ImpairmentConfig) -> None:
+        """Activate an operator's setting, also for later sessions; it replaces the schedule of lab.toml."""
+        self._activate(config, "override")
 
-    def set_as_lab(self) -> None:
-        """What lab.toml says holds again; its schedule goes on with the next session."""
-        self._begin(self._lab, "lab.toml")
+    def clear_override(self) -> None:
+        """Activate the setting of lab.toml again; its schedule restarts with the next session."""
+        self._activate(self._lab, "lab.toml")
 
-    def begin_session(self, now_ns: int) -> None:
-        """A session began, at `now_ns` of the monotonic clock: the schedule starts anew."""
-        self._begin(self._config, "hand" if self.source == "hand" else "lab.toml")
+    def start_session(self, now_ns: int) -> None:
+        """Restart the schedule: a session started at `now_ns`, monotonic clock."""
+        self._activate(self._config, "override" if self.source == "override" else "lab.toml")
         self._start_ns = now_ns
 
     def check(self, now_ns: int) -> bool:
-        """Follow the schedule; whether something else is in force now."""
+        """Apply the schedule entries that are due; return whether the active impairment changed."""
         schedule = self._config.schedule
         before = self._next
         if self._start_ns is None:
@@ -53,7 +54,7 @@ class Course:
             self._next += 1
         return self._next != before
 
-    def _begin(self, config: ImpairmentConfig, source: Source) -> None:
+    def _activate(self, config: ImpairmentConfig, source: Source) -> None:
         self._config = self._setting = config
         self.source = source
         self._start_ns = None

@@ -1,1 +1,1 @@
-"""The Modbus TCP protocol: MBAP frames, PDUs and exception codes."""
+"""Modbus TCP protocol: MBAP framing, functions and exception responses."""

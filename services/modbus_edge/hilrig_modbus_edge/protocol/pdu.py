@@ -1,38 +1,62 @@
-"""The functions of the Modbus application protocol V1.1b3, from the bytes of a request to the bytes of its answer.
+"""Functions of the Modbus application protocol V1.1b3: decode a request, execute it on a device, encode the response.
 
-Each function checks in the order of the specification's state diagrams: is the function known (01), are quantity,
-value and length right (03), does every address exist and may it be written (02), can it be done (04, 06). A block
-write is all or nothing: everything is checked before the first register changes.
+Each function checks in the order of the specification's state diagrams: function code (01), quantity, value and length
+(03), existence and access of every address (02), execution (04, 06). A block write is all or nothing: everything is
+checked before the first register changes.
 """
 
 import struct
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Final
+from typing import Any, Final, Protocol, TypeVar
 
 from pymodbus.constants import DeviceInformation, ExcCodes
 from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
-from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
-from hilrig_modbus_edge.registers.map import Table
+from hilrig_modbus_edge.registers.map import RegisterTable
 
-Handler = Callable[[Device, Client, bytes, int], bytes]
-"""Device, client, request and its arrival (ns, monotonic clock) to the answer."""
+ClientT = TypeVar("ClientT", contravariant=True)
+"""The device's description of a client; the protocol only passes it on."""
+
+
+class DataModel(Protocol[ClientT]):
+    """Coils and registers of a device; each method raises `ModbusError` for a request that it denies."""
+
+    def read_registers(self, client: ClientT, table: RegisterTable, address: int, count: int) -> bytes:
+        """Return registers, big-endian."""
+
+    def read_bits(self, client: ClientT, table: RegisterTable, address: int, count: int) -> int:
+        """Return coils or discrete inputs as a number, the first one least significant."""
+
+    def check_readable(self, address: int, count: int) -> None:
+        """Check that holding registers can be read now."""
+
+    def check_writable(self, address: int, count: int) -> None:
+        """Check that holding registers exist and may be written."""
+
+    def write_registers(self, client: ClientT, address: int, words: bytes, arrived_ns: int) -> None:
+        """Write holding registers, all or none."""
+
+    def write_coil(self, client: ClientT, address: int, on: bool, arrived_ns: int) -> None:
+        """Write a coil."""
+
+
+Handler = Callable[[DataModel[Any], Any, bytes, int], bytes]
+"""Executes a request: device, client, request and its arrival time (ns, monotonic clock) to the response."""
 
 MAX_READ_BITS: Final = 2000
 MAX_WRITE_BITS: Final = 1968
 MAX_READ_REGISTERS: Final = 125
 MAX_WRITE_REGISTERS: Final = 123
 MAX_READ_WRITE_REGISTERS: Final = 121
-"""Quantity limits of the specification; the last is of the written registers in function 23."""
+"""Quantity limits of the specification; the last one is for the written registers of function 23."""
 
-# A name in an enumeration is looked up by a function; what each request asks for is looked up once.
-_HOLDING_REGISTER: Final = Table.HOLDING_REGISTER
-_INPUT_REGISTER: Final = Table.INPUT_REGISTER
+# Looking up an enumeration member is a function call: those that each request needs are looked up once.
+_HOLDING_REGISTER: Final = RegisterTable.HOLDING_REGISTER
+_INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER
 _FUNCTION_SIZE: Final = struct.Struct(">BB")
-_ADDRESS_WORD: Final = struct.Struct(">BHH")
+_ADDRESS_VALUE: Final = struct.Struct(">BHH")
 _ADDRESS_BLOCK: Final = struct.Struct(">BHHB")
 _MASK: Final = struct.Struct(">BHHH")
 _READ_WRITE: Final = struct.Struct(">BHHHHB")
@@ -52,74 +76,74 @@ IDENTITY: Final = {
 """Objects of function 43/14: vendor, product code, revision, product name, model."""
 
 
-def answer(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    """Execute a request's PDU (at least the function code) and give the answer's; a refusal is an answer too."""
+def execute(device: DataModel[ClientT], client: ClientT, request: bytes, arrived_ns: int) -> bytes:
+    """Execute the PDU of a request (at least the function code) and return the PDU of the response."""
     handler = _HANDLERS.get(request[0])
     if handler is None:
-        return exception(request[0], ExcCodes.ILLEGAL_FUNCTION)
+        return exception_response(request[0], ExcCodes.ILLEGAL_FUNCTION)
     try:
         return handler(device, client, request, arrived_ns)
     except ModbusError as error:
-        return exception(request[0], error.code)
+        return exception_response(request[0], error.code)
 
 
-def exception(function: int, code: int) -> bytes:
-    """The answer to a request that can't be done."""
+def exception_response(function: int, code: int) -> bytes:
+    """Return the PDU of an exception response."""
     return bytes((function | 0x80, code))
 
 
-def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_registers(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_REGISTERS)
     table = _HOLDING_REGISTER if function == 0x03 else _INPUT_REGISTER
     return _FUNCTION_SIZE.pack(function, 2 * count) + device.read_registers(client, table, address, count)
 
 
-def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_bits(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_BITS)
-    table = Table.COIL if function == 0x01 else Table.DISCRETE_INPUT
+    table = RegisterTable.COIL if function == 0x01 else RegisterTable.DISCRETE_INPUT
     size = (count + 7) // 8
     return bytes((function, size)) + device.read_bits(client, table, address, count).to_bytes(size, "little")
 
 
-def _write_coil(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    _, address, value = _unpack(_ADDRESS_WORD, request)
+def _write_coil(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+    _, address, value = _unpack(_ADDRESS_VALUE, request)
     if value not in (_ON, _OFF):
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
     device.write_coil(client, address, value == _ON, arrived_ns)
     return request
 
 
-def _write_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    _, address, _ = _unpack(_ADDRESS_WORD, request)
+def _write_register(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+    _, address, _ = _unpack(_ADDRESS_VALUE, request)
     device.write_registers(client, address, request[3:], arrived_ns)
     return request
 
 
-def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_coils(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
     address, count = _block(request, MAX_WRITE_BITS, bits=True)
     if count > 1:
-        # No two coils are neighbours.
+        # No two coils have adjacent addresses.
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
     device.write_coil(client, address, bool(request[6] & 1), arrived_ns)
     return request[:5]
 
 
-def _write_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_registers(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
     address, _ = _block(request, MAX_WRITE_REGISTERS)
     device.write_registers(client, address, request[6:], arrived_ns)
     return request[:5]
 
 
-def _mask_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _mask_register(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
     _, address, and_mask, or_mask = _unpack(_MASK, request)
     device.check_writable(address, 1)
-    now = int.from_bytes(device.read_registers(client, Table.HOLDING_REGISTER, address, 1), "big")
+    now = int.from_bytes(device.read_registers(client, RegisterTable.HOLDING_REGISTER, address, 1), "big")
     value = (now & and_mask) | (or_mask & ~and_mask)
     device.write_registers(client, address, value.to_bytes(2, "big"), arrived_ns)
     return request
 
 
-def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _read_write(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
     if len(request) < _READ_WRITE.size:
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
     _, read, read_count, write, write_count, size = _READ_WRITE.unpack_from(request)
@@ -129,15 +153,15 @@ def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int)
         and size == 2 * write_count == len(request) - _READ_WRITE.size
     ):
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
-    # Both ranges before the state: that an address is wrong is said also where none has come yet.
+    # Both address ranges are checked first: a wrong address is exception 02 even if no state was received yet.
     device.check_writable(write, write_count)
     device.check_readable(read, read_count)
     device.write_registers(client, write, request[_READ_WRITE.size :], arrived_ns)
-    words = device.read_registers(client, Table.HOLDING_REGISTER, read, read_count)
+    words = device.read_registers(client, RegisterTable.HOLDING_REGISTER, read, read_count)
     return bytes((0x17, 2 * read_count)) + words
 
 
-def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _identify(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     if len(request) < 2 or request[1] != _DEVICE_IDENTIFICATION:
         raise ModbusError(ExcCodes.ILLEGAL_FUNCTION)
     if len(request) != 4 or request[2] not in _READ_CODES:
@@ -149,7 +173,7 @@ def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -
         objects = {first: IDENTITY[first]}
     else:
         last = 0x02 if code == DeviceInformation.BASIC else 0x7F
-        # A stream that starts at an object that is not there starts at the first.
+        # A stream access that starts at an unknown object starts at the first object (specification, 6.21).
         start = first if first in IDENTITY and first <= last else 0x00
         objects = {key: text for key, text in IDENTITY.items() if start <= key <= last}
     response = ReadDeviceInformationResponse(code, objects)
@@ -157,20 +181,20 @@ def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -
     return bytes((0x2B,)) + response.encode()
 
 
-def _address_and_count(request: bytes, most: int) -> tuple[int, int, int]:
-    # Too long is as wrong as too short.
-    if len(request) == _ADDRESS_WORD.size:
-        fields: tuple[int, int, int] = _ADDRESS_WORD.unpack(request)
-        if 1 <= fields[2] <= most:
+def _address_and_count(request: bytes, max_count: int) -> tuple[int, int, int]:
+    # A request that is too long is as invalid as one that is too short.
+    if len(request) == _ADDRESS_VALUE.size:
+        fields: tuple[int, int, int] = _ADDRESS_VALUE.unpack(request)
+        if 1 <= fields[2] <= max_count:
             return fields
     raise ModbusError(ExcCodes.ILLEGAL_VALUE)
 
 
-def _block(request: bytes, most: int, *, bits: bool = False) -> tuple[int, int]:
+def _block(request: bytes, max_count: int, *, bits: bool = False) -> tuple[int, int]:
     if len(request) > _ADDRESS_BLOCK.size:
         _, address, count, size = _ADDRESS_BLOCK.unpack_from(request)
         needed = (count + 7) // 8 if bits else 2 * count
-        if 1 <= count <= most and size == needed == len(request) - _ADDRESS_BLOCK.size:
+        if 1 <= count <= max_count and size == needed == len(request) - _ADDRESS_BLOCK.size:
             return address, count
     raise ModbusError(ExcCodes.ILLEGAL_VALUE)
 

@@ -1,1 +1,1 @@
-"""The register map: its definition, value encoding, register contents and export."""
+"""Register map: definition, value encoding, register image and export."""

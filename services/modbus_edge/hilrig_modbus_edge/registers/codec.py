@@ -1,7 +1,7 @@
-"""Between SI units and register words: int16 with a scale for the paper's map, 32-bit floats for the extended one.
+"""Converts between SI units and registers: scaled int16 for the paper's map, 32-bit floats for the extended map.
 
-A word is big-endian; of two words the more significant comes first. What does not fit an int16 saturates at
-±32767, symmetric, and the caller is told.
+A register is big-endian; of two registers the more significant one is first. A value beyond int16 saturates
+symmetrically at ±32767, and the function returns that it did.
 """
 
 import math
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Final
 
 COUNTS_PER_UNIT: Final = (100 * 180 / math.pi, 100 * 180 / math.pi, 100 * 1000.0, 100 * 180 / math.pi)
-"""Counts of a position register for one rad, rad, m, rad."""
+"""Counts of the position registers per rad, rad, m, rad."""
 FULL_SCALE: Final = 32767
 
 _DISPLAY: Final = (180 / math.pi, 180 / math.pi, 1000.0, 180 / math.pi)
@@ -19,45 +19,45 @@ _FLOAT32X4: Final = struct.Struct(">4f")
 
 
 def effort_of(words: bytes | bytearray) -> tuple[float, float, float, float]:
-    """Efforts of four torque registers (8 bytes); N·m, N·m, N, N·m."""
+    """Return the efforts of four torque registers (8 bytes); N·m, N·m, N, N·m."""
     t1, t2, t3, t4 = _INT16X4.unpack(words)
-    # Division gives the float nearest to the decimal fraction that the controller meant.
+    # Division, unlike a factor of 0.001, gives the float nearest to the decimal fraction of the register.
     return t1 / 1000, t2 / 1000, t3 / 1000, t4 / 1000
 
 
 def words_of_effort(effort: Sequence[float]) -> tuple[bytes, bool]:
-    """Four torque registers (8 bytes) of efforts (N·m, N·m, N, N·m), and whether one saturated."""
+    """Return four torque registers (8 bytes) of efforts (N·m, N·m, N, N·m), and whether one saturated."""
     return _saturate([value * 1000 for value in effort])
 
 
 def words_of_position(position: Sequence[float]) -> tuple[bytes, bool]:
-    """Four position registers (8 bytes) of a joint vector (rad, rad, m, rad), and whether one saturated."""
+    """Return four position registers (8 bytes) of a joint vector (rad, rad, m, rad), and whether one saturated."""
     c1, c2, c3, c4 = COUNTS_PER_UNIT
     q1, q2, q3, q4 = position
     q1, q2, q3, q4 = q1 * c1, q2 * c2, q3 * c3, q4 * c4
-    most = FULL_SCALE
-    if -most <= q1 <= most and -most <= q2 <= most and -most <= q3 <= most and -most <= q4 <= most:
-        # Of each rig at each step: what can't saturate takes the short way.
+    limit = FULL_SCALE
+    if -limit <= q1 <= limit and -limit <= q2 <= limit and -limit <= q3 <= limit and -limit <= q4 <= limit:
+        # Fast path without saturation: this runs for each rig at each step.
         return _INT16X4.pack(round(q1), round(q2), round(q3), round(q4)), False
     return _saturate([q1, q2, q3, q4])
 
 
 def position_of(words: bytes | bytearray) -> tuple[float, float, float, float]:
-    """Joint vector (rad, rad, m, rad) of four position registers (8 bytes)."""
+    """Return the joint vector (rad, rad, m, rad) of four position registers (8 bytes)."""
     c1, c2, c3, c4 = COUNTS_PER_UNIT
     n1, n2, n3, n4 = _INT16X4.unpack(words)
     return n1 / c1, n2 / c2, n3 / c3, n4 / c4
 
 
 def floats_of_joints(values: Sequence[float]) -> bytes:
-    """Eight registers (16 bytes) of four joint values or rates in SI: degrees and millimetres (a second)."""
+    """Return eight registers (16 bytes) of four joint values or rates in SI, as ° and mm or °/s and mm/s."""
     u1, u2, u3, u4 = _DISPLAY
     q1, q2, q3, q4 = values
     return floats_of((q1 * u1, q2 * u2, q3 * u3, q4 * u4))
 
 
 def floats_of(values: Sequence[float]) -> bytes:
-    """Eight registers (16 bytes) of four numbers, as they are; what exceeds a 32-bit float becomes infinite."""
+    """Return eight registers (16 bytes) of four unscaled numbers; a number beyond a 32-bit float becomes infinite."""
     try:
         return _FLOAT32X4.pack(*values)
     except OverflowError:
@@ -68,7 +68,7 @@ def _saturate(values: Sequence[float]) -> tuple[bytes, bool]:
     try:
         counts = [round(value) for value in values]
     except (ValueError, OverflowError):
-        # What is no number reads as zero, what is infinite as full scale.
+        # NaN is encoded as zero, infinity as full scale.
         counts = [0 if math.isnan(v) else round(max(-1e6, min(1e6, v))) for v in values]
         return _INT16X4.pack(*map(_clip, counts)), True
     if min(counts) >= -FULL_SCALE and max(counts) <= FULL_SCALE:

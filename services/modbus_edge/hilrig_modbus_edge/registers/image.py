@@ -1,6 +1,6 @@
-"""What one state of the simulation looks like in registers: computed once a state, shown to every reader alike.
+"""Register image of one state of the simulation: computed once per state, served to every client.
 
-A read is answered from one image, so that no 32-bit value is torn and no block mixes two steps.
+A read is served from one image, so that no 32-bit value is torn and no block mixes two steps.
 """
 
 import struct
@@ -8,41 +8,47 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_modbus_edge.device.client import NO_BASIS, Basis
 from hilrig_modbus_edge.registers import codec
 from hilrig_modbus_edge.registers.map import MAP_VERSION, Status
-from hilrig_runtime.messaging.endpoints import Arrival
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState
 
-FRESH_NS: Final = 1_000_000_000
-"""A state that is older says that the simulation, or the way from it, is down."""
+MAX_STATE_AGE_NS: Final = 1_000_000_000
+"""Age of the newest state, ns, from which on the simulation, or the connection to it, counts as down."""
+
+StateRef = tuple[int, int, int, int]
+"""Reference to a state: incarnation of the simulation, step, arrival time at the edge (ns, monotonic clock), and the
+injected delay (ns). The tuple is shared by all clients that were served the same state."""
+
+NO_STATE_REF: Final[StateRef] = (0, 0, 0, 0)
+"""Reference to no state."""
 
 _HEAD: Final = struct.Struct(">HHIIHHHHHH")
 
 
 class StateImage:
-    """The newest state in register form."""
+    """The newest state, encoded as registers."""
 
     def __init__(self) -> None:
-        self.arrival: Arrival | None = None
-        """What it was made from; None: no state has come yet, and all else is zero."""
+        self.arrival: TimestampedPayload | None = None
+        """The received state; None: none so far, and everything else is zero."""
         self.arrived_ns = 0
         self.step = 0
-        self.basis: Basis = NO_BASIS[0]
-        """What a write is based on whose controller was shown this."""
+        self.basis: StateRef = NO_STATE_REF
+        """Reference to the state; writes that are based on it carry it."""
         self.position_words = bytes(8)
         self._message = JointState()
         self._saturated = False
         self._latency_us = 0
         self._floats = b""
 
-    def take(self, arrival: Arrival) -> None:
-        """Make the image of a state that came; a message that is none is left out."""
+    def update(self, arrival: TimestampedPayload) -> None:
+        """Compute the image of a received state; an invalid message is ignored."""
         try:
             message = JointState.FromString(arrival.payload)
         except DecodeError:
             return
-        # Taken as a list at once: to ask a repeated field for its numbers one by one takes twice as long.
+        # Copied into a list: reading the numbers of a repeated field one by one takes twice as long.
         position = message.position[:]
         if not len(position) == len(message.velocity) == len(message.effort) == 4:
             return
@@ -57,12 +63,12 @@ class StateImage:
         self._floats = b""
 
     def status(self, now_ns: int) -> Status:
-        """The bits that the simulation decides; `now_ns` of the monotonic clock."""
+        """Return the status bits that depend on the simulation; ns, monotonic clock."""
         message = self._message
         status = Status(0)
         if self.arrival is None:
             return status
-        if now_ns - self.arrived_ns < FRESH_NS:
+        if now_ns - self.arrived_ns < MAX_STATE_AGE_NS:
             status |= Status.SIMULATION_ALIVE
         if message.safe:
             status |= Status.SIMULATION_SAFE
@@ -79,7 +85,7 @@ class StateImage:
     def input_words(
         self, *, status: int, lease: int, watchdog: int, timeout_ms: int, session: int, age_ms: int
     ) -> bytes:
-        """All input registers, big-endian."""
+        """Return all input registers, big-endian."""
         message = self._message
         if not self._floats:
             self._floats = (

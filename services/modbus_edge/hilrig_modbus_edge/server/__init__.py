@@ -1,1 +1,1 @@
-"""The Modbus TCP server: the listening socket, the event loop, TLS and admission of clients."""
+"""Modbus TCP server: listening sockets, connections, event loop, TLS and admission control."""

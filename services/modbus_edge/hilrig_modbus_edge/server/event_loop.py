@@ -1,8 +1,8 @@
-"""The edge's event loop: asyncio whose selector serves plain Modbus connections itself, with exact timers.
+"""Event loop of the edge: asyncio with a selector that serves plain Modbus connections itself, and exact timers.
 
-asyncio queues a handle for each ready socket, runs it in a context, and asks the transport, then the protocol: as much
-time as a Modbus request takes. Here a ready socket is read and answered inside `select()` (ADR 0027). The receive call
-is ours, which kernel timestamps need.
+asyncio queues a handle for each ready socket, runs it in a context, and calls the transport, then the protocol. This
+takes as much time as a Modbus request. Here a ready socket is read and answered inside `select()` (ADR 0027). The
+transport has its own receive call, which kernel timestamps need.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 class DirectSelector(selectors.DefaultSelector):
-    """Selector of an asyncio event loop that serves sockets inside `select()` (in-selector I/O), with exact time-outs.
+    """Selector of an asyncio event loop that serves sockets inside `select()` (in-selector I/O), with exact timeouts.
 
     A socket that was registered with a function is served by calling it, and the selector keeps waiting. asyncio gets
     only the events of its own sockets, and control when there is work for it.
@@ -41,9 +41,9 @@ class DirectSelector(selectors.DefaultSelector):
     def __init__(self) -> None:
         super().__init__()
         self.asyncio_has_work = False
-        """A callback or timer was given to asyncio since it started to wait: `select` returns to it."""
+        """Whether asyncio got a callback or timer since `select` was called: `select` returns to it."""
         self._callbacks: dict[int, Callable[[int], None]] = {}
-        """Functions of the sockets that are served here, by file descriptor."""
+        """By file descriptor: callback of a socket that is served here."""
         self._poll: Callable[[float | None], _Ready] = _epoll_of(self) if hasattr(select, "epoll") else self._super_poll
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
@@ -69,7 +69,7 @@ class DirectSelector(selectors.DefaultSelector):
         while True:
             for descriptor, mask in poll(timeout):
                 callback = callback_of(descriptor)
-                # Nearly always there is only something to read.
+                # Fast path: nearly all events are read events.
                 events = EVENT_READ if mask == EVENT_READ else _events_of(mask)
                 if callback is not None:
                     callback(events)
@@ -89,12 +89,12 @@ class DirectSelector(selectors.DefaultSelector):
 if hasattr(select, "epoll"):
 
     def _epoll_of(selector: selectors.DefaultSelector) -> Callable[[float | None], _Ready]:
-        """Return a function that waits for events, possibly for less than its time-out.
+        """Return a function that waits for events, possibly for less than its timeout.
 
-        The standard library makes a key of each event, which takes longer than the system call.
+        The standard library creates a key for each event, which takes longer than the system call.
         """
-        # A descriptor of its own for the same set, because it is closed with this object. It is older than those of all
-        # connections, so that `select` can wait for its number.
+        # A duplicate descriptor of the epoll set, because `select.epoll` closes its descriptor. It is older than all
+        # connections, so its number is small enough for `select.select`.
         epoll = select.epoll.fromfd(os.dup(selector.fileno()))
         poll, own_descriptor, wait = epoll.poll, (epoll,), select.select
 
@@ -143,7 +143,7 @@ class DirectEventLoop(asyncio.SelectorEventLoop):
 
 
 class SocketTransport(asyncio.Transport):
-    """Transport of one TCP connection, for an `asyncio.BufferedProtocol` that `set_protocol` names."""
+    """Transport of one TCP connection; its protocol is an `asyncio.BufferedProtocol`, set by `set_protocol`."""
 
     def __init__(self, loop: DirectEventLoop, connected: socket.socket, peer: Any) -> None:
         super().__init__({"socket": connected, "peername": peer})
@@ -197,7 +197,7 @@ class SocketTransport(asyncio.Transport):
         self._update_events()
 
     def resume_reading(self) -> None:
-        """Read again."""
+        """Resume reading."""
         self._reading_enabled = True
         self._update_events()
 
@@ -284,7 +284,7 @@ class SocketTransport(asyncio.Transport):
         self._lost = self._closing = True
         self._send_buffer.clear()
         self._update_events()
-        # Later, as asyncio does it: a caller that closes a connection is not notified within its own call.
+        # In the next turn, as in asyncio: a caller that closes a connection is not notified within its own call.
         self._loop.call_soon(self._notify_connection_lost, error)
 
     def _notify_connection_lost(self, error: Exception | None) -> None:
@@ -298,14 +298,19 @@ class SocketTransport(asyncio.Transport):
 async def accept_connections(
     loop: DirectEventLoop, listening: socket.socket, on_accept: Callable[[SocketTransport], None]
 ) -> None:
-    """Pass each accepted connection to `on_accept`, until cancelled."""
+    """Pass each accepted connection to `on_accept`, until the task is canceled."""
     listening.setblocking(False)
     while True:
         try:
             connected, peer = await loop.sock_accept(listening)
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
-            logger.warning("connection not accepted on %s: %s", listening.getsockname(), error)
+            logger.warning(
+                "can't accept a connection on %s: %s; retrying in %g s",
+                listening.getsockname(),
+                error,
+                ACCEPT_RETRY_S,
+            )
             await asyncio.sleep(ACCEPT_RETRY_S)
             continue
         on_accept(SocketTransport(loop, connected, peer))

@@ -1,7 +1,7 @@
-"""Modbus/TCP Security: TLS with certificates on both sides, and what a client's role lets it do.
+"""Modbus/TCP Security: mutual TLS, and authorization by the role in the client's certificate.
 
-MODBUS/TCP Security Protocol Specification: TLS 1.2 or newer, mutual authentication, the role from the certificate;
-a write that the role does not allow gets exception 01.
+MODBUS/TCP Security Protocol Specification: TLS 1.2 or newer, mutual authentication, role from the certificate; a write
+that the role does not permit gets exception 01.
 """
 
 import asyncio
@@ -19,61 +19,62 @@ from hilrig_modbus_edge.server.admission import Admission
 from hilrig_runtime.config.lab import TlsConfig
 from hilrig_runtime.errors import InputError
 
-Right = Literal["operator", "observer", "refuse"]
+Role = Literal["operator", "observer", "refuse"]
+"""Permission of a client: write and read, read only, or no connection."""
 
 Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
-"""Serve a controller: its transport, host and port, whether it may write, and what it has sent already."""
+"""Serves a client: its transport, host and port, whether it may write, and the data that it has already sent."""
 
 HANDSHAKE_TIMEOUT_S: Final = 5.0
-"""How long a client may take to begin TLS, and to end it."""
+"""Timeout of the TLS handshake and of the TLS shutdown, s."""
 
-_HUNG_UP: Final = "it closed the connection before it was secured"
+_CLOSED_EARLY: Final = "the client closed the connection during the handshake"
 
 logger = logging.getLogger(__name__)
 
 
 class TlsPolicy:
-    """The edge's side of every handshake of a lab.
+    """TLS context of the edge, and the mapping of client certificates to roles.
 
-    Raises `InputError` where a file can't be used; it names the file and its key in lab.toml.
+    Raises `InputError` if a file cannot be used; the message has the file and its key in lab.toml.
     """
 
     def __init__(self, tls: TlsConfig) -> None:
-        # An edge without TLS does not load what reads certificates.
+        # Imported here: an edge without TLS does not load the certificate library.
         from hilrig_runtime.security.x509 import role_of
 
         self._role_of = role_of
-        self._no_role: Right = tls.no_role
+        self._no_role: Role = tls.no_role
         self.context = context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.verify_mode = ssl.CERT_REQUIRED
-        # A new handshake costs the edge more than who asks for it.
+        # A renegotiation costs the edge more than the client that requests it.
         context.options |= ssl.OP_NO_RENEGOTIATION
         _check_readable("certificate", tls.certificate)
         _check_readable("key", tls.key)
         _check_readable("authority", tls.authority)
         try:
-            # Not told what to do, the library asks for a password at the terminal, and a service waits for ever.
-            context.load_cert_chain(tls.certificate, tls.key, password=partial(_has_no_password, tls.key))
+            # Without a password callback, OpenSSL prompts at the terminal, and a service would wait forever.
+            context.load_cert_chain(tls.certificate, tls.key, password=partial(_reject_encrypted, tls.key))
         except (ssl.SSLError, OSError) as error:
             raise InputError(
-                f"edge.tls: {tls.certificate} and {tls.key} are no certificate with its key (PEM): {error}"
+                f"edge.tls: certificate {tls.certificate} and key {tls.key} do not match or are not PEM files: {error}"
             ) from error
         _warn_if_exposed(tls.key)
         try:
             context.load_verify_locations(tls.authority)
         except (ssl.SSLError, OSError) as error:
-            raise InputError(f"edge.tls.authority: {tls.authority} holds no certificates (PEM): {error}") from error
+            raise InputError(f"edge.tls.authority: {tls.authority} contains no PEM certificates: {error}") from error
 
-    def right_of(self, certificate_der: bytes) -> Right:
-        """What a client with this certificate may do: write, read only, or nothing."""
+    def role_of(self, certificate_der: bytes) -> Role:
+        """Return the role of a client with this certificate."""
         role = self._role_of(certificate_der)
-        # A role that this lab does not know is none.
+        # An unknown role counts as no role.
         return "operator" if role == "operator" else "observer" if role == "observer" else self._no_role
 
 
-class TlsGate(asyncio.Protocol):
-    """A connection before its handshake is done; `serve` gets it afterwards, with what it may do and sent already."""
+class TlsHandshake(asyncio.Protocol):
+    """A connection during its TLS handshake; `serve` is called with the secured connection."""
 
     _transport: asyncio.Transport
 
@@ -92,44 +93,48 @@ class TlsGate(asyncio.Protocol):
         peer = self._admission.admit(transport)
         if peer is not None:
             self.host = peer[0]
-            self._admission.gates.add(self)
-            self._task = asyncio.get_running_loop().create_task(self._pass(*peer))
+            self._admission.pending_handshakes.add(self)
+            self._task = asyncio.get_running_loop().create_task(self._complete(*peer))
 
     def data_received(self, data: bytes) -> None:
-        """Keep what comes right behind the handshake; see `asyncio.Protocol`."""
+        """Keep data that follows the handshake at once; see `asyncio.Protocol`."""
         self._early += data
 
     def close(self) -> None:
-        """See `Gate.close`."""
+        """See `PendingHandshake.close`."""
         if self._task is not None:
             self._task.cancel()
         self._transport.abort()
 
-    async def _pass(self, host: str, port: int) -> None:
+    async def _complete(self, host: str, port: int) -> None:
         try:
-            secured = await self._shake_hands()
+            secured = await self._do_handshake()
         except (OSError, TimeoutError) as error:
-            self._admission.refuse(host, port, f"no TLS: {_reason(error)}")
+            self._admission.refuse(host, port, f"TLS handshake failed: {_reason(error)}")
             self._transport.abort()
             return
         finally:
-            self._admission.gates.discard(self)
+            self._admission.pending_handshakes.discard(self)
         secret: ssl.SSLObject | None = None if secured is None else secured.get_extra_info("ssl_object")
         if secured is None or secret is None or secret.version() is None:
-            # asyncio raises nothing where a peer hangs up in the middle.
-            self._admission.refuse(host, port, f"no TLS: {_HUNG_UP}")
+            # asyncio raises no exception if the peer disconnects during the handshake.
+            self._admission.refuse(host, port, f"TLS handshake failed: {_CLOSED_EARLY}")
             self._transport.abort()
             return
         if secured.is_closing():
             return
-        right = self._policy.right_of(secret.getpeercert(binary_form=True) or b"")
-        if right == "refuse":
-            self._admission.refuse(host, port, "its certificate names no role that this lab knows")
+        role = self._policy.role_of(secret.getpeercert(binary_form=True) or b"")
+        if role == "refuse":
+            self._admission.refuse(
+                host,
+                port,
+                "its certificate has no role that may connect; use a certificate with the role operator or observer",
+            )
             secured.abort()
             return
-        self._serve(secured, host, port, right == "operator", bytes(self._early))
+        self._serve(secured, host, port, role == "operator", bytes(self._early))
 
-    async def _shake_hands(self) -> asyncio.Transport | None:
+    async def _do_handshake(self) -> asyncio.Transport | None:
         loop, context = asyncio.get_running_loop(), self._policy.context
         return await loop.start_tls(
             self._transport,
@@ -143,31 +148,33 @@ class TlsGate(asyncio.Protocol):
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not accepted: {error.verify_message}"
+        return f"the client certificate was rejected: {error.verify_message}"
     if isinstance(error, ssl.SSLError):
-        # Where the library has no reason, its text has a code in front and a line of its own source behind.
+        # Without a reason, the text of the library starts with a code and ends with a line of its source.
         return re.sub(r"^\[.*?] |\(_ssl.*$", "", error.reason or str(error)).strip().lower().replace("_", " ")
     if isinstance(error, ConnectionResetError | BrokenPipeError):
-        return _HUNG_UP
-    return str(error) or "the handshake took too long"
+        return _CLOSED_EARLY
+    return str(error) or f"no completed handshake within {HANDSHAKE_TIMEOUT_S:g} s"
 
 
-def _has_no_password(key: Path) -> str:
+def _reject_encrypted(key: Path) -> str:
     raise InputError(
-        f"edge.tls.key: {key} is encrypted, and there is nobody to ask for its password; write it without one: "
+        f"edge.tls.key: {key} is encrypted, and a service cannot ask for the password; save it without a password: "
         f"openssl pkey -in {key} -out rig.key, then chmod 600 rig.key"
     )
 
 
 @cache
 def _warn_if_exposed(key: Path) -> None:
-    """Say, once, that whoever has an account here can read a key."""
+    """Log once that every user of this host can read the key."""
     if os.name == "posix" and key.stat().st_mode & stat.S_IROTH:
-        logger.warning("edge.tls.key: everybody on this machine can read %s; chmod 600 %s", key, key)
+        logger.warning("edge.tls.key: every user of this host can read %s; run: chmod 600 %s", key, key)
 
 
 def _check_readable(name: str, path: Path) -> None:
     try:
         path.read_bytes()
     except OSError as error:
-        raise InputError(f"edge.tls.{name}: {path} can't be read: {error.strerror}; hilrig certs makes one") from error
+        raise InputError(
+            f"edge.tls.{name}: {path} can't be read: {error.strerror}; create it with hilrig certs"
+        ) from error

@@ -1,1 +1,1 @@
-"""The SCARA arm: parameters, kinematics, dynamics, integration methods and the URDF."""
+"""SCARA arm: parameters, kinematics, dynamics, integration methods and URDF."""

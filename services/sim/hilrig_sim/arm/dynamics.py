@@ -1,6 +1,6 @@
-"""The reduced closed form of the arm's dynamics, for any number of rigs at once.
+"""Reduced closed-form dynamics of the arm, for any number of rigs at once.
 
-Point masses at the distal ends (17)–(19), viscous friction (33)–(39), the environment's wrench and a payload. With
+Point masses at the distal ends (17)–(19), viscous friction (33)–(39), the wrench of the environment and a payload. With
 w1 = θ̇1 and w2 = θ̇1 + θ̇2, the speeds of the two links in the world, equations (25)–(31) become
 
     I1·ẇ1 + p·ẇ2 = Q1,   Q1 = (τ1 − b1θ̇1) − (τ2 − b2θ̇2) + l2 l3 M sinθ2 · w2²
@@ -9,11 +9,11 @@ w1 = θ̇1 and w2 = θ̇1 + θ̇2, the speeds of the two links in the world, equ
 with I1 = l2²(m1+M), A22 = M l3², p = l2 l3 M cosθ2: the same model in fewer operations. Joints 3 and 4 are (32) and
 decision 2 of docs/model.md.
 
-Vectors are (rows, rigs): one row a quantity, so that each operation runs along contiguous memory, and a rig's numbers
-do not depend on how many stand beside it. Nothing is allocated in a step, and no BLAS is used: its sums depend on
-the shape. Operands have one shape wherever that is cheap: numpy takes twice as long for a few numbers to be broadcast.
-Results go where no operand is: an array of one element that overlaps its own result is copied first, and a single
-rig's step would take half as long again.
+Vectors are (rows, rigs), one row per quantity, so that each operation runs along contiguous memory, and the result of
+a rig does not depend on the number of rigs. A step allocates no memory and uses no BLAS: its sums depend on the shape.
+Operands have the same shape where that is cheap: for small arrays, broadcasting doubles the time of a numpy operation.
+No result overlaps an operand: numpy would copy an array of one element first, and the step of a single rig would take
+50 % longer.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 STAGE_ROWS: Final = 5
-"""What the right-hand side depends on: the four joint velocities, and θ2."""
+"""Number of quantities that the right-hand side depends on: four joint velocities and θ2."""
 
 
 class StageViews(NamedTuple):
-    """Views into a stage's state and its rates, made once: slicing in the step would cost as much as the sums."""
+    """Views of the state of a stage and its rates, created once: slicing in the step would double its time."""
 
     velocity: Floats
     v1: Floats
@@ -45,12 +45,12 @@ class StageViews(NamedTuple):
 
 
 def stage_views(state: Floats, rates: Floats) -> StageViews:
-    """Views of a stage: `state` is (5, N) with rows θ̇1, θ̇2, ḋ3, θ̇4, θ2; `rates` (5, N) gets their derivatives."""
+    """Return views of a stage: `state`, (5, N), has rows θ̇1, θ̇2, ḋ3, θ̇4, θ2; `rates`, (5, N), their derivatives."""
     return StageViews(state[:4], state[0], state[1], state[4], rates[0], rates[1], rates[2:4], rates[4])
 
 
 class _Coefficients(NamedTuple):
-    """What the equations of the two links are formed with."""
+    """Coefficients of the equations of the two links."""
 
     coupling_twice: Floats
     """l2 l3 M, for cosθ2 and for sinθ2, (2, N)."""
@@ -59,11 +59,11 @@ class _Coefficients(NamedTuple):
     product: Floats
     """I1 A22, (N,)."""
     p_where_held: Floats | None = None
-    """Added to p = l2 l3 M cosθ2, (N,)."""
+    """Added to p = l2 l3 M cosθ2 where a joint is held, (N,)."""
 
 
 class ReducedDynamics:
-    """The reduced model of N rigs; `payload` changes when a magnet picks or drops."""
+    """Reduced model of N rigs; the payload changes when a magnet picks or releases a part."""
 
     def __init__(self, arms: Sequence[ArmParameters]) -> None:
         count = len(arms)
@@ -75,21 +75,21 @@ class ReducedDynamics:
         self.friction = np.array([arm.friction for arm in arms]).T.copy()
         self.force_z = np.array([arm.external_force_z for arm in arms])
         self.torque_z = np.array([arm.external_torque_z for arm in arms])
-        # What a change of payload changes.
+        # Quantities that depend on the payload.
         self._coupling_twice = np.empty((2, count))
         self.coupling = self._coupling_twice[0]
         """l2 l3 M, kg·m², (N,)."""
         self.inertia = np.empty((2, count))
-        """A22 = M l3², I1 = l2²(m1+M): each multiplies the other link's equation."""
+        """A22 = M l3², I1 = l2²(m1+M): each is a factor of the other link's equation."""
         self._a22, self._i1 = self.inertia
         self._free = _Coefficients(self._coupling_twice, self.inertia, np.empty(count))
         self._inverse34 = np.empty((2, count))
         self._offset = np.empty((4, count))
-        """What acts besides the efforts and the motion: the environment and gravity."""
+        """Forces and torques of environment and gravity."""
         self._acting = self._holding = self._free
         self._held_key = b""
-        """What `_holding` was found for; a rig pressed onto a stop stays there for many steps."""
-        # Scratch of one evaluation.
+        """Arguments that `_holding` was computed for; a joint stays pressed against a stop for many steps."""
+        # Scratch memory of one evaluation.
         self._force = np.empty((4, count))
         self._force1, self._force2, self._force34 = self._force[0], self._force[1], self._force[2:4]
         self._cos_sin = np.empty((2, count))
@@ -113,13 +113,13 @@ class ReducedDynamics:
 
     @classmethod
     def of(cls, arm: ArmParameters, payload: float = 0.0) -> Self:
-        """The model of a single rig that holds `payload`, kg."""
+        """Return the model of a single rig with a payload, kg."""
         model = cls([arm])
         model.set_payload(np.array([payload]))
         return model
 
     def set_payload(self, payload: Floats) -> None:
-        """Let the magnets hold m4 = `payload`, kg, (N,)."""
+        """Set the mass of the held parts, m4 = `payload`, kg, (N,)."""
         mass = self.m2 + self.m3 + payload
         mass3 = self.m3 + payload
         self.payload = payload.copy()
@@ -136,14 +136,14 @@ class ReducedDynamics:
         self._offset[3] = self.torque_z
 
     def release(self) -> None:
-        """Let all joints move."""
+        """Release all held joints."""
         self._acting = self._free
 
     def hold(self, held1: Bools, held2: Bools, theta2: Floats) -> None:
-        """Let joints 1 and 2 not accelerate where they are held on a stop, (N,) each, with θ2 as it is there, (N,).
+        """Hold joints 1 and 2 without acceleration where they are pressed against a stop, (N,) each, at θ2, (N,).
 
-        The equations stay; their coefficients become others where a joint is held. With θ1 held, A22·ẇ2 = Q2 is left;
-        with θ2 held both links turn as one body, α θ̈1 = Q1 + Q2 with α = I1 + 2p + A22; θ2 and so p do not change.
+        The equations have the same form with other coefficients. With θ1 held, they reduce to A22·ẇ2 = Q2. With θ2
+        held, both links rotate as one body, α θ̈1 = Q1 + Q2 with α = I1 + 2p + A22; θ2 and p are constant.
         """
         key = held1.tobytes() + held2.tobytes() + np.where(held2, theta2, 0.0).tobytes()
         if key != self._held_key:
@@ -156,7 +156,7 @@ class ReducedDynamics:
         any_held = held1 | held2
         alpha = self._i1 + 2 * (np.cos(theta2) * self.coupling) + self._a22
         # ẇ1 = (A Q1 - p Q2) / (product - p²), ẇ2 = (I Q2 - p Q1) / (product - p²), with A, I, p and product chosen such
-        # that what is held comes out as zero to the last bit.
+        # that the acceleration of a held joint is exactly zero.
         inertia = np.where(only2, alpha, np.where(any_held, 0.0, self.inertia))
         inertia[1][only1] = 1.0
         coupling = self._coupling_twice.copy()
@@ -166,14 +166,14 @@ class ReducedDynamics:
         return _Coefficients(coupling, inertia, product, np.where(only2, -alpha, 0.0))
 
     def drive(self, effort: Floats, out: Floats) -> None:
-        """All that acts on the joints apart from their motion, (4, N), from the efforts, (4, N)."""
+        """Compute the forces and torques that do not depend on the motion, (4, N), from the efforts, (4, N)."""
         np.add(effort, self._offset, out=out)
 
     def rates(
         self,
         stage: StageViews,
         drive: Floats,
-        # Bound here: a name of the module and its attribute cost a look-up each, 130 times a step.
+        # Default arguments are local names: module attributes would cost two lookups each, 130 times per step.
         add: Any = np.add,
         subtract: Any = np.subtract,
         multiply: Any = np.multiply,
@@ -181,7 +181,7 @@ class ReducedDynamics:
         cos: Any = np.cos,
         sin: Any = np.sin,
     ) -> None:
-        """Derivatives of a stage's state into its `rates`, (25)–(32), (38), (39); `drive` is (4, N)."""
+        """Compute the derivatives of a stage into its `rates`, (25)–(32), (38), (39); `drive` is (4, N)."""
         velocity, v1, v2, theta2, a1, a2, a34, theta2_rate = stage
         force, force1, force2, force34 = self._force, self._force1, self._force2, self._force34
         cos_sin, p, ps, q1, q2 = self._cos_sin, self._cos, self._sin, self._q1, self._q2
@@ -218,12 +218,12 @@ class ReducedDynamics:
         theta2_rate[:] = v2
 
     def mass_matrix_12(self, theta2: Floats) -> tuple[Floats, Floats, Floats]:
-        """Elements α = a11 + a12, a12, a22 of the mass matrix of joints 1 and 2, kg·m², (N,) each, (25)–(27)."""
+        """Return elements α = a11 + a12, a12, a22 of the mass matrix of joints 1 and 2, kg·m², (N,) each, (25)–(27)."""
         p = self.coupling * np.cos(theta2)
         return self._i1 + 2 * p + self._a22, p + self._a22, self._a22
 
     def kinetic_energy(self, theta2: Floats, velocity: Floats) -> Floats:
-        """½ q̇ᵀ M q̇ of each rig, J, (N,), from θ2 (N,) and the joint velocities (4, N)."""
+        """Return ½ q̇ᵀ M q̇ of each rig, J, (N,), from θ2, (N,), and the joint velocities, (4, N)."""
         alpha, a12, a22 = self.mass_matrix_12(theta2)
         v1, v2, v3, v4 = velocity
         plane = alpha * v1 * v1 + 2 * a12 * v1 * v2 + a22 * v2 * v2
@@ -231,7 +231,7 @@ class ReducedDynamics:
 
 
 def mass_matrix(arm: ArmParameters, theta2: float, payload: float = 0.0) -> Floats:
-    """Mass matrix M(q), (4, 4); kg·m², kg·m², kg, kg·m² on its diagonal."""
+    """Return the mass matrix M(q), (4, 4); diagonal in kg·m², kg·m², kg, kg·m²."""
     alpha, a12, a22 = ReducedDynamics.of(arm, payload).mass_matrix_12(np.array([theta2]))
     matrix = np.zeros((4, 4))
     matrix[:2, :2] = [[alpha[0], a12[0]], [a12[0], a22[0]]]
@@ -243,7 +243,7 @@ def mass_matrix(arm: ArmParameters, theta2: float, payload: float = 0.0) -> Floa
 def forward_dynamics(
     arm: ArmParameters, position: Floats, velocity: Floats, effort: Floats, payload: float = 0.0
 ) -> Floats:
-    """Joint accelerations q̈, (4,), from position, velocity and effort, (4,) each, SI units, away from all stops."""
+    """Return the joint accelerations q̈, (4,), from position, velocity and effort, (4,) each, SI, away from stops."""
     model = ReducedDynamics.of(arm, payload)
     state = np.concatenate([velocity, position[1:2]])[:, np.newaxis]
     rates = np.empty_like(state)

@@ -1,7 +1,7 @@
-"""Fixed-step Runge–Kutta methods as tables, with their limits of stability; the variable-step reference by scipy.
+"""Explicit fixed-step Runge–Kutta methods as Butcher tables with stability limits, and a variable-step reference.
 
-The real-time method is Runge–Kutta–Fehlberg with a fixed step: the fifth-order solution goes on, and the fourth-order
-one beside it says how far off the step may be. A table is all that distinguishes the methods; `plant` applies it.
+The default real-time method is Runge–Kutta–Fehlberg with a fixed step: the fifth-order solution is used, and the
+embedded fourth-order solution gives an error estimate. The methods differ in their table only; `stepping` applies it.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Tableau:
-    """A Butcher table of an explicit method with s stages."""
+    """Butcher table of an explicit method with s stages."""
 
     name: str
     a: tuple[tuple[float, ...], ...]
-    """Row i has the i coefficients of the stages before it."""
+    """Row i has the i coefficients of the previous stages."""
     b: tuple[float, ...]
     """Weights of the solution, s."""
     embedded: tuple[float, ...] | None = None
@@ -29,18 +29,18 @@ class Tableau:
 
     @property
     def stages(self) -> int:
-        """Evaluations of the right-hand side in a step."""
+        """Number of evaluations of the right-hand side per step."""
         return len(self.b)
 
     @property
     def error_weights(self) -> tuple[float, ...]:
-        """b less the embedded weights; zeros where there are none."""
+        """b minus the embedded weights; zeros without embedded solution."""
         if self.embedded is None:
             return (0.0,) * self.stages
         return tuple(b - e for b, e in zip(self.b, self.embedded, strict=True))
 
     def negative_real_limit(self, weights: tuple[float, ...] | None = None) -> float:
-        """Largest |hλ| on the negative real axis up to which the method is stable, for other weights if given.
+        """Return the stability limit |hλ| on the negative real axis; `weights`: other weights than b.
 
         The stability function of an explicit method is the polynomial 1 + Σ z^k bᵀA^(k-1)1; the limit is the
         first x > 0 where |R(-x)| = 1.
@@ -89,13 +89,13 @@ TABLEAUS: Final = {table.name: table for table in (EULER, RK4, RKF45)}
 def reference_solution(
     derivative: Callable[[float, Floats], Floats], start: Floats, times: Floats, *, breaks: tuple[float, ...] = ()
 ) -> Floats:
-    """Dormand–Prince of order 8 with a variable step (scipy's DOP853), accurate to about 1e-10.
+    """Solve an initial value problem with scipy's variable-step DOP853 (order 8), accurate to about 1e-10.
 
     Args:
         derivative: right-hand side f(t, y).
         start: y at times[0], (n,).
-        times: where the solution is wanted, ascending, s, (m,).
-        breaks: times at which the right-hand side jumps: no step goes across one.
+        times: times of the solution, ascending, s, (m,).
+        breaks: times at which the right-hand side is discontinuous: no step crosses one.
 
     Returns:
         y at `times`, (n, m).
@@ -106,15 +106,15 @@ def reference_solution(
     result = np.empty((start.size, times.size))
     y = np.asarray(start, dtype=np.float64)
     for begin, end in pairwise(edges):
-        # The right-hand side of a piece is that of its inside, also at its two ends.
+        # At its two ends, an interval uses the right-hand side of its interior.
         margin = 1e-12 * max(1.0, end)
 
         def inside(t: float, y: Floats, begin: float = begin + margin, end: float = end - margin) -> Floats:
             return derivative(min(max(t, begin), end), y)
 
         within = (times >= begin) & (times <= end)
-        piece = solve_ivp(inside, (begin, end), y, method="DOP853", rtol=1e-10, atol=1e-13, dense_output=True)
-        assert piece.sol is not None
-        result[:, within] = piece.sol(times[within])
-        y = piece.y[:, -1]
+        interval = solve_ivp(inside, (begin, end), y, method="DOP853", rtol=1e-10, atol=1e-13, dense_output=True)
+        assert interval.sol is not None
+        result[:, within] = interval.sol(times[within])
+        y = interval.y[:, -1]
     return result

@@ -1,7 +1,7 @@
-"""The parameters of a rig in SI units: what a simulation, a picture and a judge need to know of it.
+"""Parameters of a rig in SI units, for simulation, visualization and grading.
 
-They come from the laboratory's configuration, travel as JSON in `RigConfig.parameters_json`, and are read back from
-a recording exactly as they were.
+They are computed from the lab's configuration, published as JSON in `RigConfig.parameters_json`, and read from a
+recording without loss.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from hilrig_runtime.errors import InputError
 GRAVITY: Final = 9.81
 """m/s², as in the paper (20)."""
 LARGEST_REGISTER_FORCE: Final = 32.767
-"""What the paper's force register can ask for, N."""
+"""Largest force in the paper's force register, N."""
 LARGEST_EFFORT: Final = 32.768
-"""What the drives give at most, N·m or N: all that a register can ask for, either way."""
+"""Largest effort of the drives, N·m or N: the absolute limit of a torque register."""
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -25,18 +25,18 @@ Vector4 = tuple[float, float, float, float]
 
 JOINT_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
 JOINT_SCALE: Final = (math.degrees(1.0), math.degrees(1.0), 1e3, math.degrees(1.0))
-"""From rad and m to the degrees and mm that people read."""
+"""Factors from rad and m to the displayed ° and mm."""
 
 
 def _positive(**values: float) -> None:
     for name, value in values.items():
         if not (value > 0 and math.isfinite(value)):
-            raise InputError(f"the arm's {name} must be a positive number, found {value!r}")
+            raise InputError(f"the arm's {name} must be a positive number, got {value!r}")
 
 
 @dataclass(frozen=True, slots=True)
 class ArmParameters:
-    """The arm (docs/model.md); point masses at the distal ends of the links (17)–(19)."""
+    """Parameters of the arm (docs/model.md); point masses at the distal ends of the links (17)–(19)."""
 
     l1: float = 0.139
     """Height of the arm's plane above the base plane, m."""
@@ -57,9 +57,9 @@ class ArmParameters:
     start: Vector4 = (0.0, 0.0, 0.0, 0.0)
     """Start pose; rad, rad, m, rad."""
     external_force_z: float = 0.0
-    """f_z, the environment on the tool, world z up, N."""
+    """f_z, force of the environment on the tool, along world z, N."""
     external_torque_z: float = 0.0
-    """n_z, the same about world z, N·m."""
+    """n_z, torque of the environment on the tool, about world z, N·m."""
 
     def __post_init__(self) -> None:
         _positive(l1=self.l1, l2=self.l2, l3=self.l3, j4=self.j4)
@@ -67,17 +67,17 @@ class ArmParameters:
             _positive(**{name: mass})
         for name, coefficient in zip(("b1", "b2", "b3", "b4"), self.friction, strict=True):
             if not (coefficient >= 0 and math.isfinite(coefficient)):
-                raise InputError(f"the arm's {name} must be a number not below 0, found {coefficient!r}")
+                raise InputError(f"the arm's {name} must be a number ≥ 0, got {coefficient!r}")
         for name, low, high, start in zip(JOINT_NAMES, self.lower, self.upper, self.start, strict=True):
             if not low < high:
-                raise InputError(f"the arm's {name}: its lower limit {low:g} is not below its upper limit {high:g}")
+                raise InputError(f"the arm's {name}: the lower limit {low:g} must be below the upper limit {high:g}")
             if not low <= start <= high:
-                raise InputError(f"the arm's {name}: its start {start:g} is not within {low:g} to {high:g}")
+                raise InputError(f"the arm's {name}: the start {start:g} must be within {low:g} to {high:g}")
 
 
 @dataclass(frozen=True, slots=True)
 class PartParameters:
-    """A part, and where it stands at the start."""
+    """A part and its start pose."""
 
     name: str
     shape: str
@@ -90,9 +90,9 @@ class PartParameters:
     colour: str
     """#rrggbb."""
     position: Vector3
-    """Its centre, world, m."""
+    """Center, world, m."""
     yaw: float
-    """About world z, rad."""
+    """Angle about world z, rad."""
 
     @property
     def radius(self) -> float:
@@ -108,18 +108,18 @@ class TrayParameters:
     size: Vector3
     """Length, width, height, m."""
     position: Vector3
-    """Centre of its bottom, world, m."""
+    """Center of the bottom, world, m."""
     yaw: float
-    """About world z, rad."""
+    """Angle about world z, rad."""
     colour: str
     """#rrggbb."""
     places: tuple[Vector3, ...]
-    """Where the bottoms of parts belong, world, m."""
+    """Target positions for the bottoms of parts, world, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneParameters:
-    """What stands around the arm."""
+    """Objects around the arm."""
 
     table_height: float = -0.060
     """World z of the table's top, m."""
@@ -127,16 +127,16 @@ class SceneParameters:
     table_size: Vector2 = (1.3, 1.3)
     """Extent along x and y, m."""
     magnet_reach: float = 0.015
-    """Largest sideways distance from the tip to the middle of a part's top, m."""
+    """Largest horizontal distance from the tip to the center of a part's top, m."""
     magnet_gap: float = 0.005
-    """Largest difference in height between the tip and a part's top, m."""
+    """Largest vertical distance between the tip and a part's top, m."""
     trays: tuple[TrayParameters, ...] = ()
     parts: tuple[PartParameters, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class StepParameters:
-    """How the plant is stepped."""
+    """Step length and integration method."""
 
     step_ns: int = 20_000_000
     substeps: int = 1
@@ -150,7 +150,7 @@ class StepParameters:
 
 @dataclass(frozen=True, slots=True)
 class RigParameters:
-    """All of a rig that the physics and its picture depend on."""
+    """Parameters of one rig: arm, step and scene."""
 
     arm: ArmParameters = ArmParameters()
     sim: StepParameters = StepParameters()
@@ -162,20 +162,20 @@ class RigParameters:
             if part.ferromagnetic and weight > LARGEST_REGISTER_FORCE:
                 most = LARGEST_REGISTER_FORCE / GRAVITY - self.arm.masses[2]
                 raise InputError(
-                    f"part {part.name!r} is too heavy: quill and part weigh {weight:.1f} N, the force register "
-                    f"carries {LARGEST_REGISTER_FORCE} N; {most:.2f} kg is the most"
+                    f"part {part.name!r} is too heavy: quill and part weigh {weight:.1f} N, but the force register "
+                    f"is limited to {LARGEST_REGISTER_FORCE} N; the part must have at most {most:.2f} kg"
                 )
 
     def to_json(self) -> str:
-        """The same as JSON, exactly."""
+        """Return the parameters as JSON, without loss."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read what `to_json` wrote.
+        """Return the parameters from the JSON of `to_json`.
 
         Raises:
-            InputError: it is something else, or a value is none.
+            InputError: the text is not such JSON, or a value is invalid.
         """
         try:
             fields = json.loads(text)
@@ -188,11 +188,13 @@ class RigParameters:
                 scene=SceneParameters(**scene),
             )
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise InputError(f"the rig's parameters are not understood: {error}") from error
+            raise InputError(
+                f"invalid rig parameters (parameters_json): {error!r}; use the hilrig version that made the recording"
+            ) from error
 
 
 def _tuples(value: Any) -> Any:
-    """JSON knows lists only; frozen parameters hold tuples."""
+    """Convert the lists of JSON to the tuples of frozen parameters."""
     if isinstance(value, list):
         return tuple(_tuples(item) for item in value)
     if isinstance(value, dict):

@@ -1,8 +1,8 @@
-"""One fixed step of an explicit Runge–Kutta method for N rigs, with nothing allocated.
+"""Fixed step of an explicit Runge–Kutta method for N rigs, without memory allocation.
 
-Only the joint velocities and θ2 enter the right-hand side, so the stages are taken for these five quantities, and the
-positions are sums of the stages' velocities: the same method on fewer rows. Each sum over stages is one product and
-one reduction along the first axis, whose order of additions is the same for any number of rigs.
+The right-hand side depends on the joint velocities and θ2 only, so the stages have these five quantities, and the
+positions are weighted sums of the stage velocities: the same method with fewer rows. Each sum over stages is one
+product and one reduction along the first axis, whose order of additions is the same for any number of rigs.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from hilrig_sim.arm.integrators import Tableau
 Floats = NDArray[np.float64]
 
 
-FEW_RIGS: Final = 64
-"""Up to so many, weights are stored once a rig: the same products, without the cost of broadcasting."""
+MAX_RIGS_WITH_OWN_WEIGHTS: Final = 64
+"""Up to this number of rigs, each has its own copy of the weights, which saves the cost of broadcasting."""
 
 
 @cache
 def _packed(tableau: Tableau) -> tuple[Floats, Floats]:
-    """Weights of all sums of a step, one after the other, (terms, 1, 1): what they are, and what a second adds.
+    """Return the weights of all sums of a step, (terms, 1, 1): a constant part and a part per second of step length.
 
-    First those of the stages and of the end, each led by the 1 of the state at the step's start; then those of the
-    position's change and of its error.
+    First the weights of the stages and of the end state, each preceded by the weight 1 of the start state; then those
+    of the position increment and of its error.
     """
     led = [(1.0, row) for row in (*tableau.a[1:], tableau.b)]
     bare = [tableau.b, tableau.error_weights]
@@ -57,13 +57,13 @@ class _Sum:
 
 
 class FixedStep:
-    """Steps `dynamics` by `length`: seconds, one number or one for each rig, (N,)."""
+    """Integrates `dynamics` over a step of `length`, s: one number, or one per rig, (N,)."""
 
     def __init__(self, dynamics: ReducedDynamics, tableau: Tableau, length: float | Floats) -> None:
         count, stages = dynamics.count, tableau.stages
         self._dynamics = dynamics
         lengths = np.asarray(length, dtype=np.float64).reshape(1, -1)
-        # Slot 0 holds the state at the step's start, slot i the rates of stage i.
+        # Slot 0 is the state at the start of the step, slot i the rates of stage i.
         self._slots = np.zeros((1 + stages, STAGE_ROWS, count))
         self._states = np.zeros((stages, STAGE_ROWS, count))
         self._products = np.empty((1 + stages, STAGE_ROWS, count))
@@ -76,7 +76,7 @@ class FixedStep:
 
         one, scaled = _packed(tableau)
         table = one + scaled * lengths
-        if count <= FEW_RIGS:
+        if count <= MAX_RIGS_WITH_OWN_WEIGHTS:
             table = np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy()
         used = 0
 
@@ -93,9 +93,9 @@ class FixedStep:
         self._error = terms(stages, self._states) if tableau.embedded else None
 
     def advance(self, position: Floats, velocity: Floats, effort: Floats, error: Floats | None = None) -> None:
-        """Move `position` and `velocity`, (4, N), on by one step under constant `effort`, (4, N).
+        """Advance `position` and `velocity`, (4, N), by one step with constant `effort`, (4, N).
 
-        `error`, (4, N), gets the embedded estimate of the position's error; a method without one leaves it.
+        `error`, (4, N), receives the embedded error estimate of the position, if the method has one.
         """
         rates, drive, result, result4 = self._dynamics.rates, self._drive, self._result, self._result4
         self._dynamics.drive(effort, drive)
@@ -115,7 +115,7 @@ class FixedStep:
         velocity[:] = result4
 
     def accelerations(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
-        """Joint accelerations, (4, N), at a state and under an effort, (4, N) each; valid until the next call."""
+        """Return the joint accelerations, (4, N), of a state and effort, (4, N) each; valid until the next call."""
         self._dynamics.drive(effort, self._drive)
         self._states[0, :4] = velocity
         self._states[0, 4] = position[1]

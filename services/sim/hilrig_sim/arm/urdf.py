@@ -1,9 +1,9 @@
-"""The arm and its cell as URDF, out of the same parameters as the physics: the one source of the picture.
+"""URDF of the arm and its cell, generated from the parameters of the simulation; all visualizations use it.
 
-Each moving link has its point mass where the reduced model has it, (17)–(19). Its inertia tensor would be zero, which
-engines refuse, so it is `POINT_INERTIA`. The inertia of joint 4 belongs to its drive and turns with θ4 alone
-(docs/model.md, decision 2); URDF has no word for that, so an engine that loads the file gets it as the joint's armature
-(MuJoCo `dof_armature`, Pinocchio `armature`). Visuals are primitives alone and there is no collision geometry.
+Each moving link has its point mass at the position of the reduced model, (17)–(19). Physics engines reject a zero
+inertia tensor, so it is `POINT_INERTIA`. The inertia of joint 4 belongs to its drive and rotates with θ4 only
+(docs/model.md, decision 2). URDF has no element for that: set it as the armature of the joint in the engine (MuJoCo
+`dof_armature`, Pinocchio `armature`). Visuals are primitives, and there is no collision geometry.
 """
 
 import math
@@ -14,16 +14,16 @@ from xml.etree.ElementTree import Element, SubElement
 from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, TrayParameters
 
 POINT_INERTIA: Final = 1e-12
-"""Stands for the zero inertia of a point mass, kg·m²."""
+"""Replaces the zero inertia of a point mass, kg·m²."""
 POINT_MASS: Final = 1e-9
-"""Stands for the mass of the empty magnet, kg."""
+"""Replaces the zero mass of the magnet, kg."""
 
 JOINTS: Final = ("theta1", "theta2", "d3", "theta4")
 """Names of the joints, in joint order."""
 LINKS: Final = ("base", "link1", "link2", "quill", "tool")
 """Names of the links, from the base to the tool; the origin of `tool` is the tip."""
 
-_COLOURS: Final = {
+_COLORS: Final = {
     "graphite": "0.16 0.18 0.21 1",
     "steel": "0.74 0.76 0.79 1",
     "orange": "0.95 0.45 0.13 1",
@@ -36,7 +36,7 @@ _DOWN: Final = -1
 
 
 def urdf(parameters: RigParameters, name: str = "hilrig_scara") -> str:
-    """The rig as URDF text."""
+    """Return the rig as URDF text."""
     arm, scene = parameters.arm, parameters.scene
     robot = Element("robot", name=name)
     robot.append(
@@ -44,8 +44,8 @@ def urdf(parameters: RigParameters, name: str = "hilrig_scara") -> str:
             f" SI units, z up. Give joint theta4 an armature of {arm.j4!r} kg m2: the inertia of its drive. "
         )
     )
-    for colour, rgba in _COLOURS.items():
-        SubElement(SubElement(robot, "material", name=colour), "color", rgba=rgba)
+    for color, rgba in _COLORS.items():
+        SubElement(SubElement(robot, "material", name=color), "color", rgba=rgba)
     for tray in scene.trays:
         SubElement(SubElement(robot, "material", name=f"tray {tray.name}"), "color", rgba=_rgba(tray.colour))
     _base(robot, arm, scene)
@@ -124,7 +124,7 @@ def _link2(robot: Element, arm: ArmParameters) -> None:
 
 
 def _quill(robot: Element, arm: ArmParameters) -> None:
-    """The spline shaft: long enough to stay in its nuts over the whole stroke."""
+    """Add the quill: a spline shaft, long enough for the whole stroke."""
     link = SubElement(robot, "link", name=LINKS[3])
     _point_mass(link, arm.masses[2], (0, 0, 0))
     length = arm.upper[2] - arm.lower[2] + 0.145
@@ -135,7 +135,7 @@ def _quill(robot: Element, arm: ArmParameters) -> None:
 
 
 def _tool(robot: Element) -> None:
-    """The magnet; a mark on its side shows how θ4 stands."""
+    """Add the magnet; a mark on its side shows θ4."""
     link = SubElement(robot, "link", name=LINKS[4])
     _point_mass(link, POINT_MASS, (0, 0, 0))
     _cylinder(link, 0.013, 0.010, (0, 0, 0.027), "steel")
@@ -157,7 +157,7 @@ def _joint(
     SubElement(joint, "child", link=LINKS[index + 1])
     SubElement(joint, "origin", xyz=_numbers(origin), rpy="0 0 0")
     SubElement(joint, "axis", xyz=_numbers(axis))
-    # URDF wants a largest effort and speed; the model has none but what the effort register carries.
+    # URDF requires limits of effort and speed; the model has only the limit of the torque register.
     SubElement(
         joint,
         "limit",
@@ -203,6 +203,6 @@ def _numbers(values: tuple[float, ...]) -> str:
     return " ".join(f"{value:.12g}" for value in values)
 
 
-def _rgba(colour: str) -> str:
-    red, green, blue = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+def _rgba(color: str) -> str:
+    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return f"{red:.3f} {green:.3f} {blue:.3f} 1"

@@ -1,1 +1,1 @@
-"""The simulated plant: the arm with its hard stops, joint limits and the parts around it."""
+"""Simulated plant: arm, hard stops, limit flags, and the scene with its parts."""

@@ -1,4 +1,4 @@
-"""Which limits each rig is at, and what a step brings that is worth an event."""
+"""Limit flags of the rigs, and the events of a step of the plant."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_sim.plant.world import NONE
+from hilrig_sim.plant.world import NO_PART
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -18,8 +18,8 @@ TOOL_CONTACT_FLAG: Final = 1 << 8
 _TRUE: Final = b"\x01"
 
 
-class Happening(Enum):
-    """What a step may bring that is worth an event."""
+class PlantEventKind(Enum):
+    """Kind of a plant event."""
 
     LIMIT_HIT = "limit hit"
     PART_PICKED = "part picked"
@@ -28,38 +28,38 @@ class Happening(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PlantEvent:
-    """Something that happened to one rig in a step."""
+    """An event of one rig in a step."""
 
-    happening: Happening
+    kind: PlantEventKind
     rig: int
     joint: int = 0
-    """1 to 4 at a limit; 0: the tool, on what lies below it."""
+    """Joint at its limit, 1 to 4; 0: the tool touches an object below it."""
     upper: bool = False
     speed: float = 0.0
-    """Of the joint at the impact; rad/s or m/s."""
-    part: int = NONE
-    """Index of the part in the rig's scene."""
+    """Speed of the joint at the impact; rad/s or m/s."""
+    part: int = NO_PART
+    """Index of the part in the scene of the rig."""
 
 
 class LimitFlags:
-    """The limit flags of N rigs, restated where something changed."""
+    """Limit flags of N rigs, recomputed when they change."""
 
     def __init__(self, stop3: Floats) -> None:
-        """Set up for quills whose own upper stops are at `stop3`, m, (N,)."""
+        """Initialize for quills with upper stops at `stop3`, m, (N,)."""
         self._stop3 = stop3
         self._below = np.zeros(len(stop3), dtype=np.bool_)
         self._key = b""
         self.flags = [0] * len(stop3)
-        """For each rig: bit j-1 joint j on its lower stop, bit 3+j on its upper one, bit 8 tool on what is below it."""
+        """For each rig: bit j-1 joint j at its lower stop, bit 3+j at its upper stop, bit 8 tool touches an object."""
         self.any = False
         """Whether any rig is at any limit."""
 
     def update(
-        self, at_lower: Bools, at_upper: Bools, upper3: Floats, arriving: Floats | None, events: list[PlantEvent]
+        self, at_lower: Bools, at_upper: Bools, upper3: Floats, impact_velocity: Floats | None, events: list[PlantEvent]
     ) -> None:
-        """Restate the flags, and add to `events` the limits that were hit at joint velocities `arriving`, (4, N).
+        """Update the flags, and append the limits that were hit with velocities `impact_velocity`, (4, N), to `events`.
 
-        `upper3`, (N,), is how far each quill can go: less than to its own stop where something is below the tool.
+        `upper3`, (N,): largest d3 of each quill; less than its upper stop if an object is below the tool.
         """
         np.less(upper3, self._stop3, self._below)
         key = at_lower.tobytes() + at_upper.tobytes() + self._below.tobytes()
@@ -78,22 +78,22 @@ class LimitFlags:
             new = flags & ~self.flags[rig]
             self.flags[rig] = flags
             self.any |= flags != 0
-            if new and arriving is not None:
-                events.extend(_hits(rig, new, arriving[:, rig].tolist()))
+            if new and impact_velocity is not None:
+                events.extend(_hits(rig, new, impact_velocity[:, rig].tolist()))
 
 
-def _hits(rig: int, new: int, arriving: list[float]) -> list[PlantEvent]:
+def _hits(rig: int, new: int, impact_velocity: list[float]) -> list[PlantEvent]:
     hits = [
-        PlantEvent(Happening.LIMIT_HIT, rig, joint + 1, upper, abs(arriving[joint]))
+        PlantEvent(PlantEventKind.LIMIT_HIT, rig, joint + 1, upper, abs(impact_velocity[joint]))
         for joint in range(4)
         for upper in (False, True)
         if new & (1 << (4 * upper + joint))
     ]
     if new & TOOL_CONTACT_FLAG:
-        hits.append(PlantEvent(Happening.LIMIT_HIT, rig, 0, True, abs(arriving[2])))
+        hits.append(PlantEvent(PlantEventKind.LIMIT_HIT, rig, 0, True, abs(impact_velocity[2])))
     return hits
 
 
 def any_true(mask: Bools) -> bool:
-    """Whether any element is true: for a few elements, ten times as fast as `mask.any()`."""
+    """Return whether an element is true: for a few elements, ten times as fast as `mask.any()`."""
     return _TRUE in mask.tobytes()

@@ -1,8 +1,9 @@
-"""One step of N rigs: magnet, motion, stops, contact, falling parts. A pure function of state, effort and parameters.
+"""Plant of N rigs: one step computes magnet, motion, stops, contact and falling parts.
 
-`Plant` owns the state and the scratch memory of the step; it knows no clock and no bus, so the same object runs in
-real time, in a recording's verification and in a study of a thousand rigs. Between two steps everything that the
-next one depends on is in the published state, but for the speed of a part that is falling.
+A step is a pure function of state, effort and parameters. `Plant` owns the state and the scratch memory of the step. It
+has no clock and no bus, so the same class runs in real time, in the verification of a recording and in a study of a
+thousand rigs. The published state contains everything that the next step depends on, except the speed of a falling
+part.
 """
 
 from collections.abc import Sequence
@@ -17,9 +18,9 @@ from hilrig_sim.arm.integrators import TABLEAUS, Tableau
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import crossing, stop_outward
-from hilrig_sim.plant.limits import Happening, LimitFlags, PlantEvent, any_true
-from hilrig_sim.plant.static_geometry import TOUCHING
-from hilrig_sim.plant.world import ALL, NONE, World
+from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
+from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M
+from hilrig_sim.plant.world import ALL_RIGS, NO_PART, World
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -30,18 +31,18 @@ _FALSE: Final = b"\x00"
 
 
 class Plant:
-    """N rigs that step together; they share step length, sub-steps and integrator, all else is each rig's own."""
+    """N rigs that step together; they have one step length, number of sub-steps and integrator."""
 
     def __init__(self, rigs: Sequence[RigParameters]) -> None:
-        """Start every rig at its start pose.
+        """Initialize every rig at its start pose.
 
         Raises:
-            InputError: no rig is given, or their steps differ.
+            InputError: no rig is given, or the step parameters of the rigs differ.
         """
         if not rigs:
-            raise InputError("a plant needs at least one rig")
+            raise InputError("a plant needs at least one rig, got none")
         if len({rig.sim for rig in rigs}) > 1:
-            raise InputError("rigs that step together need the same step, sub-steps and integrator")
+            raise InputError("rigs of one simulation must have the same step, sub-steps and integrator")
         self.rigs = tuple(rigs)
         count = len(rigs)
         sim = rigs[0].sim
@@ -54,7 +55,7 @@ class Plant:
         self.velocity = np.zeros((4, count))
         """q̇: rad/s, rad/s, m/s, rad/s, (4, N)."""
         self.error = np.zeros((4, count))
-        """Embedded estimate of the last integration step's error of q, (4, N)."""
+        """Embedded error estimate of q for the last integration step, (4, N)."""
         self.world = World([rig.scene for rig in rigs], max(arm.l2 + arm.l3 for arm in self._arms))
         self.dynamics = ReducedDynamics(self._arms)
         self._integrator = FixedStep(self.dynamics, self._tableau, self._step)
@@ -62,16 +63,16 @@ class Plant:
         self._lower = np.array([arm.lower for arm in self._arms]).T.copy()
         self._stop = np.array([arm.upper for arm in self._arms]).T.copy()
         self._upper = self._stop.copy()
-        """Upper stops, those of the quill raised to what lies below the tool."""
+        """Upper stops; that of the quill is reduced where an object is below the tool."""
         self._free3 = np.empty(count)
-        """d3 up to which nothing can be below the tool, m, (N,)."""
+        """d3 up to which the tool cannot touch any object, m, (N,)."""
         self._at_lower = np.zeros((4, count), dtype=np.bool_)
         self._at_upper = np.zeros((4, count), dtype=np.bool_)
         self._switched = np.zeros(count, dtype=np.bool_)
         self._low = np.zeros(count, dtype=np.bool_)
         self._contact_known = np.full((4, count), np.nan)
-        """θ1, θ2, d3 at the start of the step, θ4 for which `_upper` was found, (4, N)."""
-        self._contact_place = np.empty((4, count))
+        """θ1, θ2, d3 at the start of the step, and θ4, for which `_upper` was computed, (4, N)."""
+        self._contact_pose = np.empty((4, count))
         self._contact_differs = np.zeros((4, count), dtype=np.bool_)
         self._contact_unknown = np.zeros(count, dtype=np.bool_)
         self._start_position = np.empty((4, count))
@@ -82,20 +83,20 @@ class Plant:
         self._held = self._nothing_held
         self._events: list[PlantEvent] = []
         self.position[:] = np.array([arm.start for arm in self._arms]).T
-        self._begin_anew()
+        self._refresh_derived_state()
 
     @property
     def count(self) -> int:
-        """How many rigs there are."""
+        """Number of rigs."""
         return len(self.rigs)
 
     @property
     def limit_flags(self) -> Sequence[int]:
-        """For each rig: bit j-1 joint j on its lower stop, bit 3+j on its upper one, bit 8 tool on what is below it."""
+        """For each rig: bit j-1 joint j at its lower stop, bit 3+j at its upper stop, bit 8 tool touches an object."""
         return self._limits.flags
 
     def tool(self, rigs: Ints | slice) -> Floats:
-        """Poses (x, y, z, yaw) of the tools of some rigs, (4, K); (1)–(4)."""
+        """Return the tool poses (x, y, z, yaw) of rigs, (4, K); (1)–(4)."""
         theta1, theta2, d3, theta4 = position = self.position[:, rigs]
         l2, l3 = self.dynamics.l2[rigs], self.dynamics.l3[rigs]
         pose = np.empty_like(position)
@@ -107,43 +108,43 @@ class Plant:
         return pose
 
     def reset(self, rig: int) -> None:
-        """Put a rig and its parts back to the start, at rest."""
+        """Move a rig and its parts to the start pose, at rest."""
         self.position[:, rig] = self._arms[rig].start
         self.velocity[:, rig] = 0.0
         self.error[:, rig] = 0.0
         self.world.reset(rig)
-        self._begin_anew()
+        self._refresh_derived_state()
 
-    def place(
+    def set_state(
         self,
         rig: int,
         position: Sequence[float],
         velocity: Sequence[float],
         parts: Sequence[tuple[float, float, float, float]] | None = None,
-        held: int = NONE,
+        held: int = NO_PART,
     ) -> None:
-        """Set a rig's state: q and q̇, (4,) each, and where its parts are (x, y, z, yaw); None: as they are."""
+        """Set the state of a rig: q and q̇, (4,) each, and the poses (x, y, z, yaw) of its parts; None: unchanged."""
         self.position[:, rig] = position
         self.velocity[:, rig] = velocity
         if parts is not None:
-            self.world.place(rig, parts, held, self.tool(np.array([rig]))[:, 0])
-        self._begin_anew()
+            self.world.set_state(rig, parts, held, self.tool(np.array([rig]))[:, 0])
+        self._refresh_derived_state()
 
-    def adopt(self, other: "Plant", mine: Sequence[int], theirs: Sequence[int]) -> None:
-        """Take over the state of rigs of another plant with the same parameters: `mine[i]` goes on as `theirs[i]`."""
+    def copy_state_from(self, other: "Plant", mine: Sequence[int], theirs: Sequence[int]) -> None:
+        """Copy the state of the rigs `theirs` of another plant with the same parameters to the rigs `mine`."""
         here, there = np.array(mine, dtype=np.int64), np.array(theirs, dtype=np.int64)
         self.position[:, here] = other.position[:, there]
         self.velocity[:, here] = other.velocity[:, there]
         self.error[:, here] = other.error[:, there]
-        self.world.adopt(other.world, here, there)
-        self._begin_anew()
+        self.world.copy_state_from(other.world, here, there)
+        self._refresh_derived_state()
 
     def step(self, effort: Floats, magnet: Bools) -> Sequence[PlantEvent]:
-        """Move every rig on by one step of the loop; says what happened, in a list that the next step reuses.
+        """Advance every rig by one step of the loop; return the events, in a list that the next step reuses.
 
         Args:
             effort: τ1, τ2, τ3, τ4 of each rig, finite, constant over the step; N·m, N·m, N, N·m, (4, N).
-            magnet: which magnets are on, (N,).
+            magnet: whether each magnet is on, (N,).
         """
         events = self._events
         if events:
@@ -157,10 +158,10 @@ class Plant:
             self._substep(effort)
         if world.holding:
             holding = np.flatnonzero(world.holds)
-            world.carry(holding, self.tool(holding))
+            world.move_held_parts(holding, self.tool(holding))
         if world.falling:
             world.fall(self._step * self._substeps)
-            self._world_changed()
+            self._invalidate_contact()
         return events
 
     def _switch_magnets(self, magnet: Bools) -> None:
@@ -168,21 +169,21 @@ class Plant:
         dropping = np.flatnonzero(self._switched & world.holds)
         if dropping.size:
             for rig in dropping:
-                self._events.append(PlantEvent(Happening.PART_DROPPED, int(rig), part=int(world.held[rig])))
+                self._events.append(PlantEvent(PlantEventKind.PART_DROPPED, int(rig), part=int(world.held[rig])))
             world.release(dropping)
             self.dynamics.set_payload(world.payload())
-        wanting = np.flatnonzero(self._switched & magnet)
-        if wanting.size:
-            taken = world.attract(wanting, self.tool(wanting))
-            if taken.size:
-                for rig in taken:
-                    self._events.append(PlantEvent(Happening.PART_PICKED, int(rig), part=int(world.held[rig])))
-                self._share_momentum(taken)
+        switching_on = np.flatnonzero(self._switched & magnet)
+        if switching_on.size:
+            picked = world.pick(switching_on, self.tool(switching_on))
+            if picked.size:
+                for rig in picked:
+                    self._events.append(PlantEvent(PlantEventKind.PART_PICKED, int(rig), part=int(world.held[rig])))
+                self._add_payload(picked)
         if self._events:
-            self._world_changed()
+            self._invalidate_contact()
 
-    def _share_momentum(self, rigs: Ints) -> None:
-        """A part at rest is taken along: momentum stays, energy goes, as in any inelastic impact."""
+    def _add_payload(self, rigs: Ints) -> None:
+        """Apply the inelastic impact of a picked part at rest: momentum is conserved, energy is not."""
         dynamics = self.dynamics
         before = [element[rigs] for element in dynamics.mass_matrix_12(self.position[1])]
         mass3 = (dynamics.m3 + dynamics.payload)[rigs]
@@ -216,25 +217,25 @@ class Plant:
                 self._touching_plane = False
                 self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
             return
-        arriving = velocity.copy()
+        impact_velocity = velocity.copy()
         plane = 2 * self.count
         self._touching_plane = _TRUE in at_lower[:plane] or _TRUE in at_upper[:plane]
         if self._touching_plane:
             self._impact(effort)
             np.less_equal(position, self._lower, lower)
             np.greater_equal(position, self._upper, upper)
-        # Joints 3 and 4 move by themselves: to stop them is to stop where the limit is.
+        # Joints 3 and 4 are decoupled: an impact sets their position to the limit.
         np.maximum(position, self._lower, out=position)
         np.minimum(position, self._upper, out=position)
         speed34, lower34, upper34 = velocity[2:], lower[2:], upper[2:]
         np.maximum(speed34, 0.0, out=speed34, where=lower34)
         np.minimum(speed34, 0.0, out=speed34, where=upper34)
-        self._limits.update(lower, upper, self._upper[2], arriving, self._events)
+        self._limits.update(lower, upper, self._upper[2], impact_velocity, self._events)
 
     def _hold_pressed(self, effort: Floats) -> bool:
-        """Hold joints 1 and 2 where they are pressed onto a stop at the start of a step; whether any is."""
+        """Hold joints 1 and 2 that are pressed against a stop at the start of a step; return whether any is."""
         rates = self._integrator.accelerations(self.position, self.velocity, effort)
-        # Only what rests on a stop can be held there; what moves off it is free.
+        # Only a joint at rest at a stop is held; a joint that moves off the stop is free.
         side = np.where(self.velocity[:2] == 0, _sides(self.position, self._lower, self._stop), 0.0)
         if not any_true(side * rates[:2] > 0):
             return False
@@ -245,27 +246,27 @@ class Plant:
         return True
 
     def _find_contact(self) -> None:
-        """Raise the quill's stop to what lies below the tool, where it may reach it."""
-        world, place = self.world, self._contact_place
-        # What lies below is known where neither the tool nor the scene has changed since it was found.
-        place[:] = self.position
-        place[2] = self._start_position[2]
-        np.not_equal(place, self._contact_known, self._contact_differs)
+        """Limit the quill's upper stop by the object below the tool, where the tool may reach it."""
+        world, pose = self.world, self._contact_pose
+        # The surface below is known if neither the tool nor the scene has changed since it was computed.
+        pose[:] = self.position
+        pose[2] = self._start_position[2]
+        np.not_equal(pose, self._contact_known, self._contact_differs)
         np.logical_and(self._contact_differs, self._low, self._contact_differs)
         if not any_true(self._contact_differs):
             return
         np.logical_or.reduce(self._contact_differs, axis=0, out=self._contact_unknown)
-        # A view where all are asked for: with few rigs, to pick columns costs more than to compute with them.
-        rigs = np.flatnonzero(self._contact_unknown) if _FALSE in self._contact_unknown.tobytes() else ALL
-        self._contact_known[:, rigs] = place[:, rigs]
+        # A slice for all rigs: with few rigs, the copy of selected columns costs more than the computation.
+        rigs = np.flatnonzero(self._contact_unknown) if _FALSE in self._contact_unknown.tobytes() else ALL_RIGS
+        self._contact_known[:, rigs] = pose[:, rigs]
         tip = self.tool(rigs)
         bottom = self._l1[rigs] - self._start_position[2, rigs] - world.held_height[rigs]
-        x, y = world.footprint_centre(rigs, tip)
+        x, y = world.footprint_center(rigs, tip)
         below = world.contact(rigs, x, y, bottom)
         self._upper[2, rigs] = np.minimum(self._stop[2, rigs], self._l1[rigs] - world.held_height[rigs] - below)
 
     def _impact(self, effort: Floats) -> None:
-        """Stop joints 1 and 2 at their limits: at the time within the step at which they get there."""
+        """Stop joints 1 and 2 at their limits, at the time of the impact within the step."""
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
         if any_true(beyond):
@@ -274,11 +275,11 @@ class Plant:
             q0, v0 = self._start_position[:, rigs], self._start_velocity[:, rigs]
             q1, v1 = position[:, rigs], velocity[:, rigs]
             outside = beyond[:, rigs]
-            shares = np.ones((2, rigs.size))
+            fractions = np.ones((2, rigs.size))
             for joint in (0, 1):
-                share = crossing(q0[joint], q1[joint], v0[joint] * self._step, v1[joint] * self._step, limit[joint])
-                shares[joint] = np.where(outside[joint], share, 1.0)
-            first = shares.min(axis=0)
+                fraction = crossing(q0[joint], q1[joint], v0[joint] * self._step, v1[joint] * self._step, limit[joint])
+                fractions[joint] = np.where(outside[joint], fraction, 1.0)
+            first = fractions.min(axis=0)
             arms = [self._arms[rig] for rig in rigs]
             dynamics = ReducedDynamics(arms)
             dynamics.set_payload(self.dynamics.payload[rigs])
@@ -286,11 +287,11 @@ class Plant:
             acting = effort[:, rigs]
             plane, plane_rate = q0.copy(), v0.copy()
             FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, acting)
-            arriving = outside & (shares == first)
-            np.copyto(plane[:2], limit, where=arriving)
+            hitting = outside & (fractions == first)
+            np.copyto(plane[:2], limit, where=hitting)
             side = _sides(plane, self._lower[:, rigs], self._stop[:, rigs])
             self._stop_plane(dynamics, plane, plane_rate, side)
-            # The rest of the step goes on from the stop, pressed onto it or leaving it.
+            # The remainder of the step starts at the stop, pressed against it or leaving it.
             rest = FixedStep(dynamics, self._tableau, (1.0 - first) * self._step)
             rates = rest.accelerations(plane, plane_rate, acting)
             mass = dynamics.mass_matrix_12(plane[1])
@@ -298,11 +299,11 @@ class Plant:
             _, _, held1, held2 = stop_outward(rates[0], rates[1], resting[0], resting[1], mass)
             dynamics.hold(held1, held2, plane[1])
             rest.advance(plane, plane_rate, acting)
-            # Joints 3 and 4 had the whole step already.
+            # Joints 3 and 4 have already made the whole step.
             position[:2, rigs], velocity[:2, rigs] = plane[:2], plane_rate[:2]
             np.maximum(position[:2], self._lower[:2], out=position[:2])
             np.minimum(position[:2], self._stop[:2], out=position[:2])
-        # What is at a stop at the end, by a second impact in one step or since before, does not move outwards.
+        # A joint at a stop at the end, by a second impact in the step or since before, must not move outward.
         self._stop_plane(self.dynamics, position, velocity, _sides(position, self._lower, self._stop))
 
     @staticmethod
@@ -311,10 +312,10 @@ class Plant:
             mass = dynamics.mass_matrix_12(position[1])
             velocity[0], velocity[1], _, _ = stop_outward(velocity[0], velocity[1], side[0], side[1], mass)
 
-    def _begin_anew(self) -> None:
-        """Derive everything from position, velocity and the world's parts."""
+    def _refresh_derived_state(self) -> None:
+        """Recompute everything that depends on position, velocity and parts."""
         self.dynamics.set_payload(self.world.payload())
-        self._world_changed()
+        self._invalidate_contact()
         np.greater(self.position[2], self._free3, self._low)
         if any_true(self._low):
             self._start_position[:] = self.position
@@ -324,15 +325,15 @@ class Plant:
         self._touching_plane = bool(self._at_lower[:2].any() or self._at_upper[:2].any())
         self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
 
-    def _world_changed(self) -> None:
-        """Forget what was known of what lies below the tools."""
+    def _invalidate_contact(self) -> None:
+        """Invalidate the computed surfaces below the tools, because the scene has changed."""
         self._contact_known.fill(np.nan)
         self._upper[2] = self._stop[2]
         np.subtract(self._l1, self.world.held_height, out=self._free3)
         np.subtract(self._free3, self.world.highest, out=self._free3)
-        np.subtract(self._free3, TOUCHING, out=self._free3)
+        np.subtract(self._free3, CONTACT_TOLERANCE_M, out=self._free3)
 
 
 def _sides(position: Floats, lower: Floats, upper: Floats) -> Floats:
-    """+1 where joints 1 and 2 are on their upper stops, -1 on their lower ones, else 0, (2, N)."""
+    """Return +1 where joints 1 and 2 are at their upper stops, -1 at their lower stops, else 0, (2, N)."""
     return (position[:2] >= upper[:2]).astype(np.float64) - (position[:2] <= lower[:2])

@@ -1,4 +1,4 @@
-"""What never moves in a scene: the floor, the table and the trays, and which of them is under a disc."""
+"""Static geometry of the scenes: ground, table and trays, and the height of the surface under a disc."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,31 +10,31 @@ from hilrig_sim.arm.model import SceneParameters
 
 Floats = NDArray[np.float64]
 Rigs = NDArray[np.int64] | slice
-"""Some rigs by their indices, or all of them."""
+"""Indices of rigs, or a slice of all rigs."""
 
-FAR_AWAY: Final = 1e9
-"""Where parts and trays are that a rig does not have, m."""
-TOUCHING: Final = 1e-9
-"""Closer than this, m, two surfaces touch."""
-GROUND_BELOW_TABLE: Final = 0.75
-"""How far below the table's top the floor is, m."""
+FAR_AWAY_M: Final = 1e9
+"""Coordinate of the unused parts and trays of a rig, m."""
+CONTACT_TOLERANCE_M: Final = 1e-9
+"""Largest distance of two surfaces that touch, m."""
+TABLE_ABOVE_GROUND_M: Final = 0.75
+"""Height of the table top above the ground, m."""
 
 
-class Surfaces:
-    """What never moves: the floor, each rig's table and trays."""
+class StaticGeometry:
+    """Ground, tables and trays of N rigs."""
 
     def __init__(self, scenes: Sequence[SceneParameters], reach: float) -> None:
         count = len(scenes)
         self._table = np.array([scene.table_height for scene in scenes])
-        self._table_centre = np.array([scene.table_centre for scene in scenes]).T.copy()
+        self._table_center = np.array([scene.table_centre for scene in scenes]).T.copy()
         self._table_half = np.array([scene.table_size for scene in scenes]).T / 2
-        edge = self._table_half - np.abs(self._table_centre)
-        beside_the_tip = max(scene.magnet_reach for scene in scenes)
-        self._is_table_everywhere = bool(np.all(edge >= reach + beside_the_tip))
-        """No tool and no part gets beyond the edge of any table."""
+        edge = self._table_half - np.abs(self._table_center)
+        magnet_reach = max(scene.magnet_reach for scene in scenes)
+        self._is_table_everywhere = bool(np.all(edge >= reach + magnet_reach))
+        """Whether no tool and no part can be beside a table."""
         rows = max(len(scene.trays) for scene in scenes)
         self._tray = np.zeros((5, rows, count))
-        self._tray[0] = FAR_AWAY
+        self._tray[0] = FAR_AWAY_M
         self._half = np.zeros((2, rows, count))
         for rig, scene in enumerate(scenes):
             for row, tray in enumerate(scene.trays):
@@ -43,16 +43,16 @@ class Surfaces:
                 self._half[:, row, rig] = tray.size[0] / 2, tray.size[1] / 2
         self._rows = rows
         self.highest = np.maximum(self._table, self._tray[4].max(axis=0, initial=-np.inf, where=self._half[0] > 0))
-        """World z of the highest of them, m, (N,)."""
+        """World z of the highest surface, m, (N,)."""
 
     def under(self, rigs: Rigs, x: Floats, y: Floats, radius: Floats, bottom: Floats) -> Floats:
-        """Highest of them, m, (K,), that is under any of a disc and not above `bottom`."""
+        """Return the height of the highest surface, m, (K,), that a disc overlaps and that is not above `bottom`."""
         height = table = self._table[rigs]
         if not self._is_table_everywhere:
             half_x, half_y = self._table_half[:, rigs]
-            centre_x, centre_y = self._table_centre[:, rigs]
-            beside = (np.abs(x - centre_x) > half_x + radius) | (np.abs(y - centre_y) > half_y + radius)
-            height = np.where(beside | (table > bottom + TOUCHING), table - GROUND_BELOW_TABLE, table)
+            center_x, center_y = self._table_center[:, rigs]
+            beside = (np.abs(x - center_x) > half_x + radius) | (np.abs(y - center_y) > half_y + radius)
+            height = np.where(beside | (table > bottom + CONTACT_TOLERANCE_M), table - TABLE_ABOVE_GROUND_M, table)
         if not self._rows:
             return height
         tray_x, tray_y, c, s, top = self._tray[:, :, rigs]
@@ -60,5 +60,5 @@ class Surfaces:
         dx, dy = x - tray_x, y - tray_y
         u = np.maximum(np.abs(c * dx + s * dy) - half_u, 0.0)
         v = np.maximum(np.abs(c * dy - s * dx) - half_v, 0.0)
-        under = (u * u + v * v <= radius * radius) & (top <= bottom + TOUCHING)
+        under = (u * u + v * v <= radius * radius) & (top <= bottom + CONTACT_TOLERANCE_M)
         return np.asarray(np.maximum(height, np.where(under, top, -np.inf).max(axis=0)))

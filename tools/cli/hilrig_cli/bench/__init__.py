@@ -1,1 +1,1 @@
-"""Measurements of the local machine: timing jitter and CPU load."""
+"""Timing benchmark of this host: the measurement, its verdict, and CPU stress."""

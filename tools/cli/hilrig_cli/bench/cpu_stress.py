@@ -1,4 +1,4 @@
-"""Processes that keep every processor busy: what a rig has to bear when its machine does something else too."""
+"""CPU stress: processes that keep every processor busy while a lab runs."""
 
 import contextlib
 import os
@@ -14,39 +14,39 @@ from hilrig_cli.local.supervisor import own_process_group
 
 
 @contextmanager
-def busy_processors(count: int) -> Iterator[None]:
-    """Keep `count` processors busy, each by a process of its own, until the context is left."""
+def cpu_stress(count: int) -> Iterator[None]:
+    """Keep `count` processors busy, each with one process, until the context is left."""
     with ExitStack() as processes:
         for _ in range(count):
-            # A session of its own, as somebody else's work has: the system shares out between sessions first.
+            # In a session of its own, like an independent program: Linux groups processes by session for scheduling.
             process = subprocess.Popen(
                 [sys.executable, "-m", "hilrig_cli.bench.cpu_stress"], stdin=subprocess.PIPE, **own_process_group()
             )
-            processes.callback(_end, process)
+            processes.callback(_kill, process)
         yield
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
+def _kill(process: "subprocess.Popen[bytes]") -> None:
     process.kill()
     process.wait()
     if process.stdin is not None:
         process.stdin.close()
 
 
-def burn() -> None:
-    """Compute, and move memory through the caches, until standard input ends: whoever started this is gone."""
+def stress_forever() -> None:
+    """Compute and move memory through the caches until standard input is closed, that is, the parent has ended."""
 
-    def watch() -> None:
+    def watch_parent() -> None:
         with contextlib.suppress(OSError):
             while os.read(0, 4096):
                 pass
         os._exit(0)
 
-    threading.Thread(target=watch, name="parent-watch", daemon=True).start()
+    threading.Thread(target=watch_parent, name="parent-watch", daemon=True).start()
     data = np.ones(1 << 20)
     while True:
         data = np.sqrt(data + 1.0)
 
 
 if __name__ == "__main__":
-    burn()
+    stress_forever()

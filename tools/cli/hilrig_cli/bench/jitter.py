@@ -1,7 +1,7 @@
-"""Measuring how well this machine keeps time: the rig itself, run for a while with a quick controller.
+"""Timing measurement of this host: runs a lab with a fast controller and measures its recording.
 
-Nothing is imitated: simulation, edge and recorder run as `hilrig up` runs them, a controller polls over real Modbus
-TCP, and the recording says what ticks, bus and loop took. The controller times its requests itself.
+Simulation, edge and recorder run as with `hilrig up`. The controller polls over Modbus TCP and times its own requests;
+the recording gives the times of ticks, bus and loop.
 """
 
 import os
@@ -18,11 +18,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_cli.bench.cpu_stress import busy_processors
-from hilrig_cli.bench.timing_benchmark import Timekeeping
+from hilrig_cli.bench.cpu_stress import cpu_stress
+from hilrig_cli.bench.timing_benchmark import TimingResult
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
-from hilrig_replay.analysis.data_quality import behind_ns
+from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.records import Records
@@ -30,9 +30,9 @@ from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.rate import Rate
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
-LAB: Final = """[sim]
+LAB_TEMPLATE: Final = """[sim]
 step_ms = {step_ms}
 [edge]
 first_port = {modbus_port}
@@ -42,62 +42,69 @@ first_port = {bus_port}
 [recorder]
 folder = '{folder}'
 """
-SHORTEST_POLL_NS: Final = 1_000_000
-POLLS_A_STEP: Final = 4
-ANSWER_WITHIN_S: Final = 5.0
-READ: Final = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
-"""The four positions."""
-WRITE: Final = struct.pack(">HHHBBHHB8x", 2, 0, 15, 1, 16, 0, 4, 8)
-"""Four torques of zero."""
-READ_ANSWER, WRITE_ANSWER = 17, 12
-"""How long the answers are, bytes."""
+MIN_POLL_PERIOD_NS: Final = 1_000_000
+POLLS_PER_STEP: Final = 4
+RESPONSE_TIMEOUT_S: Final = 5.0
+READ_REQUEST: Final = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
+"""Modbus request that reads the four positions."""
+WRITE_REQUEST: Final = struct.pack(">HHHBBHHB8x", 2, 0, 15, 1, 16, 0, 4, 8)
+"""Modbus request that writes four torques of zero."""
+READ_RESPONSE_BYTES: Final = 17
+WRITE_RESPONSE_BYTES: Final = 12
 
 
-def measure_timekeeping(
-    step_ms: float, seconds: float, loaded: bool, say: Callable[[str], None], tick: Callable[[float], None]
-) -> Timekeeping:
-    """Run a lab at a step for so long, with every processor kept busy if `loaded`; `tick` hears the share that passed.
+def measure_timing(
+    step_ms: float, seconds: float, loaded: bool, log: Callable[[str], None], on_progress: Callable[[float], None]
+) -> TimingResult:
+    """Run a lab for `seconds` and measure its timing.
+
+    Args:
+        step_ms: step of the simulation.
+        seconds: duration of the measurement.
+        loaded: whether CPU stress keeps every processor busy meanwhile.
+        log: receives messages of the lab, one line each.
+        on_progress: receives the elapsed share of the duration.
 
     Raises:
-        HilrigError: the lab could not start, or it stopped answering.
+        HilrigError: the lab could not start, or it stopped responding.
     """
-    prefer_latency()
+    set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
         ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}
-        config.write_text(LAB.format(step_ms=step_ms, folder=folder, **ports))
+        config.write_text(LAB_TEMPLATE.format(step_ms=step_ms, folder=folder, **ports))
         lab = load_lab(config)
         processors = os.cpu_count() or 1
         with (
-            running_lab(lab, config, say, threading.Event()) as supervisor,
-            busy_processors(processors) if loaded else nullcontext(),
+            running_lab(lab, config, log, threading.Event()) as supervisor,
+            cpu_stress(processors) if loaded else nullcontext(),
         ):
-            before_s, begin_s = stolen_s(), time.monotonic()
-            round_trips_ns = _poll(lab, seconds, supervisor.poll, tick)
-            passed_s, after_s = time.monotonic() - begin_s, stolen_s()
-        stolen = None if before_s is None or after_s is None else (after_s - before_s) / (passed_s * processors)
+            before_s, start_s = steal_time_s(), time.monotonic()
+            round_trips_ns = _poll(lab, seconds, supervisor.poll, on_progress)
+            elapsed_s, after_s = time.monotonic() - start_s, steal_time_s()
+        stolen = None if before_s is None or after_s is None else (after_s - before_s) / (elapsed_s * processors)
         recordings = list(Path(folder).rglob("*.mcap"))
         if len(recordings) != 1:
             raise OperationError("the session was not recorded: the lab stopped too early")
-        return _judge(recordings[0], seconds, loaded, round_trips_ns, stolen)
+        return _evaluate(recordings[0], seconds, loaded, round_trips_ns, stolen)
 
 
-def _judge(
+def _evaluate(
     recording: Path, seconds: float, loaded: bool, round_trips_ns: NDArray[np.int64], stolen: float | None
-) -> Timekeeping:
+) -> TimingResult:
     run = open_run(recording)
     ticks = overruns = missed = 0
 
     def count(block: Records) -> None:
         nonlocal ticks, overruns, missed
         ticks += len(block.states)
-        overruns += int((behind_ns(block.states, run.step_ns) > run.step_ns).sum())
+        overruns += int((tick_lateness_ns(block.states, run.step_ns) > run.step_ns).sum())
         missed += int(block.states["missed_steps"].sum())
 
     report = measure(run, count)
     if report.loop_ms is None:
-        raise OperationError("no command of the controller took effect: the simulation or the edge stood still")
-    return Timekeeping(
+        raise OperationError("no command of the controller took effect: the simulation or the edge was blocked")
+    return TimingResult(
         loaded=loaded,
         step_ms=report.step_ms,
         seconds=seconds,
@@ -112,46 +119,49 @@ def _judge(
     )
 
 
-def _poll(lab: LabConfig, seconds: float, poll: Callable[[], None], tick: Callable[[float], None]) -> NDArray[np.int64]:
-    """Read and write, some cycles a step; how long each request took, ns, shape (requests,)."""
-    took_ns: list[int] = []
-    rate = Rate(max(SHORTEST_POLL_NS, lab.sim.step_ns // POLLS_A_STEP))
-    begin_ns = time.monotonic_ns()
-    told_s = 0.0
+def _poll(
+    lab: LabConfig, seconds: float, poll: Callable[[], None], on_progress: Callable[[float], None]
+) -> NDArray[np.int64]:
+    """Read and write `POLLS_PER_STEP` times a step; return the round trip times, ns, shape (requests,)."""
+    round_trips_ns: list[int] = []
+    rate = Rate(max(MIN_POLL_PERIOD_NS, lab.sim.step_ns // POLLS_PER_STEP))
+    start_ns = time.monotonic_ns()
+    reported_s = 0.0
     try:
-        with socket.create_connection((lab.edge.host, lab.ports[lab.rigs[0].name]), ANSWER_WITHIN_S) as link:
-            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            while (passed_s := (time.monotonic_ns() - begin_ns) * 1e-9) < seconds:
+        with socket.create_connection((lab.edge.host, lab.ports[lab.rigs[0].name]), RESPONSE_TIMEOUT_S) as connection:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            while (elapsed_s := (time.monotonic_ns() - start_ns) * 1e-9) < seconds:
                 rate.wait()
-                took_ns.append(_ask(link, READ, READ_ANSWER))
-                took_ns.append(_ask(link, WRITE, WRITE_ANSWER))
-                if passed_s - told_s > 0.5:
-                    # Between two cycles, not within one.
-                    told_s = passed_s
+                round_trips_ns.append(_request(connection, READ_REQUEST, READ_RESPONSE_BYTES))
+                round_trips_ns.append(_request(connection, WRITE_REQUEST, WRITE_RESPONSE_BYTES))
+                if elapsed_s - reported_s > 0.5:
+                    # Between two cycles, so that no cycle is delayed by it.
+                    reported_s = elapsed_s
                     poll()
-                    tick(passed_s / seconds)
+                    on_progress(elapsed_s / seconds)
     except OSError as error:
-        raise OperationError(f"the edge stopped answering: {error}") from error
-    return np.array(took_ns, np.int64)
+        raise OperationError(f"the edge stopped responding: {error}") from error
+    return np.array(round_trips_ns, np.int64)
 
 
-def _ask(link: socket.socket, request: bytes, length: int) -> int:
-    begin_ns = time.monotonic_ns()
-    link.sendall(request)
-    answer = b""
-    while len(answer) < length:
-        part = link.recv(length - len(answer))
-        if not part:
+def _request(connection: socket.socket, request: bytes, response_bytes: int) -> int:
+    """Send a request and receive its response; return the round trip time, ns."""
+    start_ns = time.monotonic_ns()
+    connection.sendall(request)
+    response = b""
+    while len(response) < response_bytes:
+        received = connection.recv(response_bytes - len(response))
+        if not received:
             raise ConnectionError("it closed the connection")
-        answer += part
-    took_ns = time.monotonic_ns() - begin_ns
-    if answer[7] & 0x80:
-        raise ConnectionError(f"exception {answer[8]:02d}")
-    return took_ns
+        response += received
+    round_trip_ns = time.monotonic_ns() - start_ns
+    if response[7] & 0x80:
+        raise ConnectionError(f"exception {response[8]:02d}")
+    return round_trip_ns
 
 
-def stolen_s() -> float | None:
-    """Processor time that the host has taken from this virtual machine since its start, s; None: it is not told."""
+def steal_time_s() -> float | None:
+    """CPU steal time of this virtual machine since its start, s (`steal` of /proc/stat); None: not reported."""
     stat = Path("/proc/stat")
     if not stat.exists():
         return None

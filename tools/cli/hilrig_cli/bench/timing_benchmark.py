@@ -1,4 +1,4 @@
-"""How well a machine keeps time, and whether that is good enough for a study at a step: figures and verdict. Pure."""
+"""Result of the timing benchmark: measured statistics and the verdict for a step of the simulation. No I/O."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -6,74 +6,78 @@ from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import Statistics
 
-LATE_SHARE: Final = 0.1
-"""Of a step, by which 999 ticks of 1,000 may be late."""
-EXCHANGE_SHARE: Final = 0.5
-"""Of a step, that bus and Modbus may take together, each at its 99th percentile: the rest is the controller's."""
-LOOP_STEPS: Final = 1.5
-"""Steps that 999 loops of 1,000 of a quick controller may take: one, and no command slips to the next tick."""
-STOLEN_SHARE: Final = 0.01
-"""Of the processors' time, that the host of a virtual machine may take away."""
-FEWEST_TICKS: Final = 500
+MAX_LATENESS_SHARE: Final = 0.1
+"""Limit of the 99.9th percentile of the tick lateness, as a share of the step."""
+MAX_EXCHANGE_SHARE: Final = 0.5
+"""Limit of the bus and Modbus times (99th percentiles), as a share of the step; the rest is the controller's."""
+MAX_LOOP_STEPS: Final = 1.5
+"""Limit of the 99.9th percentile of the loop latency, in steps: one step, and no command slips to the next tick."""
+MAX_STEAL_SHARE: Final = 0.01
+"""Limit of the CPU steal time, as a share of the processors' time."""
+MIN_TICKS: Final = 500
 
 
 @dataclass(frozen=True, slots=True)
-class Timekeeping:
-    """What was measured under one condition; ms, or a count."""
+class TimingResult:
+    """Result of one timing measurement; times in ms."""
 
     loaded: bool
-    """Whether every processor was kept busy by others."""
+    """Whether CPU stress kept every processor busy."""
     step_ms: float
     seconds: float
     ticks: int
     overruns: int
-    """Ticks that came later than a step."""
+    """Ticks that began more than a step late."""
     missed_steps: int
     tick_lateness_ms: Statistics
-    """Of the simulation behind its deadlines."""
+    """Lateness of the simulation's ticks."""
     bus_ms: Statistics
-    """Both ways between simulation and edge: the transport stage of docs/timing.md."""
+    """State link and command link together: the transport stage of docs/timing.md."""
     modbus_ms: Statistics
-    """From a request to its answer."""
+    """Round trip of a Modbus request."""
     loop_ms: Statistics
-    """Loop latency of a quick controller."""
+    """Loop latency of a fast controller."""
     stolen: float | None
-    """Share of the processors' time that the host took away; None: the system does not tell."""
+    """CPU steal time as a share of the processors' time; None: not reported by this system."""
 
     @property
     def exchange_ms(self) -> float:
-        """What a cycle spends on its way: a read, a write and both ways over the bus, each at its 99th percentile."""
+        """Communication time of a cycle: read, write and the bus in both directions, each at its 99th percentile."""
         return self.bus_ms.p99 + 2 * self.modbus_ms.p99
 
     @property
     def fit_from_ms(self) -> int:
-        """The shortest step, whole ms, at which ticks, bus and Modbus of these figures would do."""
+        """Shortest step, whole ms, for which the measured ticks, bus and Modbus times are suitable."""
         lateness = self.tick_lateness_ms
-        return max(1, math.ceil(max(lateness.p999 / LATE_SHARE, lateness.max, self.exchange_ms / EXCHANGE_SHARE)))
+        shortest_ms = max(lateness.p999 / MAX_LATENESS_SHARE, lateness.max, self.exchange_ms / MAX_EXCHANGE_SHARE)
+        return max(1, math.ceil(shortest_ms))
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What speaks against a study at this step; none: it is fit."""
+        """Reasons why the host is not suitable for a study at this step; empty: it is suitable."""
         found = []
         lateness = self.tick_lateness_ms
-        if self.ticks < FEWEST_TICKS:
-            found.append(f"{self.ticks} ticks were measured only, {FEWEST_TICKS} are needed: measure longer")
+        if self.ticks < MIN_TICKS:
+            found.append(f"only {self.ticks} ticks measured, {MIN_TICKS} required: measure longer")
         if self.overruns:
             found.append(
-                f"{self.overruns} of {self.ticks} ticks came later than a step, at most {lateness.max:.1f} ms; "
+                f"{self.overruns} of {self.ticks} ticks were more than a step late, at most {lateness.max:.1f} ms; "
                 f"{self.missed_steps} steps were missed"
             )
-        if lateness.p999 > LATE_SHARE * self.step_ms:
-            found.append(f"ticks are {lateness.p999:.2f} ms late (p99.9), more than a tenth of the step")
-        if self.exchange_ms > EXCHANGE_SHARE * self.step_ms:
-            found.append(f"bus and Modbus take {self.exchange_ms:.2f} ms of a step (p99), more than half of it")
-        if self.loop_ms.p999 > LOOP_STEPS * self.step_ms:
-            found.append(f"the loop of a quick controller takes {self.loop_ms.p999:.1f} ms (p99.9), more than a step")
-        if self.stolen is not None and self.stolen > STOLEN_SHARE:
-            found.append(f"the host takes {100 * self.stolen:.1f} % of the processors away: runs will differ")
+        if lateness.p999 > MAX_LATENESS_SHARE * self.step_ms:
+            found.append(f"tick lateness p99.9 is {lateness.p999:.2f} ms, more than a tenth of the step")
+        if self.exchange_ms > MAX_EXCHANGE_SHARE * self.step_ms:
+            found.append(f"bus and Modbus take {self.exchange_ms:.2f} ms (p99), more than half of the step")
+        if self.loop_ms.p999 > MAX_LOOP_STEPS * self.step_ms:
+            found.append(
+                f"loop latency p99.9 of a fast controller is {self.loop_ms.p999:.1f} ms, "
+                f"more than {MAX_LOOP_STEPS:g} steps"
+            )
+        if self.stolen is not None and self.stolen > MAX_STEAL_SHARE:
+            found.append(f"CPU steal is {100 * self.stolen:.1f} %: repeated runs will differ")
         return tuple(found)
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON, with the verdict."""
-        judged = {"fit": not self.reasons, "reasons": list(self.reasons), "fit_from_step_ms": self.fit_from_ms}
-        return {**asdict(self), **judged}
+        """The result and the verdict as plain values, for JSON."""
+        verdict = {"fit": not self.reasons, "reasons": list(self.reasons), "fit_from_step_ms": self.fit_from_ms}
+        return {**asdict(self), **verdict}

@@ -1,1 +1,1 @@
-"""One module a command (or a close family of commands): its options, its help, and the wiring to what does the work."""
+"""One module per command or command group: its options, its help text, and the call of its implementation."""

@@ -1,4 +1,4 @@
-"""`hilrig certs`: a lab's certificates, for Modbus/TCP Security and for the bus."""
+"""`hilrig certs`: creates a lab's certificates for Modbus/TCP Security and for the bus."""
 
 import json
 from pathlib import Path
@@ -13,35 +13,36 @@ if TYPE_CHECKING:
 
 
 def certs(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where they are written.")] = Path("certs"),
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write them to.")] = Path("certs"),
     config: Config = None,
     host: Annotated[
         list[str] | None,
-        typer.Option(help="Name or address by which others reach the edge or the router; may be given again."),
+        typer.Option(help="Host name or address of the edge or the router; may be repeated."),
     ] = None,
     client: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME[=ROLE]",
-            help="A controller and its role, operator (writes) or observer (reads); may be given again. "
+            help="A controller and its role: operator (reads and writes) or observer (reads only); may be repeated. "
             "Default: operator=operator and observer=observer.",
         ),
     ] = None,
     days: Annotated[
-        int, typer.Option(min=1, max=36_500, help="How long they are valid; an authority ten times as long.")
+        int, typer.Option(min=1, max=36_500, help="Validity, days; the authorities are valid ten times as long.")
     ] = 365,
-    renew: Annotated[bool, typer.Option("--renew", help="Make those anew too that are still good.")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Renew all certificates except the authorities.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make what a lab needs to let in nobody else: authorities, and a certificate for everyone.
+    """Create the certificate authorities and certificates that secure a lab.
 
-    The edge's and the controllers' are for Modbus/TCP Security; those in FOLDER/bus, signed by an authority of their
-    own, are for the services, the router and the commands. What is there already and good for long enough is kept, an
-    authority always, so controllers can be added. Keep the keys of the authorities, ca.key, to yourself.
+    The certificates of the edge and the controllers are for Modbus/TCP Security. Those in FOLDER/bus, signed by a
+    separate authority, are for the services, the router and the commands. Existing certificates are kept until they
+    are about to expire, and authorities are always kept, so controllers can be added later. Keep the private keys of
+    the authorities (ca.key) secret.
     """
     from datetime import UTC, datetime
 
-    from hilrig_cli.cert_store import CertificateFolder
+    from hilrig_cli.cert_store import CertificateStore
     from hilrig_runtime.bus.acl import identities
     from hilrig_runtime.config.bus import BusTlsConfig
     from hilrig_runtime.config.lab import load_lab
@@ -49,26 +50,26 @@ def certs(
 
     lab = load_lab(config)
     now = datetime.now(UTC)
-    clients = dict(_name_and_role(text) for text in client or ["operator=operator", "observer=observer"])
-    here = ["localhost", "127.0.0.1"]
+    clients = dict(_parse_client(text) for text in client or ["operator=operator", "observer=observer"])
+    loopback = ["localhost", "127.0.0.1"]
 
-    controllers = CertificateFolder(folder, now, days, renew=renew)
-    bus = CertificateFolder(folder / "bus", now, days, renew=renew)
+    controllers = CertificateStore(folder, now, days, renew=renew)
+    bus = CertificateStore(folder / "bus", now, days, renew=renew)
     authority = controllers.authority(f"hilrig {lab.name}: controllers")
-    edge_names = _distinct([*(host or []), *_reachable(lab.edge.host), *here])
+    edge_names = _distinct([*(host or []), *_reachable(lab.edge.host), *loopback])
     if controllers.is_due("edge", edge_names):
-        controllers.write("edge", issue_server(authority, controllers.names_for("edge", edge_names), now, days))
+        controllers.write("edge", issue_server(authority, controllers.host_names("edge", edge_names), now, days))
     for name, role in clients.items():
         if client or controllers.is_due(name):
             controllers.write(name, issue_client(authority, name, role, now, days))
 
     authority = bus.authority(f"hilrig {lab.name}: bus")
-    router_names = _distinct([*_router_host(lab), *(host or []), *here])
-    service_names = _distinct([*_reachable(lab.bus.host), *here])
-    wanted = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
-    for name, names in ({"router": router_names} | wanted).items():
+    router_names = _distinct([*_router_host(lab), *(host or []), *loopback])
+    service_names = _distinct([*_reachable(lab.bus.host), *loopback])
+    required = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
+    for name, names in ({"router": router_names} | required).items():
         if bus.is_due(name, names):
-            bus.write(name, issue_peer(authority, name, bus.names_for(name, names), now, days))
+            bus.write(name, issue_peer(authority, name, bus.host_names(name, names), now, days))
 
     tables = {
         "edge.tls": {
@@ -85,8 +86,8 @@ def certs(
     for path in written:
         print(f"wrote {path}")
     if not written:
-        print("all there, and good for long enough; --renew makes them anew")
-    print("\nin lab.toml:")
+        print("nothing to do: all certificates exist and are valid; --renew renews them")
+    print("\nlab.toml:")
     for table, values in tables.items():
         print(f"[{table}]")
         for key, value in values.items():
@@ -99,7 +100,7 @@ def _router_host(lab: "LabConfig") -> list[str]:
 
 
 def _reachable(host: str) -> list[str]:
-    """The host as a name that others can use; none where it stands for every address."""
+    """The host in a list; empty for a wildcard address, which no peer can connect to."""
     return [] if host in ("", "0.0.0.0", "::") else [host]
 
 
@@ -107,13 +108,16 @@ def _distinct(names: list[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _name_and_role(text: str) -> tuple[str, str]:
+def _parse_client(text: str) -> tuple[str, str]:
     from hilrig_runtime.errors import InputError
     from hilrig_schemas.topics import is_name
 
     name, _, role = text.partition("=")
     if not is_name(name) or name in ("ca", "edge"):
-        raise InputError(f"--client {text}: expected NAME or NAME=ROLE, the name of letters, digits, - and _")
+        raise InputError(
+            f"--client {text}: expected NAME or NAME=ROLE; NAME consists of letters, digits, - and _ and is not "
+            "ca or edge"
+        )
     if role not in ("", "operator", "observer"):
-        raise InputError(f"--client {text}: a role is operator or observer, found {role!r}")
+        raise InputError(f"--client {text}: expected the role operator or observer, got {role!r}")
     return name, role

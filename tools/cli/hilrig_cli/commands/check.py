@@ -1,4 +1,4 @@
-"""`hilrig check`: is this a lab, and which one?"""
+"""`hilrig check`: validates a lab's configuration file."""
 
 import json
 from pathlib import Path
@@ -11,18 +11,19 @@ from hilrig_cli.options import AsJson
 
 def check(
     file: Annotated[
-        Path | None, typer.Argument(metavar="LAB.TOML", help="The lab's file; without: the defaults.")
+        Path | None,
+        typer.Argument(metavar="LAB.TOML", help="Configuration file of the lab; default: default settings."),
     ] = None,
     template: Annotated[
-        bool, typer.Option("--template", help="Print a lab's file with every key explained and its default, instead.")
+        bool, typer.Option("--template", help="Print a template with every key, its meaning and its default instead.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Read a lab's file, name every mistake, and print what it describes."""
+    """Validate a lab's configuration file: report every error, and print the rigs with their addresses."""
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_replay.grading.task_loading import check_task
+    from hilrig_replay.grading.task_loading import validate_task
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
     from hilrig_runtime.errors import InputError
@@ -36,21 +37,21 @@ def check(
         for rig in lab.rigs:
             parameters = rig_parameters(lab, rig)
             if lab.task is not None:
-                check_task(lab.task, parameters)
+                validate_task(lab.task, parameters)
     except InputError as error:
         raise InputError(f"{file or 'defaults'}: {error}") from error
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return
-    table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is good", title_justify="left")
+    table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is valid", title_justify="left")
     addresses = lab.addresses()
     kinds = list(addresses[lab.rigs[0].name])
-    allows = any(rig.allow for rig in lab.rigs)
-    for column in ("rig", *kinds, *(["may connect"] if allows else []), "step", "integrator"):
+    is_restricted = any(rig.allow for rig in lab.rigs)
+    for column in ("rig", *kinds, *(["allowed networks"] if is_restricted else []), "step", "integrator"):
         table.add_column(column)
     for rig in lab.rigs:
         substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
-        allowed = [", ".join(map(str, rig.allow)) or "all"] if allows else []
+        allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
         table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
     Console().print(table)

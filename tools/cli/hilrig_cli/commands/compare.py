@@ -1,4 +1,4 @@
-"""`hilrig compare`: how one run differs from another."""
+"""`hilrig compare`: differences between runs."""
 
 import json
 import sys
@@ -14,29 +14,29 @@ if TYPE_CHECKING:
     from hilrig_replay.analysis.compare import Comparison
 
 
-OTHERWISE = {
-    "command": "nothing moved under command, so it is aligned by its first command",
-    "start": "no controller commanded, so it is aligned by its start",
+FALLBACK_TEXTS = {
+    "command": "no motion under command; aligned by its first command instead",
+    "start": "no command by a controller; aligned by its start instead",
 }
-"""What a run without motion is aligned by, for people."""
+"""Note on a run that could not be aligned as requested, by the alignment used instead."""
 
 
 def compare(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="A.MCAP B.MCAP…", help="Recordings; the first is the reference.")
+        list[Path], typer.Argument(metavar="A.MCAP B.MCAP…", help="Recordings; the first one is the reference.")
     ],
     align: Annotated[
-        str, typer.Option(help="What is time zero: motion, start, or an event's kind, such as part_picked.")
+        str, typer.Option(help="Time zero: motion, start, or a kind of event, such as part_picked.")
     ] = "motion",
-    plot: Annotated[Path | None, typer.Option(help="Draw them (.png, .svg, .pdf).", show_default=False)] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a plot (.png, .svg, .pdf).", show_default=False)] = None,
     save: Annotated[
-        Path | None, typer.Option(metavar="BOTH.RRD", help="Write a rerun file with all arms.", show_default=False)
+        Path | None, typer.Option(metavar="ALL.RRD", help="Write a rerun file with all arms.", show_default=False)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Align runs in time and show how they differ from the first: positions, the tool, torques, loop latency.
+    """Align runs in time and print their differences from the first: tool, positions, torques, loop latency.
 
-    Exit code 1: one of several could not be compared; it is said which, and why.
+    Exit code 1: at least one of several recordings could not be compared; it is listed with the reason.
     """
     from hilrig_replay.analysis.compare import compare as compare_runs
     from hilrig_replay.io.run import open_run
@@ -49,7 +49,7 @@ def compare(
         try:
             opened.append(open_run(path))
         except InputError as error:
-            # Among several a bad one does not hide the others; without the reference there is nothing to compare with.
+            # One unreadable recording of several is skipped; the reference is required.
             if not opened or len(runs) == 2:
                 raise
             unreadable.append(str(error))
@@ -66,7 +66,7 @@ def compare(
     else:
         _print(comparison)
         for reason in comparison.left_out:
-            print(f"left out: {reason}", file=sys.stderr)
+            print(f"skipped: {reason}", file=sys.stderr)
     if comparison.left_out:
         raise typer.Exit(1)
 
@@ -85,24 +85,24 @@ def _print(comparison: "Comparison") -> None:
         table.add_column(difference.session, justify="right", overflow="fold")
     each = comparison.differences
     table.add_row("common time, s", *(f"{one.overlap_s:.2f}" for one in each), end_section=True)
-    table.add_row("tools apart, rms, mm", *(f"{one.tool_rms_mm:.3f}" for one in each))
-    table.add_row("tools apart, largest, mm", *(f"{one.tool_max_mm:.3f}" for one in each), end_section=True)
+    table.add_row("tool distance, rms, mm", *(f"{one.tool_rms_mm:.3f}" for one in each))
+    table.add_row("tool distance, max, mm", *(f"{one.tool_max_mm:.3f}" for one in each), end_section=True)
     for joint, (name, unit) in enumerate((("θ1", "°"), ("θ2", "°"), ("d3", "mm"), ("θ4", "°"))):
 
-        def shown(value: float, in_mm: bool = unit == "mm") -> str:
+        def formatted(value: float, in_mm: bool = unit == "mm") -> str:
             return f"{value * 1000 if in_mm else degrees(value):.3f}"
 
-        figures = (f"{shown(one.position_rms[joint])} / {shown(one.position_max[joint])}" for one in each)
-        table.add_row(f"{name}, rms / largest, {unit}", *figures, end_section=joint == 3)
+        figures = (f"{formatted(one.position_rms[joint])} / {formatted(one.position_max[joint])}" for one in each)
+        table.add_row(f"{name}, rms / max, {unit}", *figures, end_section=joint == 3)
     efforts = (" ".join(f"{value:.3f}" for value in one.effort_rms) for one in each)
     table.add_row("τ1 τ2 τ3 τ4, rms, N·m (τ3: N)", *efforts, end_section=True)
     for name, values in (
-        ("loop latency p50, ms more", [one.loop_p50_ms for one in each]),
-        ("loop latency p99, ms more", [one.loop_p99_ms for one in each]),
+        ("Δ loop latency p50, ms", [one.loop_p50_ms for one in each]),
+        ("Δ loop latency p99, ms", [one.loop_p99_ms for one in each]),
     ):
         table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
     console = Console()
     console.print(table)
     for summary, origin in zip(comparison.summaries, comparison.origins, strict=True):
-        if (why := OTHERWISE.get(origin.by)) and origin.by != comparison.aligned_by:
-            console.print(f"{summary.session}: {why}", highlight=False, markup=False)
+        if (note := FALLBACK_TEXTS.get(origin.by)) and origin.by != comparison.aligned_by:
+            console.print(f"{summary.session}: {note}", highlight=False, markup=False)

@@ -1,4 +1,4 @@
-"""`hilrig console`: the lab in a browser."""
+"""`hilrig console`: web console of the lab."""
 
 import sys
 from pathlib import Path
@@ -12,31 +12,34 @@ from hilrig_cli.options import Config
 def console(
     config: Config = None,
     listen: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where to answer; :8050 alone is every address of this host.")
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on; :8050 listens on all addresses.")
     ] = "127.0.0.1:8050",
     password_file: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Its first line is the password. Without: none on loopback, elsewhere a new one that is printed.",
+            help="File whose first line is the password. Default: no password on loopback, otherwise a generated one, "
+            "which is printed.",
             show_default=False,
         ),
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option(metavar="PEM", help="Answer by HTTPS with this certificate.", show_default=False)
+        Path | None, typer.Option(metavar="PEM", help="Serve HTTPS with this certificate.", show_default=False)
     ] = None,
-    key: Annotated[Path | None, typer.Option(metavar="PEM", help="The certificate's key.", show_default=False)] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="PEM", help="Private key of the certificate.", show_default=False)
+    ] = None,
     name: Annotated[
         list[str] | None,
-        typer.Option(help="Name by which browsers call this host, beside its own; may be given again."),
+        typer.Option(help="Additional host name that browsers use for this host; may be repeated."),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Only ask whether the console at --listen is well, as health checks do.")
+        bool, typer.Option("--check", help="Check that the console at --listen responds; for container health checks.")
     ] = False,
 ) -> None:
-    """Show the lab to browsers until Ctrl-C: every rig live, services, events, recordings with their reports.
+    """Serve a web console until Ctrl-C: every rig live, services, events, recordings with their reports.
 
-    It only looks: nothing on the bus and nothing of a rig can be changed by it.
+    The console is read-only: it cannot change the bus or a rig.
     """
     import platform
     import secrets
@@ -46,11 +49,11 @@ def console(
     from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
-    from hilrig_runtime.process.shutdown import end_when_closing_hangs, stop_on_signals, wait_for
-    from hilrig_runtime.timing.realtime import yield_to_others
+    from hilrig_runtime.process.shutdown import force_exit_after, stop_on_signals, wait_for
+    from hilrig_runtime.timing.realtime import lower_priority
 
     if (certificate is None) != (key is None):
-        raise InputError("--certificate and --key belong together: give both")
+        raise InputError("--certificate and --key must be given together")
     tls = None if certificate is None or key is None else TlsFiles(certificate, key)
     address = ListenAddress.parse(listen)
     if check:
@@ -58,21 +61,25 @@ def console(
         return
     lab = load_lab(config)
     password = _password(password_file) if password_file is not None else ""
-    invented = not password and not address.is_loopback
-    if invented:
+    generated = not password and not address.is_loopback
+    if generated:
         password = secrets.token_urlsafe(12)
     names = normalize_host_names([platform.node(), address.host, *(name or [])])
     server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
-    yield_to_others()
+    lower_priority()
     stopping = threading.Event()
     stop_on_signals(stopping)
-    end_when_closing_hangs(stopping, 8.0)
+    force_exit_after(stopping, 8.0)
     with server:
         print(f"console of lab {lab.name}: {server.url}", flush=True)
-        if invented:
+        if generated:
             print(f"password: {password} (any user name)", flush=True)
         if tls is None and not address.is_loopback:
-            print("hilrig: without --certificate and --key the password can be overheard", file=sys.stderr, flush=True)
+            print(
+                "hilrig: warning: without --certificate and --key the password is sent unencrypted",
+                file=sys.stderr,
+                flush=True,
+            )
         wait_for(stopping)
 
 
@@ -83,8 +90,11 @@ def _password(file: Path) -> str:
     try:
         password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "no text"
-        raise InputError(f"--password-file: {file} can't be read: {reason}") from error
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"--password-file: {file}: can't be read: {reason}") from error
     if len(password) < MIN_PASSWORD_CHARS:
-        raise InputError(f"--password-file: {file}: its first line must have at least {MIN_PASSWORD_CHARS} characters")
+        raise InputError(
+            f"--password-file: {file}: the password in the first line must have at least {MIN_PASSWORD_CHARS} "
+            f"characters, got {len(password)}"
+        )
     return password

@@ -1,4 +1,4 @@
-"""`hilrig demo`: the whole rig with a controller over real Modbus TCP, then everything that a recording tells."""
+"""`hilrig demo`: runs a lab with the example controller and analyzes the recording."""
 
 import json
 from pathlib import Path
@@ -13,17 +13,17 @@ def demo(
     duration: Annotated[
         float | None,
         typer.Option(
-            min=1.0, help="How long the controller runs, seconds; where it is not said, 20, or more to finish its work."
+            min=1.0, help="Duration of the controller, s; default: 20, and up to 20 more until its work is finished."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("demo-out"),
     as_json: AsJson = False,
 ) -> None:
-    """Run the whole rig with the example controller, then measure, verify and draw what was recorded.
+    """Run a lab with the example controller, then measure, verify and plot the recording.
 
-    The controller, examples/pick_and_place.py, is a process of its own that speaks Modbus TCP. Parts that it had no
-    time to place are named. Exit code 1: the loop never closed, the recording could not be verified, or a part does not
-    stand where the controller believes it to.
+    The controller, examples/pick_and_place.py, runs as a separate process and connects over Modbus TCP. Parts that it
+    had no time to place are listed. Exit code 1: the loop never closed, the recording could not be verified, or a part
+    that the controller reported as placed is not in the tray.
     """
     from rich.console import Console
     from rich.progress import Progress, TimeElapsedColumn
@@ -33,19 +33,19 @@ def demo(
 
     console = Console(stderr=True, quiet=as_json)
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
 
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("controller", total=1.0)
-        recorded = run_demo(duration, out, say, lambda share: progress.update(task, completed=share))
-    with console.status("measuring, verifying and drawing the run"):
-        found = review(recorded, out)
+        recorded = run_demo(duration, out, log, lambda share: progress.update(task, completed=share))
+    with console.status("measuring, verifying and plotting the run"):
+        result = review(recorded, out)
     if as_json:
-        print(json.dumps(found.as_dict()))
+        print(json.dumps(result.as_dict()))
     else:
-        print_report(found.latency)
-        for line in found.sentences():
+        print_report(result.latency)
+        for line in result.summary_lines():
             print(line)
-    if not found.good:
+    if not result.passed:
         raise typer.Exit(1)

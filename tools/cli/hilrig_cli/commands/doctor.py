@@ -1,4 +1,4 @@
-"""`hilrig doctor`: is this deployment as it should be, and what is to be mended?"""
+"""`hilrig doctor`: diagnosis of a deployment."""
 
 import json
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +10,7 @@ from hilrig_cli.options import AsJson, Config
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from hilrig_cli.doctor import Finding
+    from hilrig_cli.doctor import CheckResult
     from hilrig_runtime.config.lab import LabConfig
 
 
@@ -20,119 +20,126 @@ def doctor(
         str,
         typer.Option(
             metavar="NAME",
-            help="Only ask whether this service is well (sim, edge, recorder or router), as health checks do.",
+            help="Check this service only (sim, edge, recorder or router); for container health checks.",
             show_default=False,
         ),
     ] = "",
     instance: Annotated[
         str,
-        typer.Option(metavar="NAME", help="With --service: this one of its kind; without: any.", show_default=False),
+        typer.Option(metavar="NAME", help="With --service: check this instance; default: any.", show_default=False),
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Look at ports, bus, services, certificates, versions, clocks, limits and disk, and say what is to be mended.
+    """Check ports, bus, services, certificates, versions, clocks, limits and disk, and print how to fix errors.
 
-    Run it on each host, before or while the lab runs. Exit code 1 if something is wrong.
+    Run it on each host, before or while the lab runs. Exit code 1: at least one error was found.
     """
+    from hilrig_cli.doctor import Level
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    findings = _one_service(lab, service, instance) if service else _everything(lab)
-    bad = [finding for finding in findings if finding.level.value == "wrong"]
+    results = _check_service(lab, service, instance) if service else _check_all(lab)
+    errors = [result for result in results if result.level is Level.ERROR]
     if as_json:
         rows = [
-            {"check": found.check, "level": found.level.value, "text": found.text, "mend": found.mend}
-            for found in findings
+            {"check": result.check, "level": result.level.value, "text": result.text, "fix": result.fix}
+            for result in results
         ]
-        print(json.dumps({"lab": lab.name, "well": not bad, "findings": rows}))
+        print(json.dumps({"lab": lab.name, "well": not errors, "findings": rows}))
     else:
-        _print(findings)
-    if bad:
+        _print_table(results)
+    if errors:
         raise typer.Exit(1)
 
 
-def _everything(lab: "LabConfig") -> "list[Finding]":
+def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     from datetime import UTC, datetime
     from importlib.metadata import version
 
-    from hilrig_cli.doctor import good, host
-    from hilrig_cli.doctor import services as on_bus
+    from hilrig_cli.doctor import CheckResult, host, services
 
-    findings = [
-        good("lab", f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms")
-    ]
-    findings += host.check_software()
-    of_bus, heard = on_bus.check_bus(lab)
-    findings += of_bus
-    if heard is not None:
-        findings += on_bus.check_services(lab, heard)
-    # Of a lab that can't be heard nobody knows what runs; this host can be looked at all the same.
-    heard = heard or on_bus.Heard()
-    findings += on_bus.check_realtime(lab, heard)
-    findings += on_bus.check_versions((health for health, _ in heard.healths.values()), version("hilrig"))
-    findings += on_bus.check_clocks(list(heard.healths.values()))
+    text = f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms"
+    results = [CheckResult.ok("lab", text)]
+    results += host.check_software()
+    bus_results, joined = services.check_bus(lab)
+    results += bus_results
+    if joined is not None:
+        results += services.check_services(lab, joined)
+    # Without the bus the services are unknown; the checks of this host still run.
+    snapshot = joined or services.BusSnapshot()
+    results += services.check_realtime(lab, snapshot)
+    results += services.check_versions((health for health, _ in snapshot.healths.values()), version("hilrig"))
+    results += services.check_clocks(list(snapshot.healths.values()))
     if lab.bus.tls is not None or lab.edge.tls is not None:
-        findings += _certificates(lab, datetime.now(UTC))
-    findings += host.check_ports(lab, heard.services)
-    findings += host.check_open_files(lab)
-    findings += host.check_punctuality(lab)
-    findings += host.check_disk(lab)
-    return findings
+        results += _check_certificates(lab, datetime.now(UTC))
+    results += host.check_ports(lab, snapshot.services)
+    results += host.check_open_files(lab)
+    results += host.check_timer_accuracy(lab)
+    results += host.check_disk(lab)
+    return results
 
 
-def _certificates(lab: "LabConfig", now: "datetime") -> "list[Finding]":
-    from hilrig_cli.doctor import notice
+def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]":
+    from hilrig_cli.doctor import CheckResult
 
     try:
-        # Only the edge needs what reads certificates; zenoh reads its own.
+        # The package that reads certificates is part of the edge's dependencies only; zenoh reads its own.
         from hilrig_cli.doctor.certificates import check_certificates
     except ModuleNotFoundError as error:
-        text = f"can't be looked at: {error.name!r} is not installed on this host"
-        return [notice("certificates", text, "pip install 'hilrig[edge]', or look at copies of them elsewhere")]
+        text = f"not checked: {error.name!r} is not installed on this host"
+        fix = "pip install 'hilrig[edge]', or check copies of the certificates on another host"
+        return [CheckResult.warning("certificates", text, fix)]
     return list(check_certificates(lab, now))
 
 
-def _one_service(lab: "LabConfig", service: str, instance: str) -> "list[Finding]":
-    from hilrig_cli.doctor import good, wrong
-    from hilrig_cli.doctor.services import SERVICES, is_one, listen
+def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[CheckResult]":
+    from hilrig_cli.doctor import CheckResult
+    from hilrig_cli.doctor.services import collect, matches
+    from hilrig_cli.service_kinds import SERVICE_KINDS
     from hilrig_runtime.errors import HilrigError, InputError
 
-    if service not in (*SERVICES, "router"):
+    if service not in (*SERVICE_KINDS, "router"):
         raise InputError(f"--service {service}: expected sim, edge, recorder or router")
     if service == "router" and lab.bus.topology != "router":
-        raise InputError("--service router: this lab has none (bus.topology in lab.toml)")
-    # A container has its own service's certificate and no other; in a mesh a tool's is needed, for the port is taken.
+        raise InputError('--service router: this lab has no router (bus.topology in lab.toml is not "router")')
+    # A container has its own service's certificate only. In a mesh the service's port is in use, so join as a tool.
     identity = service if lab.bus.topology == "router" else "tool"
     wanted = f"{service}/{instance}" if instance else service
     try:
-        heard = listen(lab, identity, until=wanted, for_s=0.0 if service == "router" else 2.5)
+        snapshot = collect(lab, identity, until=wanted, timeout_s=0.0 if service == "router" else 2.5)
     except HilrigError as error:
-        return [wrong(service, str(error), "see its log")]
+        return [CheckResult.error(service, str(error), "see the service's log")]
     if service == "router":
-        return [good(service, "it answers")]
-    for name, (health, _) in heard.healths.items():
-        if is_one(name, wanted):
-            if health.trouble:
-                return [wrong(service, health.trouble, "see its log")]
-            return [good(service, f"{name} is well, {health.uptime_ns / 1e9:.0f} s after it started")]
-    return [wrong(service, f"no {wanted} says how it is", "see its log, or start it again")]
+        return [CheckResult.ok(service, "running")]
+    for name, (health, _) in snapshot.healths.items():
+        if matches(name, wanted):
+            if health.alert:
+                return [CheckResult.error(service, health.alert, "see the service's log")]
+            return [CheckResult.ok(service, f"{name}: running for {health.uptime_ns / 1e9:.0f} s")]
+    return [CheckResult.error(service, f"no health report from {wanted}", "see the service's log, or restart it")]
 
 
-def _print(findings: "list[Finding]") -> None:
+def _print_table(results: "list[CheckResult]") -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    colours = {"good": "green", "notice": "yellow", "wrong": "bold red"}
+    from hilrig_cli.doctor import Level
+
+    colors = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "bold red"}
     table = Table()
-    for column in ("", "check", "found"):
-        table.add_column(column, no_wrap=column != "found", overflow="fold")
-    for found in findings:
-        mend = f"\n[dim]→ {escape(found.mend)}[/dim]" if found.mend else ""
-        level = found.level.value
-        table.add_row(f"[{colours[level]}]{level}[/]", found.check, escape(found.text) + mend)
-    Console().print(table)
-    wrong = sum(found.level.value == "wrong" for found in findings)
-    notices = sum(found.level.value == "notice" for found in findings)
-    well = "all is well" if not notices else f"nothing is wrong; {notices} to look at"
-    Console().print(f"[green]{well}[/]" if not wrong else f"[bold red]{wrong} to mend[/]")
+    for column in ("level", "check", "result"):
+        table.add_column(column, no_wrap=column != "result", overflow="fold")
+    for result in results:
+        fix = f"\n[dim]fix: {escape(result.fix)}[/dim]" if result.fix else ""
+        table.add_row(f"[{colors[result.level]}]{result.level.value}[/]", result.check, escape(result.text) + fix)
+    console = Console()
+    console.print(table)
+    errors = sum(result.level is Level.ERROR for result in results)
+    warnings = sum(result.level is Level.WARNING for result in results)
+    summary = _count(errors, "error") + (f", {_count(warnings, 'warning')}" if warnings else "")
+    console.print(f"[bold red]{summary}[/]" if errors else f"[green]{summary}[/]", highlight=False)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number or 'no'} {noun}{'' if number == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""`hilrig export`: a recording for other tools."""
+"""`hilrig export`: converts a recording for other tools."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,9 @@ def export(
     run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
     foxglove: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.MCAP", help="An MCAP in which Foxglove and rerun draw the arm.", show_default=False),
+        typer.Option(
+            metavar="OUT.MCAP", help="Write an MCAP file in which Foxglove and rerun show the arm.", show_default=False
+        ),
     ] = None,
     csv: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write tables as CSV into a folder.", show_default=False)
@@ -20,13 +22,13 @@ def export(
         Path | None, typer.Option(metavar="FOLDER", help="Write tables as Parquet into a folder.", show_default=False)
     ] = None,
 ) -> None:
-    """Write a recording for other tools; what was written is printed, a line a file."""
+    """Convert a recording for other tools; print the path of each file that was written."""
     from hilrig_replay.export.export import export_foxglove, export_tables
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
     if foxglove is None and csv is None and parquet is None:
-        raise InputError("nothing to write: give --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
+        raise InputError("no output given: add --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
     opened = open_run(run)
     written: list[Path] = []
     if foxglove is not None:

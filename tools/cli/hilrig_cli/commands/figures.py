@@ -1,4 +1,4 @@
-"""`hilrig figures`: the paper's figures 4, 5 and 6, and whether the numbers behind them come out."""
+"""`hilrig figures`: reproduces figures 4, 5 and 6 of the paper and checks their numbers."""
 
 import json
 from pathlib import Path
@@ -10,13 +10,13 @@ from hilrig_cli.options import AsJson
 
 
 def figures(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path("figures"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the figures.")] = Path("figures"),
     step_ms: Annotated[float, typer.Option(help="Step of the fixed-step methods, ms.")] = 20.0,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the paper's experiment by Euler, Dormand–Prince and Runge–Kutta–Fehlberg, and draw its figures.
+    """Repeat the paper's experiment with Euler, Dormand–Prince and Runge–Kutta–Fehlberg, and plot its figures.
 
-    Exit code 1: a number is not what is expected at the paper's step of 20 ms.
+    Exit code 1: a number differs from the expected one at the paper's step of 20 ms.
     """
     from rich.console import Console
     from rich.table import Table
@@ -30,10 +30,10 @@ def figures(
     else:
         console = Console()
         table = Table(title="Experiment (44) of the paper", title_justify="left", title_style="bold")
-        for column in ("", "expected", "came out", "agrees"):
+        for column in ("quantity", "expected", "computed", "agrees"):
             table.add_column(column)
-        for what, expected, came_out, holds in found.checks():
-            table.add_row(what, expected, came_out, "yes" if holds else "no", style=None if holds else "red")
+        for name, expected, computed, holds in found.checks():
+            table.add_row(name, expected, computed, "yes" if holds else "no", style=None if holds else "red")
         console.print(table)
         for path in files:
             console.print(str(path), soft_wrap=True)

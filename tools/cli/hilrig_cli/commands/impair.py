@@ -1,4 +1,4 @@
-"""`hilrig impair`: delay and loss added to a rig's loop on purpose, while it runs."""
+"""`hilrig impair`: network impairment emulation (delay, loss) in the loop of a running rig."""
 
 import json
 from pathlib import Path
@@ -12,60 +12,63 @@ if TYPE_CHECKING:
     from hilrig_runtime.config.impairment import ImpairmentConfig
     from hilrig_schemas import ImpairmentStatus
 
-DELAYS = (
+DELAY_SYNTAX = (
     "constant:MS, uniform:LOW,HIGH, normal:MEAN,STD, gamma:MEAN,STD[,OFFSET], exponential:MEAN[,OFFSET], trace:FILE"
 )
-LOSSES = "none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
+LOSS_SYNTAX = "none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
 
 
 def impair(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig; without: all of the lab are shown.")] = "",
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: show all rigs of the lab.")] = "",
     preset: Annotated[
         str,
-        typer.Option(metavar="NAME", help="none, wired, busy-wifi, vpn, mobile or paper-25-100ms.", show_default=False),
+        typer.Option(
+            metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms.", show_default=False
+        ),
     ] = "",
     state: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state's way, ms: {DELAYS}.", show_default=False)
+        str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state link, ms: {DELAY_SYNTAX}.", show_default=False)
     ] = "",
     command: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help="Delay of the command's way, as --state.", show_default=False)
+        str,
+        typer.Option(metavar="KIND:ARGS", help="Delay of the command link; kinds as for --state.", show_default=False),
     ] = "",
     loss: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both ways: {LOSSES}.", show_default=False)
+        str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.", show_default=False)
     ] = "",
     trace: Annotated[
         Path | None,
         typer.Option(
-            metavar="RUN.MCAP", help="Delay commands as that recording's loop was delayed.", show_default=False
+            metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording.", show_default=False
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same delays and losses.")] = 1,
-    off: Annotated[bool, typer.Option("--off", help="No impairment, until something else is set.")] = False,
-    lab: Annotated[bool, typer.Option("--lab", help="As lab.toml says it.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the delays and losses.")] = 1,
+    off: Annotated[bool, typer.Option("--off", help="Remove the impairment.")] = False,
+    lab: Annotated[bool, typer.Option("--lab", help="Restore the impairment of lab.toml.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Add delay and loss to a rig's loop while it runs, or show what is in force.
+    """Add delay and loss to the loop of a running rig, or show the active impairment.
 
-    What is set holds until it is set otherwise or the edge is started anew. The watchdog's zero torque is never delayed
-    or lost. Every change is an event of the recording, and every delay stands with its command.
+    The setting stays active until changed or until the edge restarts. The watchdog's zero torque is never delayed or
+    lost. Each change is recorded as an event, and each delay with its command.
     """
-    from hilrig_cli.client import ask_edges
+    from hilrig_cli.client import query_edges
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_schemas import ImpairmentRequest, topics
 
     setting = any((preset, state, command, loss, trace))
     if setting + off + lab > 1:
-        raise InputError("--off and --lab stand alone: leave out either them or what is to be set")
+        raise InputError("--off and --lab can't be combined with each other or with an impairment: use one of them")
     if (setting or off or lab) and not rig:
-        raise InputError("setting an impairment takes a rig: hilrig impair RIG …")
+        raise InputError("a rig is required to set an impairment: hilrig impair RIG …")
     if trace is not None and command:
-        raise InputError("--trace is a delay of the command's way: leave out --command")
-    request = ImpairmentRequest(as_lab=lab)
+        raise InputError("--trace and --command both set the delay of the command link: use one of them")
+    request = ImpairmentRequest(restore_lab=lab)
     if setting or off:
         request.set_json = _impairment(preset, state, command, loss, trace, seed).model_dump_json()
-    statuses = ask_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
+    statuses = query_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if rig else rows))
@@ -74,44 +77,44 @@ def impair(
 
 
 def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | None, seed: int) -> "ImpairmentConfig":
-    """What was asked for on the command line.
+    """Impairment from the command line options.
 
     Raises:
-        InputError: there is no such thing; what would be right is said.
+        InputError: the requested impairment is invalid.
     """
     from pydantic import ValidationError
 
     from hilrig_runtime.config.impairment import ImpairmentConfig
-    from hilrig_runtime.config.validation import mistakes_in
+    from hilrig_runtime.config.validation import format_validation_error
     from hilrig_runtime.errors import InputError
 
     try:
-        ways = ImpairmentConfig(preset=preset or "none").ways
+        base = ImpairmentConfig(preset=preset or "none").links
         delays = {
-            "state": state or ways.state.delay,
-            "command": command or ways.command.delay,
+            "state": state or base.state.delay,
+            "command": command or base.command.delay,
         }
         if trace is not None:
             from hilrig_replay.export.delay_trace import delay_trace
             from hilrig_replay.io.run import open_run
 
             delays["command"] = delay_trace(open_run(trace))
-        losses = {"state": loss or ways.state.loss, "command": loss or ways.command.loss}
-        told = {way: {"delay": delays[way], "loss": losses[way]} for way in delays}
-        return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **told})
+        losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
+        links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
+        return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **links})
     except ValidationError as error:
-        raise InputError("\n".join(mistakes_in(error))) from error
+        raise InputError("\n".join(format_validation_error(error))) from error
 
 
 def _row(status: "ImpairmentStatus") -> dict[str, object]:
     return {
         "rig": status.rig,
         "impairment": status.text,
-        "ways": json.loads(status.ways_json),
+        "ways": json.loads(status.links_json),
         "seed": status.seed,
         "set_by": status.source,
-        "states": {"count": status.states, "lost": status.states_lost, "overtaken": status.states_overtaken},
-        "commands": {"count": status.commands, "lost": status.commands_lost, "overtaken": status.commands_overtaken},
+        "states": {"count": status.states, "lost": status.states_lost, "overtaken": status.states_superseded},
+        "commands": {"count": status.commands, "lost": status.commands_lost, "overtaken": status.commands_superseded},
     }
 
 
@@ -120,17 +123,17 @@ def _print_table(statuses: "list[ImpairmentStatus]") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_runtime.config.impairment import Ways
+    from hilrig_runtime.config.impairment import LinkImpairments
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in ("rig", "way", "impairment", "messages", "lost", "overtaken"):
-        numeric = column in ("messages", "lost", "overtaken")
+    for column in ("rig", "link", "impairment", "messages", "lost", "superseded"):
+        numeric = column in ("messages", "lost", "superseded")
         table.add_column(column, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")
     for status in statuses:
-        ways = Ways.model_validate_json(status.ways_json)
-        states = (status.states, status.states_lost, status.states_overtaken)
-        commands = (status.commands, status.commands_lost, status.commands_overtaken)
-        table.add_row(status.rig, "state", ways.state.describe(), *map(str, states))
-        whose = f"({status.source}, seed {status.seed})"
-        table.add_row(whose, "command", ways.command.describe(), *map(str, commands), end_section=True)
+        links = LinkImpairments.model_validate_json(status.links_json)
+        states = (status.states, status.states_lost, status.states_superseded)
+        commands = (status.commands, status.commands_lost, status.commands_superseded)
+        table.add_row(status.rig, "state", links.state.describe(), *map(str, states))
+        origin = f"({status.source}, seed {status.seed})"
+        table.add_row(origin, "command", links.command.describe(), *map(str, commands), end_section=True)
     Console().print(table)

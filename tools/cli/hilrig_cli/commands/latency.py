@@ -1,4 +1,4 @@
-"""`hilrig latency`: where the time goes between a state and the torque that answers it."""
+"""`hilrig latency`: loop latency of recordings, from a state to the tick at which its torque acts."""
 
 import json
 import sys
@@ -23,26 +23,29 @@ def latency(
     ],
     plot: Annotated[
         Path | None,
-        typer.Option(help="Draw histogram, stages, tail and history (.png, .svg, .pdf); one run.", show_default=False),
+        typer.Option(
+            help="Write a plot of histogram, stages, tail and history (.png, .svg, .pdf); one recording only.",
+            show_default=False,
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the loop latency of recordings: six stages, percentiles, jitter, and why it is what it is.
+    """Measure the loop latency of recordings: six stages, percentiles, jitter, losses, and a diagnosis.
 
-    Exit code 1: the recording (or one of them) is not valid for latency measurements; the reasons are printed.
+    Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
     from hilrig_replay.analysis.latency import measure
-    from hilrig_replay.io.paths import names_of, recordings
+    from hilrig_replay.io.paths import display_names, find_recordings
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
-    paths = recordings(runs)
+    paths = find_recordings(runs)
     if plot is not None:
         from hilrig_replay.plots.latency_plot import save_plot
         from hilrig_replay.plots.output import check_plot_path
 
         if len(paths) > 1:
-            raise InputError(f"--plot draws one run, and {len(paths)} were given")
+            raise InputError(f"--plot: expected one recording, got {len(paths)}")
         check_plot_path(plot)
     reports, unreadable = [], []
     for path in paths:
@@ -50,22 +53,22 @@ def latency(
             run = open_run(path)
             report = measure(run)
         except InputError as error:
-            # Among many runs a bad one is a line of its own.
+            # An unreadable recording of several is reported in its own line.
             if len(paths) == 1:
                 raise
             unreadable.append({"path": str(path), "reason": str(error)})
             continue
         if plot is not None:
             save_plot(report, run, plot)
-        # Of many runs only the figures are kept.
+        # Of each recording only the statistics are kept, not the samples.
         reports.append((path, report.without_table()))
     if as_json:
-        many = {"runs": [{"path": str(path), **each.as_dict()} for path, each in reports], "unreadable": unreadable}
-        print(json.dumps(reports[0][1].as_dict() if len(paths) == 1 else many))
+        overview = {"runs": [{"path": str(path), **each.as_dict()} for path, each in reports], "unreadable": unreadable}
+        print(json.dumps(reports[0][1].as_dict() if len(paths) == 1 else overview))
     elif len(paths) == 1:
         print_report(reports[0][1])
     else:
-        names = names_of(paths)
+        names = display_names(paths)
         print_overview({names[path]: each for path, each in reports})
         for bad in unreadable:
             print(bad["reason"], file=sys.stderr)
@@ -77,7 +80,7 @@ COLUMNS = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 
 
 def print_report(report: "LatencyReport") -> None:
-    """Print one run's latency as a table for people."""
+    """Print the latency report of one run: a table, losses, findings and the verdict."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -87,7 +90,7 @@ def print_report(report: "LatencyReport") -> None:
 
     console = Console()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
-    # Without rules between the columns it fits a terminal of 80 characters.
+    # Without lines between the columns the table fits a terminal of 80 characters.
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("ms", no_wrap=True)
     for column in COLUMNS:
@@ -113,7 +116,7 @@ def print_report(report: "LatencyReport") -> None:
 
 
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
-    """Print many runs by their names: the figures one line each, and below them what there is to say."""
+    """Print a table of runs by name, one line each, and below it their findings or reasons."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -125,16 +128,16 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     table.add_column("run", overflow="fold")
     for column in ("samples", "p50", "p99", "p99.9", "max"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("fit")
+    table.add_column("valid")
     for name, report in reports.items():
         loop = report.loop_ms
         figures = [f"{value:.2f}" for value in (loop.p50, loop.p99, loop.p999, loop.max)] if loop else ["–"] * 4
         table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
     console.print(table)
     for name, report in reports.items():
-        why = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
-        if why:
-            console.print(Text(f"{name}: {'' if report.fit else 'not fit: '}{why}"))
+        note = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
+        if note:
+            console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))
 
 
 def _figures(statistics: "Statistics") -> list[str]:

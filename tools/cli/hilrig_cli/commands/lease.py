@@ -1,4 +1,4 @@
-"""`hilrig lease`: who holds a rig, and taking it back."""
+"""`hilrig lease`: shows or releases the lease of a rig."""
 
 import json
 from typing import TYPE_CHECKING, Annotated
@@ -12,23 +12,23 @@ if TYPE_CHECKING:
 
 
 def lease(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig; without: all of the lab.")] = "",
-    release: Annotated[bool, typer.Option("--release", help="Take the rig from the controller that holds it.")] = False,
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: all rigs of the lab.")] = "",
+    release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which controller holds a rig, or take the rig from it: the next other one to write gets it.
+    """Show the lease holder of a rig, or revoke its lease: the next other controller that writes acquires it.
 
-    Exit code 1 with --release when nobody held it.
+    Exit code 1: with --release, the rig had no lease holder.
     """
-    from hilrig_cli.client import ask_edges
+    from hilrig_cli.client import query_edges
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_schemas import LeaseRequest, topics
 
     if release and not rig:
-        raise InputError("--release takes a rig: hilrig lease RIG --release")
-    statuses = ask_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
+        raise InputError("--release requires a rig: hilrig lease RIG --release")
+    statuses = query_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if rig else rows))
@@ -56,20 +56,21 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
     from rich.table import Table
 
     table = Table()
-    for column in ("rig", "held by", "last request", "session", "connections", "watchdog"):
-        table.add_column(column, no_wrap=column in ("rig", "held by"), overflow="fold")
+    for column in ("rig", "lease holder", "last request", "session", "connections", "watchdog"):
+        table.add_column(column, no_wrap=column in ("rig", "lease holder"), overflow="fold")
     for status in statuses:
-        off = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
+        timeout = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
         table.add_row(
             status.rig,
-            status.holder or "nobody",
+            status.holder or "none",
             f"{status.silent_ns / 1e9:.1f} s ago" if status.holder else "",
             status.session,
             str(status.connections),
-            "tripped" if status.watchdog_tripped else off,
+            "tripped" if status.watchdog_tripped else timeout,
         )
     console = Console()
     console.print(table)
     if release:
-        taken = statuses[0].released
-        console.print(f"taken from {taken}: the next other controller to write gets it" if taken else "nobody held it")
+        former = statuses[0].released
+        text = f"lease of {former} revoked: the next other controller that writes acquires it"
+        console.print(text if former else "the rig had no lease holder")

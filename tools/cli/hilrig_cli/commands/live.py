@@ -1,4 +1,4 @@
-"""`hilrig live`: a running rig in the rerun viewer."""
+"""`hilrig live`: shows a running rig in the rerun viewer."""
 
 import sys
 import threading
@@ -13,15 +13,17 @@ from hilrig_cli.options import Config
 
 def live(
     rig: Annotated[
-        str | None, typer.Argument(metavar="RIG", help="Which rig; without: the lab's first.", show_default=False)
+        str | None,
+        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig.", show_default=False),
     ] = None,
     config: Config = None,
     save: Annotated[
-        Path | None, typer.Option(metavar="LIVE.RRD", help="Write a rerun file and open nothing.", show_default=False)
+        Path | None,
+        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
-    """Follow a running rig: the same view as of a recording, as it happens; until it is closed, or Ctrl-C."""
+    """Show a running rig in the rerun viewer, like `replay`, until the viewer is closed or Ctrl-C."""
     from hilrig_cli.client import check_rig
     from hilrig_replay.rerun_view.layout import layout
     from hilrig_replay.rerun_view.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
@@ -34,13 +36,13 @@ def live(
     from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
     if save is not None and web:
-        raise InputError("--save writes a file and --web serves a browser: choose one")
+        raise InputError("--save and --web can't be combined: use one of them")
     lab = load_lab(config)
     name = rig or lab.rigs[0].name
     stopping = threading.Event()
     stop_on_signals(stopping)
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         print(f"hilrig: {line}", file=sys.stderr, flush=True)
 
     blueprint = layout(live=True)
@@ -50,18 +52,18 @@ def live(
         if save is not None:
             stream = to_file(save, f"live-{name}", blueprint)
 
-            def over() -> bool:
+            def is_closed() -> bool:
                 return False
         else:
             grpc_port, web_port = free_port(), free_port() if web else None
             viewer = closing.enter_context(running_viewer(grpc_port, web_port))
             if web_port is not None:
-                say(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it")
+                log(f"open {browser_address(grpc_port, web_port)} ; press Ctrl-C to stop")
             stream = to_viewer(grpc_port, f"live-{name}", blueprint)
 
-            def over() -> bool:
+            def is_closed() -> bool:
                 return viewer.poll() is not None
 
         closing.callback(stream.disconnect)
         period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S
-        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, say, lab.task), over, stopping, period_s)
+        follow(Follower(bus, lab.name, name, stream, SYSTEM_CLOCK, log, lab.task), is_closed, stopping, period_s)

@@ -1,4 +1,4 @@
-"""`hilrig metrics`: the lab for Prometheus."""
+"""`hilrig metrics`: Prometheus exporter of the lab."""
 
 import threading
 from typing import Annotated
@@ -11,12 +11,12 @@ from hilrig_cli.options import Config
 def metrics(
     config: Config = None,
     listen: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where to answer; :9464 alone is every address of this host.")
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on; :9464 listens on all addresses.")
     ] = "127.0.0.1:9464",
 ) -> None:
-    """Serve the lab's figures at http://HOST:PORT/metrics for Prometheus, until Ctrl-C.
+    """Serve the lab's metrics for Prometheus at http://HOST:PORT/metrics until Ctrl-C.
 
-    One process for the whole lab; the services only send the reports that they send anyway.
+    One process serves the whole lab. It uses the health reports that the services publish anyway.
     """
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_monitoring.prometheus import metrics_server, text_of
@@ -27,7 +27,7 @@ def metrics(
     lab = load_lab(config)
     host, colon, port = listen.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
-        raise InputError(f"--listen {listen!r}: expected HOST:PORT, for example 127.0.0.1:9464")
+        raise InputError(f"--listen: expected HOST:PORT, for example 127.0.0.1:9464, got {listen!r}")
     stopping = threading.Event()
     stop_on_signals(stopping)
     with LabWatch(lab) as watch:

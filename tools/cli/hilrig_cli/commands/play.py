@@ -1,4 +1,4 @@
-"""`hilrig play`: a recording back on the bus, as if its rig ran."""
+"""`hilrig play`: publishes a recording on the bus with its original timing."""
 
 import sys
 from pathlib import Path
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 def play(
     run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
     config: Config = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="How many times its own speed.")] = 1.0,
-    start: Annotated[float, typer.Option(min=0.0, help="Where to begin, s.")] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
-    rig: Annotated[str, typer.Option(help="Play it as this rig; default: the rig that was recorded.")] = "",
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed factor.")] = 1.0,
+    start: Annotated[float, typer.Option(min=0.0, help="Start position in the recording, s.")] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
+    rig: Annotated[str, typer.Option(help="Name of the rig to publish as; default: the recorded rig.")] = "",
 ) -> None:
-    """Put a recording back on the bus with its own timing, so that whatever follows a running rig follows it."""
+    """Publish a recording on the bus with its original timing, for tools that subscribe to a running rig."""
     import threading
 
     from hilrig_replay.export.player import Player, publish_recording, rig_config
@@ -36,12 +36,12 @@ def play(
     opened = open_run(run)
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
-        raise InputError(f"--rig {name!r} is no name for a rig")
+        raise InputError(f"--rig: {name!r} is not a valid rig name")
     player = Player(opened.file, speed=speed, start_s=start, loop=loop)
     stopping = threading.Event()
     stop_on_signals(stopping)
     with _bus(lab, name) as bus:
-        bus.serve(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
+        bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
         played = publish_recording(
             bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name
         )
@@ -49,7 +49,7 @@ def play(
 
 
 def _bus(lab: "LabConfig", rig: str) -> "Bus":
-    """The bus, in the simulation's place: where none runs, that is who tools on this host look for."""
+    """Join the bus with the identity (in a mesh also the port) of the simulation, which tools connect to."""
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas.topics import CONFIG
@@ -59,11 +59,11 @@ def _bus(lab: "LabConfig", rig: str) -> "Bus":
             return ZenohBus(lab.bus, "sim")
         except OperationError as error:
             raise OperationError(
-                f"a lab runs here already (bus.first_port {lab.bus.first_port}): stop it first, or play with "
-                "a --config whose bus.first_port is another"
+                f"a lab is already running on this host (bus.first_port {lab.bus.first_port}): stop it, or use a "
+                "--config with another bus.first_port"
             ) from error
-    with ZenohBus(lab.bus, "tool") as asking:
-        if asking.ask(CONFIG.key(lab.name, rig), timeout_s=0.5):
-            raise OperationError(f"rig {rig} runs in lab {lab.name}: play it as another with --rig")
-    # On a secured bus nobody else may say states.
+    with ZenohBus(lab.bus, "tool") as probe:
+        if probe.query(CONFIG.key(lab.name, rig), timeout_s=0.5):
+            raise OperationError(f"rig {rig!r} is running in lab {lab.name!r}: choose another name with --rig")
+    # On a secured bus only the simulation's certificate may publish states.
     return ZenohBus(lab.bus, "sim")

@@ -1,4 +1,4 @@
-"""`hilrig record start RIG`, `hilrig record stop RIG`: a session by hand, beside those that controllers begin."""
+"""`hilrig record start RIG`, `hilrig record stop RIG`: manual recording sessions."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,38 +11,38 @@ if TYPE_CHECKING:
 
     from hilrig_schemas import Event
 
-ANSWER_TIMEOUT_S = 5.0
-"""How long a recorder has to answer."""
+QUERY_TIMEOUT_S = 5.0
+"""Timeout of a query to the recorder."""
 
 app = typer.Typer(
-    help="Record a rig by hand, whether a controller is there or not.",
+    help="Record a rig manually, with or without a controller.",
     no_args_is_help=True,
     callback=config_for_commands,
 )
 
-Rig = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
+Rig = Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig.")]
 
 
 @app.command()
 def start(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
-    """Begin to record a rig."""
+    """Start a manual recording of a rig."""
     from hilrig_schemas import Event
 
-    event = _ask(config, Event(kind=Event.SESSION_START, rig=rig))
-    _print(event, f"recording {event.session}: `hilrig record stop {rig}` ends it", as_json)
+    event = _request(config, Event(kind=Event.SESSION_START, rig=rig))
+    _print(event, f"recording {event.session}; stop it with `hilrig record stop {rig}`", as_json)
 
 
 @app.command()
 def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
-    """End the recording of a rig that was begun by hand."""
+    """Stop the manual recording of a rig."""
     from hilrig_schemas import Event
 
-    event = _ask(config, Event(kind=Event.SESSION_END, rig=rig))
+    event = _request(config, Event(kind=Event.SESSION_END, rig=rig))
     _print(event, f"recorded {event.session}", as_json)
 
 
-def _ask(config: "Path | None", request: "Event") -> "Event":
-    from hilrig_cli.client import all_rosters, check_rig
+def _request(config: "Path | None", request: "Event") -> "Event":
+    from hilrig_cli.client import check_rig, discover_services
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
@@ -50,22 +50,22 @@ def _ask(config: "Path | None", request: "Event") -> "Event":
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "tool") as bus:
-        recorders = [one for one in all_rosters(bus, lab, {"recorder"}) if one.service == "recorder"]
+        recorders = [one for one in discover_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
             raise OperationError(
                 f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
             )
-        # Rigs that were added since are the one's that has the first of the lab's file.
-        has = next((one for one in recorders if request.rig in one.rigs), None)
-        has = has or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
-        key = CONTROL.key(lab.name, has.service, has.instance)
-        for answer in bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_TIMEOUT_S):
-            if answer.error:
-                # A recorder knows of rigs that were taken away: it is asked first, and a name that is none told after.
+        # Rigs that were added at run time belong to the recorder of the first rig in the lab's file.
+        owner = next((one for one in recorders if request.rig in one.rigs), None)
+        owner = owner or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
+        key = CONTROL.key(lab.name, owner.service, owner.instance)
+        for reply in bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S):
+            if reply.error:
+                # The recorder also knows removed rigs, so it is queried first and an unknown name reported after that.
                 check_rig(bus, lab, request.rig)
-                raise OperationError(answer.error)
-            return CONTROL.decode(answer.payload)
-    raise OperationError(f"{has.service}/{has.instance} does not answer: see its log")
+                raise OperationError(reply.error)
+            return CONTROL.decode(reply.payload)
+    raise OperationError(f"{owner.service}/{owner.instance} does not reply within {QUERY_TIMEOUT_S:g} s: see its log")
 
 
 def _print(event: "Event", text: str, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""`hilrig recover`: whole files of torn or damaged ones."""
+"""`hilrig recover`: recovers truncated or damaged MCAP files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,30 +12,33 @@ if TYPE_CHECKING:
 
 
 def recover(
-    files: Annotated[list[Path], typer.Argument(metavar="RUN.MCAP…", help="MCAP files, also foreign ones.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="RUN.MCAP…", help="MCAP files, of hilrig or of other programs.")
+    ],
     output: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The new file; for one file only.", show_default=False)
+        Path | None,
+        typer.Option("--out", "-o", help="Path of the recovered file; for one input file only.", show_default=False),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make whole, indexed files of torn or damaged ones; the original stays until the new file is safe.
+    """Write complete, indexed files from truncated or damaged ones; originals are kept until the new files are stored.
 
-    `RUN.mcap.part` becomes `RUN.mcap`, any other file gets a `.recovered.mcap` beside it. Exit code 1: something was
-    lost.
+    `RUN.mcap.part` becomes `RUN.mcap`; any other file is recovered to a new `.recovered.mcap` file in the same folder.
+    Exit code 1: data was lost.
     """
     import json
     from dataclasses import asdict
 
     from hilrig_recorder.mcap_format.file_names import PART_SUFFIX
-    from hilrig_recorder.mcap_format.recover import recover as make_whole
+    from hilrig_recorder.mcap_format.recover import recover as recover_file
     from hilrig_recorder.mcap_format.recover import recovered_path
     from hilrig_runtime.errors import InputError
 
     if output is not None and len(files) > 1:
-        raise InputError(f"--out names one file, but {len(files)} are to be recovered")
+        raise InputError(f"--out: expected one input file, got {len(files)}")
     recoveries = []
     for source in files:
-        recovery = make_whole(source, output or recovered_path(source))
+        recovery = recover_file(source, output or recovered_path(source))
         if recovery.path is not None and output is None and source.name.endswith(PART_SUFFIX):
             source.unlink()
         recoveries.append(recovery)
@@ -49,12 +52,12 @@ def recover(
 
 def _print(recovery: "Recovery") -> None:
     if recovery.path is None:
-        print(f"{recovery.source}: whole; nothing to do")
+        print(f"{recovery.source}: complete; nothing to do")
         return
-    print(f"{recovery.source} -> {recovery.path}: {recovery.messages} messages in {recovery.chunks} chunks saved")
+    print(f"{recovery.source} -> {recovery.path}: recovered {recovery.messages} messages in {recovery.chunks} chunks")
     if recovery.damaged_bytes or recovery.orphans:
         print(
-            f"  not saved: {recovery.damaged_bytes} bytes, {recovery.damaged_chunks} damaged chunks, "
+            f"  lost: {recovery.damaged_bytes} bytes, {recovery.damaged_chunks} damaged chunks, "
             f"{recovery.orphans} messages of unknown channels"
         )
         for reason in recovery.reasons[:10]:

@@ -1,4 +1,4 @@
-"""`hilrig registers`: the map of a rig's registers, for people and for PLC tools."""
+"""`hilrig registers`: prints the register map of a rig as a table, CSV, Markdown or JSON."""
 
 import json
 from typing import Annotated
@@ -9,28 +9,28 @@ from hilrig_cli.options import AsJson
 
 
 def registers(
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print it as CSV, to import into a PLC tool.")] = False,
-    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print it as docs/registers.md has it.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV for import into a PLC tool.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown, as in docs/registers.md.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Print what each register and coil of a rig holds."""
-    from hilrig_modbus_edge.registers import export as register_tables
+    """Print the register map: every register and coil of a rig with its type, unit, scale and meaning."""
+    from hilrig_modbus_edge.registers import export
 
     if as_csv:
-        print(register_tables.as_csv(), end="")
+        print(export.as_csv(), end="")
     elif as_markdown:
-        print(register_tables.as_markdown(), end="")
+        print(export.as_markdown(), end="")
     elif as_json:
-        print(json.dumps(register_tables.as_rows()))
+        print(json.dumps(export.as_rows()))
     else:
-        _print_table(register_tables.as_rows())
+        _print_table(export.as_rows())
 
 
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "what it is")
+    table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "meaning")
     for row in rows:
         table.add_row(
             *(str(row[key]) for key in ("table", "number", "address", "name", "type", "unit", "scale")),

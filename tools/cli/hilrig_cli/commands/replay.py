@@ -1,4 +1,4 @@
-"""`hilrig replay`: recordings in the rerun viewer."""
+"""`hilrig replay`: shows recordings in the rerun viewer."""
 
 import sys
 import threading
@@ -11,14 +11,15 @@ import typer
 def replay(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown together.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view.", show_default=False),
     ],
     save: Annotated[
-        Path | None, typer.Option(metavar="RUN.RRD", help="Write a rerun file and open nothing.", show_default=False)
+        Path | None,
+        typer.Option(metavar="RUN.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
-    """Show what happened: the arm in 3D, its curves, the loop latency and its stages, events; until it is closed."""
+    """Show recordings in the rerun viewer: the arm in 3D, its curves, the loop latency and its stages, events."""
     from hilrig_replay.io.run import open_run
     from hilrig_replay.rerun_view.view import save_rrd, send_runs
     from hilrig_replay.rerun_view.viewer import browser_address, free_port, running_viewer, wait_for_end
@@ -26,7 +27,7 @@ def replay(
     from hilrig_runtime.process.shutdown import stop_on_signals
 
     if save is not None and web:
-        raise InputError("--save writes a file and --web serves a browser: choose one")
+        raise InputError("--save and --web can't be combined: use one of them")
     opened = [open_run(path) for path in runs]
     if save is not None:
         save_rrd(opened, save)
@@ -36,10 +37,10 @@ def replay(
     grpc_port, web_port = free_port(), free_port() if web else None
     with running_viewer(grpc_port, web_port) as viewer:
         if web_port is not None:
-            print(f"open {browser_address(grpc_port, web_port)} ; Ctrl-C ends it", file=sys.stderr, flush=True)
+            print(f"open {browser_address(grpc_port, web_port)} ; press Ctrl-C to stop", file=sys.stderr, flush=True)
 
-        def over() -> bool:
+        def is_closed() -> bool:
             return stopping.is_set() or viewer.poll() is not None
 
-        send_runs(opened, grpc_port, over)
+        send_runs(opened, grpc_port, is_closed)
         wait_for_end(viewer, stopping)

@@ -1,4 +1,4 @@
-"""`hilrig report`: runs as one page to read, print or hand in, and their grades."""
+"""`hilrig report`: HTML report of one run, or of a ranked group of runs."""
 
 import json
 import sys
@@ -15,61 +15,63 @@ def report(
         list[Path],
         typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings.", show_default=False),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="HTML file to write.")] = Path("report.html"),
     verify: Annotated[
-        bool, typer.Option("--verify", help="Re-simulate each run, and say whether it is the same.")
+        bool, typer.Option("--verify", help="Re-simulate each run and report whether it is reproduced.")
     ] = False,
     task: Annotated[
         Path | None,
         typer.Option(
             metavar="LAB.TOML",
-            help="Grade by the \\[task] of this lab's file; without: by the one that was recorded.",
+            help="Grade by the \\[task] of this configuration file; default: by the recorded task.",
             show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write one HTML page of a run, or of a class of runs, ranked: motion, task, latency, events; no network needed.
+    """Write an HTML report of one run, or of a ranked group of runs: motion, task, latency, events.
 
-    Runs of a class that were driven by the same torques, as when one was replayed, are named. Exit code 1: a recording
-    of several could not be read; the page says which, and why.
+    The page works without a network. Runs with the same torques (for example a replayed run) are listed. Exit code 1:
+    at least one of several recordings could not be read; the report lists it with the reason.
     """
     from rich.console import Console
     from rich.progress import Progress
 
-    from hilrig_replay.grading.task_loading import read_task
-    from hilrig_replay.io.paths import recordings
+    from hilrig_replay.grading.task_loading import load_task
+    from hilrig_replay.io.paths import find_recordings
     from hilrig_replay.io.recording_file import refuse_recording
     from hilrig_replay.report.report import build_report
     from hilrig_runtime.errors import InputError, OperationError
 
     if not out.parent.is_dir():
-        raise InputError(f"{out}: folder {out.parent} does not exist")
+        raise InputError(f"--out {out}: the folder {out.parent} does not exist")
     refuse_recording(out)
-    graded_by = None if task is None else read_task(task)
+    graded_by = None if task is None else load_task(task)
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        doing = bar.add_task("reading and drawing", total=1.0)
-        found = build_report(
-            recordings(runs),
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("reading and plotting", total=1.0)
+        result = build_report(
+            find_recordings(runs),
             verified=verify,
             task=graded_by,
-            on_progress=lambda share: bar.update(doing, completed=share),
+            on_progress=lambda share: progress.update(bar, completed=share),
             workers=None,
         )
     try:
-        out.write_text(found.html, encoding="utf-8")
+        out.write_text(result.html, encoding="utf-8")
     except OSError as error:
         raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
     if as_json:
         print(
-            json.dumps({"page": str(out), "runs": found.runs, "left_out": found.left_out, "alike": found.same_torques})
+            json.dumps(
+                {"page": str(out), "runs": result.runs, "left_out": result.left_out, "alike": result.same_torques}
+            )
         )
     else:
         print(out)
-        for reason in found.left_out:
-            print(f"left out: {reason}", file=sys.stderr)
-        for pair in found.same_torques:
+        for reason in result.left_out:
+            print(f"skipped: {reason}", file=sys.stderr)
+        for pair in result.same_torques:
             print(f"same torques: {pair}", file=sys.stderr)
-    if found.left_out:
+    if result.left_out:
         raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""`hilrig rig`: which rigs a running lab has, and having more or fewer of them."""
+"""`hilrig rig`: lists, adds, removes and resets rigs of a running lab."""
 
 import json
 from pathlib import Path
@@ -11,20 +11,20 @@ from hilrig_cli.options import AsJson, Config, config_for_commands
 if TYPE_CHECKING:
     from hilrig_runtime.bus.api import Bus
     from hilrig_runtime.config.lab import LabConfig, RigSettings
-    from hilrig_schemas import Event, Roster
+    from hilrig_schemas import Event, ServiceInfo
 
 app = typer.Typer(
-    help="See which rigs a running lab has; add, take away or reset one.",
+    help="List, add, remove or reset rigs of a running lab.",
     no_args_is_help=True,
     callback=config_for_commands,
 )
 
-Name = Annotated[str, typer.Argument(metavar="RIG", help="The rig's name.")]
+Name = Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig.")]
 
 
 @app.command(name="list")
 def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
-    """Print each rig with who simulates and who serves it, those of the lab's file and those added since."""
+    """List the rigs of a running lab with their addresses, simulation and edge, including rigs added at run time."""
     from rich.console import Console
     from rich.table import Table
 
@@ -33,12 +33,12 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        rows = _rows(lab, _rosters(bus, lab))
+        rows = _rows(lab, _discover(bus, lab))
     if as_json:
         print(json.dumps(rows))
         return
     table = Table()
-    for column in ("rig", "at", "simulation", "edge", "from"):
+    for column in ("rig", "address", "simulation", "edge", "source"):
         table.add_column(column)
     for row in rows:
         origin = "lab.toml" if row["in_file"] else "added"
@@ -51,17 +51,21 @@ def add(
     rig: Name,
     port: Annotated[
         int | None,
-        typer.Option(help="Modbus TCP port; without: the next free one behind the others.", show_default=False),
+        typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports.", show_default=False),
     ] = None,
     settings: Annotated[
         Path | None,
-        typer.Option(metavar="RIG.TOML", help="What differs from the lab, as in \\[\\[rigs]].", show_default=False),
+        typer.Option(
+            metavar="RIG.TOML",
+            help="File with settings that differ from the lab's; keys as in \\[\\[rigs]].",
+            show_default=False,
+        ),
     ] = None,
     config: Config = None,
 ) -> None:
-    """Add a rig to a running lab; the others do not feel it.
+    """Add a rig to a running lab; other rigs are not affected.
 
-    It is there until the lab ends, or its simulation or edge is started anew: to keep it, write it into lab.toml too.
+    The rig exists until the lab stops, or its simulation or edge restarts. To keep it, add it to lab.toml too.
     """
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
@@ -70,26 +74,27 @@ def add(
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        rosters = _rosters(bus, lab)
-        new = _settings(rosters, rig, port, settings)
-        simulation = _least_loaded(rosters, "sim", lab)
-        edge = _least_loaded(rosters, "edge", lab)
+        services = _discover(bus, lab)
+        new = _settings(services, rig, port, settings)
+        simulation = _least_loaded(services, "sim", lab)
+        edge = _least_loaded(services, "edge", lab)
         request = Event(kind=Event.RIG_ADDED, rig=rig)
         request.configuration_data.text = new.model_dump_json()
-        _ask(bus, lab, simulation, request)
+        _request(bus, lab, simulation, request)
         try:
-            done = _ask(bus, lab, edge, request)
+            reply = _request(bus, lab, edge, request)
         except HilrigError as error:
-            # Both or none: a rig that nobody serves must not be left behind.
-            _ask(bus, lab, simulation, Event(kind=Event.RIG_REMOVED, rig=rig))
-            raise OperationError(f"{rig} was not added: {error}") from error
-    print(done.text)
+            # Atomic: if the edge refuses the rig, the simulation must not keep it.
+            _request(bus, lab, simulation, Event(kind=Event.RIG_REMOVED, rig=rig))
+            raise OperationError(f"rig {rig!r} was not added: {error}") from error
+    print(reply.text)
 
 
 @app.command()
 def remove(rig: Name, config: Config = None) -> None:
-    """Take a rig away from a running lab: no torque, its session ends, its port closes; the others do not feel it."""
-    from hilrig_cli.client import SERVING, check_rig
+    """Remove a rig from a running lab: its torque is zeroed, its session ends, its port is closed."""
+    from hilrig_cli.client import check_rig
+    from hilrig_cli.service_kinds import RIG_SERVICES, STOP_ORDER
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
@@ -97,18 +102,18 @@ def remove(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        owners = [roster for roster in _rosters(bus, lab) if rig in roster.rigs and roster.service in SERVING]
+        owners = [info for info in _discover(bus, lab) if rig in info.rigs and info.service in RIG_SERVICES]
         if not owners:
             check_rig(bus, lab, rig)
-            raise OperationError(f"no running service has {rig}: hilrig rig list shows those that there are")
-        # The edge first: its last word is that there is no torque.
-        for roster in sorted(owners, key=lambda roster: roster.service):
-            print(_ask(bus, lab, roster, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
+            raise OperationError(f"no running service has rig {rig!r}; hilrig rig list shows the existing rigs")
+        # The edge first: its last command is zero torque.
+        for info in sorted(owners, key=lambda info: STOP_ORDER.index(info.service)):
+            print(_request(bus, lab, info, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
 
 
 @app.command()
 def reset(rig: Name, config: Config = None) -> None:
-    """Put a rig's arm and parts back to the start; a controller that holds it goes on from there."""
+    """Reset a rig's arm and parts to their start; the controller that holds the lease stays connected."""
     from hilrig_cli.client import check_rig
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
@@ -117,73 +122,76 @@ def reset(rig: Name, config: Config = None) -> None:
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
-        for roster in _rosters(bus, lab):
-            if roster.service == "edge" and rig in roster.rigs:
-                print(_ask(bus, lab, roster, Event(kind=Event.RESET, rig=rig)).text)
+        for info in _discover(bus, lab):
+            if info.service == "edge" and rig in info.rigs:
+                print(_request(bus, lab, info, Event(kind=Event.RESET, rig=rig)).text)
                 return
         check_rig(bus, lab, rig)
-    raise OperationError(f"no edge serves {rig}: hilrig rig list shows those that there are")
+    raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
 
 
-def _rosters(bus: "Bus", lab: "LabConfig") -> "list[Roster]":
-    from hilrig_cli.client import all_rosters
+def _discover(bus: "Bus", lab: "LabConfig") -> "list[ServiceInfo]":
+    from hilrig_cli.client import discover_services
+    from hilrig_cli.service_kinds import RIG_SERVICES
     from hilrig_runtime.errors import OperationError
 
-    found = all_rosters(bus, lab, {"sim", "edge"})
+    found = discover_services(bus, lab, set(RIG_SERVICES))
     if not found:
-        raise OperationError(f"nothing is heard of lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
+        raise OperationError(f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?")
     return found
 
 
-def _rows(lab: "LabConfig", rosters: "list[Roster]") -> list[dict[str, Any]]:
+def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
     in_file = [rig.name for rig in lab.rigs]
-    names = dict.fromkeys([*in_file, *(rig for roster in rosters if roster.service == "edge" for rig in roster.rigs)])
+    names = dict.fromkeys([*in_file, *(rig for info in infos if info.service == "edge" for rig in info.rigs)])
     rows = []
     for name in names:
         row: dict[str, Any] = {"rig": name, "in_file": name in in_file, "address": "", "sim": "", "edge": ""}
-        for roster in rosters:
-            if name in roster.rigs and roster.service in row:
-                row[roster.service] = f"{roster.instance} on {roster.host}"
-                row["address"] = row["address"] or roster.addresses[list(roster.rigs).index(name)]
+        for info in infos:
+            if name in info.rigs and info.service in row:
+                row[info.service] = f"{info.instance} on {info.host}"
+                row["address"] = row["address"] or info.addresses[list(info.rigs).index(name)]
         rows.append(row)
     return rows
 
 
-def _settings(rosters: "list[Roster]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
+def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
     import tomllib
 
     from hilrig_runtime.config.lab import read_lab_text, read_rig
     from hilrig_runtime.errors import InputError
 
-    if any(rig in roster.rigs for roster in rosters if roster.service in ("sim", "edge")):
-        raise InputError(f"the lab has a rig called {rig!r} already")
+    if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
+        raise InputError(f"rig {rig!r} already exists in the lab: choose another name")
     try:
-        said = {} if settings is None else tomllib.loads(read_lab_text(settings))
+        values = {} if settings is None else tomllib.loads(read_lab_text(settings))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{settings}: no valid TOML: {error}") from error
+        raise InputError(f"{settings}: invalid TOML: {error}") from error
     if port is not None:
-        said["port"] = port
-    return read_rig(json.dumps(said | {"name": rig}))
+        values["port"] = port
+    return read_rig(json.dumps(values | {"name": rig}))
 
 
-def _least_loaded(rosters: "list[Roster]", service: str, lab: "LabConfig") -> "Roster":
+def _least_loaded(infos: "list[ServiceInfo]", service: str, lab: "LabConfig") -> "ServiceInfo":
     from hilrig_runtime.errors import OperationError
 
-    able = [roster for roster in rosters if roster.service == service]
-    if not able:
-        raise OperationError(f"no {service} of lab {lab.name!r} is heard: is it running?")
-    return min(able, key=lambda roster: len(roster.rigs))
+    candidates = [info for info in infos if info.service == service]
+    if not candidates:
+        raise OperationError(f"no {service} service of lab {lab.name!r} found: is it running?")
+    return min(candidates, key=lambda info: len(info.rigs))
 
 
-def _ask(bus: "Bus", lab: "LabConfig", roster: "Roster", request: "Event") -> "Event":
-    from hilrig_cli.client import ANSWER_WITHIN_S
+def _request(bus: "Bus", lab: "LabConfig", info: "ServiceInfo", request: "Event") -> "Event":
+    from hilrig_cli.client import QUERY_TIMEOUT_S
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import Event, topics
 
-    key = topics.CONTROL.key(lab.name, roster.service, roster.instance)
-    answers = bus.ask(key, request.SerializeToString(), timeout_s=ANSWER_WITHIN_S)
-    if not answers:
-        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} does not answer")
-    if answers[0].error:
-        raise OperationError(f"{roster.service}/{roster.instance} on {roster.host} refused: {answers[0].error}")
-    return Event.FromString(answers[0].payload)
+    key = topics.CONTROL.key(lab.name, info.service, info.instance)
+    replies = bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S)
+    if not replies:
+        raise OperationError(
+            f"{info.service}/{info.instance} on {info.host} does not reply within {QUERY_TIMEOUT_S:g} s"
+        )
+    if replies[0].error:
+        raise OperationError(f"{info.service}/{info.instance} on {info.host} refused: {replies[0].error}")
+    return Event.FromString(replies[0].payload)

@@ -1,4 +1,4 @@
-"""`hilrig router`: the router of a lab on several machines."""
+"""`hilrig router`: zenoh router of a lab on several hosts."""
 
 from typing import Annotated
 
@@ -14,19 +14,19 @@ def router(
         str,
         typer.Option(
             metavar="ENDPOINT",
-            help="Where to listen, as tls/0.0.0.0:7447; without: at bus.router of lab.toml.",
+            help="Endpoint to listen on, such as tls/0.0.0.0:7447; default: bus.router of lab.toml.",
             show_default=False,
         ),
     ] = "",
     print_only: Annotated[
-        bool, typer.Option("--print", help="Print the configuration for zenoh's own router (zenohd -c) instead.")
+        bool, typer.Option("--print", help="Print the configuration for zenoh's own router (zenohd -c) and exit.")
     ] = False,
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Run the zenoh router of a lab, with access control by certificate where the lab has \\[bus.tls]."""
-    from hilrig_runtime.bus.router import router_endpoint, run_router
+    """Run the zenoh router of a lab; with \\[bus.tls], with access control by certificate."""
     from hilrig_runtime.bus.zenoh_config import router_config
     from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.process.router import router_endpoint, run_router
 
     lab = load_lab(config)
     if print_only:

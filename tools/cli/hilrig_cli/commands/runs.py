@@ -1,4 +1,4 @@
-"""`hilrig runs`: the recordings of a folder, with what matters of each."""
+"""`hilrig runs`: lists the recordings of a folder."""
 
 import sys
 from datetime import UTC, datetime
@@ -13,17 +13,17 @@ from hilrig_cli.options import AsJson, Config
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hilrig_replay.io.index import RunEntry
+    from hilrig_replay.analysis.index import RunEntry
 
 
-UNTOWARD = ("disk full", "write failed", "keeper lost")
-"""Endings that are told with their reason."""
-WIDE = 130
-"""Columns of a terminal from which on everything is shown."""
+ABNORMAL_ENDINGS = ("disk full", "write failed", "keeper lost")
+"""Endings that are shown with their reason."""
+WIDE_TERMINAL_COLUMNS = 130
+"""Minimum width of a terminal in which all columns are shown, characters."""
 
 
 class SortKey(StrEnum):
-    """What the list is sorted by."""
+    """Sort key of the list."""
 
     START = "start"
     RIG = "rig"
@@ -37,27 +37,31 @@ class SortKey(StrEnum):
 def runs(
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="FOLDER", help="Where the recordings are; default: the lab's recorder.folder."),
+        typer.Argument(metavar="FOLDER", help="Folder of the recordings; default: the lab's recorder.folder."),
     ] = None,
     config: Config = None,
-    rig: Annotated[str, typer.Option(help="Only this rig's.")] = "",
-    controller: Annotated[str, typer.Option(help="Only controllers whose address begins so.")] = "",
+    rig: Annotated[str, typer.Option(help="Only recordings of this rig.")] = "",
+    controller: Annotated[str, typer.Option(help="Only controllers whose address starts with this text.")] = "",
     since: Annotated[
-        str, typer.Option(metavar="TIME", help="Only those begun then or later, UTC: 2026-01-31 or 2026-01-31T14:30.")
+        str,
+        typer.Option(metavar="TIME", help="Only recordings started at or after this time, UTC: 2026-01-31[T14:30]."),
     ] = "",
-    until: Annotated[str, typer.Option(metavar="TIME", help="Only those begun before, UTC.")] = "",
+    until: Annotated[str, typer.Option(metavar="TIME", help="Only recordings started before this time, UTC.")] = "",
     fit: Annotated[
-        bool | None, typer.Option("--fit/--unfit", help="Only those whose latencies can, or can't, be relied on.")
+        bool | None,
+        typer.Option("--fit/--unfit", help="Only recordings that are (not) valid for latency measurements."),
     ] = None,
-    sort: Annotated[SortKey, typer.Option(help="What to sort by; the largest or newest first.")] = SortKey.START,
-    reverse: Annotated[bool, typer.Option("--reverse", help="The smallest or oldest first.")] = False,
-    limit: Annotated[int, typer.Option(min=0, help="How many to show; 0: all.")] = 100,
-    loop: Annotated[bool, typer.Option("--loop/--no-loop", help="Show the loop's latency (read once a file).")] = True,
-    rebuild: Annotated[bool, typer.Option("--rebuild", help="Read every file again.")] = False,
+    sort: Annotated[SortKey, typer.Option(help="Sort key; largest or newest first.")] = SortKey.START,
+    reverse: Annotated[bool, typer.Option("--reverse", help="Smallest or oldest first.")] = False,
+    limit: Annotated[int, typer.Option(min=0, help="Maximum number of recordings to show; 0: no limit.")] = 100,
+    loop: Annotated[
+        bool, typer.Option("--loop/--no-loop", help="Show the loop latency (each file is read once for it).")
+    ] = True,
+    rebuild: Annotated[bool, typer.Option("--rebuild", help="Rebuild the index: read every file again.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List recordings: duration, size, loop latency, losses, how each ended; unusable files with the reason."""
-    from hilrig_replay.io.index import RunIndex
+    """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason."""
+    from hilrig_replay.analysis.index import RunIndex
     from hilrig_runtime.config.lab import load_lab
 
     since_ns, until_ns = _wall_ns("--since", since), _wall_ns("--until", until)
@@ -96,7 +100,7 @@ def _wall_ns(option: str, text: str) -> int | None:
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:
-        raise InputError(f"{option} {text!r}: expected a date or a time, as 2026-01-31 or 2026-01-31T14:30") from error
+        raise InputError(f"{option}: expected a date or time (2026-01-31 or 2026-01-31T14:30), got {text!r}") from error
     return int(time.replace(tzinfo=time.tzinfo or UTC).timestamp() * 1e9)
 
 
@@ -150,40 +154,40 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     from rich.table import Table
 
     if not entries:
-        print(f"no such recordings in {folder}" if read else f"no recordings in {folder}")
+        print(f"no matching recordings in {folder}" if read else f"no recordings in {folder}")
         return
     console = Console() if sys.stdout.isatty() else Console(width=200)
-    wide = console.width >= WIDE
+    wide = console.width >= WIDE_TERMINAL_COLUMNS
     table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
     table.add_column("recording", min_width=20)
     if wide:
         table.add_column("rig", no_wrap=True)
-        table.add_column("begun (UTC)", no_wrap=True)
+        table.add_column("start (UTC)", no_wrap=True)
     for column in ("duration", "size", "p50 ms", "p99 ms", "lost"):
         table.add_column(column, justify="right", no_wrap=True)
     if wide:
         table.add_column("controller", no_wrap=True)
         table.add_column("verified", no_wrap=True)
-    table.add_column("fit", no_wrap=True)
-    table.add_column("ended")
+    table.add_column("valid", no_wrap=True)
+    table.add_column("ending")
     for entry in entries:
         lost = _lost(entry)
-        begun = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
+        start = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
         table.add_row(
             Path(entry.path).name.removesuffix(".mcap"),
-            *([entry.rig, begun] if wide else []),
+            *([entry.rig, start] if wide else []),
             _duration(entry.duration_s),
             _size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
             f"[red]{lost}[/]" if lost else "0",
-            *([entry.controller, _answer(entry.verified)] if wide else []),
-            _answer(entry.fit),
+            *([entry.controller, _yes_no(entry.verified)] if wide else []),
+            _yes_no(entry.fit),
             _ending(entry),
         )
     console.print(table)
     if total > len(entries):
-        Console(stderr=True).print(f"{total - len(entries)} more: --limit 0 shows all")
+        Console(stderr=True).print(f"{total - len(entries)} more; --limit 0 shows all")
 
 
 def _lost(entry: "RunEntry") -> int:
@@ -195,7 +199,7 @@ def _ending(entry: "RunEntry") -> str:
 
     if entry.trouble:
         return f"[red]{escape(entry.trouble)}[/]"
-    if entry.ended in UNTOWARD:
+    if entry.ended in ABNORMAL_ENDINGS:
         return f"[yellow]{escape(f'{entry.ended}: {entry.reason}')}[/]"
     return escape(entry.ended)
 
@@ -220,5 +224,5 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
-def _answer(value: bool | None) -> str:
+def _yes_no(value: bool | None) -> str:
     return {None: "", True: "yes", False: "no"}[value]

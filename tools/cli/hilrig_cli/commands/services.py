@@ -1,4 +1,4 @@
-"""`hilrig sim`, `hilrig edge`, `hilrig recorder`: one service in this process, as `up` and compose start it."""
+"""`hilrig sim`, `hilrig edge`, `hilrig recorder`: run one service in this process."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -12,23 +12,23 @@ if TYPE_CHECKING:
     from hilrig_runtime.process.service import Service
 
 StopWithParent = Annotated[
-    bool, typer.Option("--stop-with-parent", help="End when standard input ends: whoever started this is gone.")
+    bool, typer.Option("--stop-with-parent", help="Stop when standard input is closed, that is, the parent has ended.")
 ]
-
 
 Rigs = Annotated[
     str,
     typer.Option(
         metavar="RIG,RIG…",
-        help="Those that this process serves; the others have one of their own. Without: all of the lab.",
+        help="Rigs that this process serves; default: all rigs of the lab.",
         show_default=False,
     ),
 ]
 Instance = Annotated[
-    str, typer.Option(metavar="NAME", help="What this process is called, where there are several of its kind.")
+    str, typer.Option(metavar="NAME", help="Instance name; required if several services of this kind run.")
 ]
 LogFormat = Annotated[
-    str, typer.Option("--log-format", metavar="text|json", help="Lines for people, or one JSON object a line.")
+    str,
+    typer.Option("--log-format", metavar="text|json", help="Log format: readable text, or one JSON object per line."),
 ]
 
 
@@ -39,7 +39,7 @@ def sim(
     log_format: LogFormat = "text",
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Run the simulation: command in, plant stepped in real time, state out."""
+    """Run the simulation: steps the plant in real time, receives commands, publishes states."""
     from hilrig_sim.service import run
 
     _run("sim", run, config, rigs, instance, log_format, stop_with_parent)
@@ -52,7 +52,7 @@ def edge(
     log_format: LogFormat = "text",
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Run the Modbus edge: one TCP port a rig, torques in, positions out."""
+    """Run the Modbus edge: one Modbus TCP port per rig, torques in, positions out."""
     from hilrig_modbus_edge.service import run
 
     _run("edge", run, config, rigs, instance, log_format, stop_with_parent)
@@ -65,7 +65,7 @@ def recorder(
     log_format: LogFormat = "text",
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Run the recorder: each session of each rig becomes an MCAP file."""
+    """Run the recorder: writes each session of each rig to an MCAP file."""
     from hilrig_recorder.service import run
 
     _run("recorder", run, config, rigs, instance, log_format, stop_with_parent)
@@ -87,12 +87,14 @@ def _run(
     from hilrig_schemas.topics import is_name
 
     if not is_name(instance):
-        raise InputError(f"--instance {instance!r}: expected letters, digits, - and _, beginning with no sign")
+        raise InputError(
+            f"--instance: expected letters, digits, - and _, starting with a letter or digit, got {instance!r}"
+        )
     lab = load_lab(config)
     names = [rig.strip() for rig in rigs.split(",")] if rigs else None
-    for rig, times in Counter(names).items():
-        if times > 1:
-            raise InputError(f"--rigs {rigs}: {rig!r} stands there {times} times, expected once")
+    for rig, count in Counter(names).items():
+        if count > 1:
+            raise InputError(f"--rigs: duplicate rig {rig!r}")
         lab.rig(rig)
     start_logging(name, instance, log_format)
     run_service(name, run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)

@@ -1,4 +1,4 @@
-"""`hilrig study`: how much delay, jitter and loss a controller bears."""
+"""`hilrig study`: stability of a controller under delay, jitter and loss."""
 
 import json
 from pathlib import Path
@@ -14,33 +14,35 @@ if TYPE_CHECKING:
 
 def study(
     file: Annotated[
-        Path | None, typer.Argument(metavar="STUDY.TOML", help="What is swept (docs/studies.md).", show_default=False)
+        Path | None,
+        typer.Argument(metavar="STUDY.TOML", help="Definition of the study (docs/studies.md).", show_default=False),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("study-out"),
     controller: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="FILE.PY", help="Sweep this controller too: a file with a class Controller.", show_default=False
+            metavar="FILE.PY", help="Add a controller: a file that defines class Controller.", show_default=False
         ),
     ] = None,
     live: Annotated[
-        bool, typer.Option("--live", help="Run the study's live points over Modbus TCP too, on a lab of its own.")
+        bool, typer.Option("--live", help="Also run the study's live points over Modbus TCP, on a separate lab.")
     ] = False,
     from_run: Annotated[
         Path | None,
         typer.Option(
             "--from",
             metavar="RUN.MCAP",
-            help="Take the latency of this recording: which gains would have been stable, and with what margin.",
+            help="Use the latency of this recording: evaluate which gains are stable, and their margins.",
             show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Sweep a loop in virtual time, ask theory, and draw both; with --live measure chosen points on the real loop.
+    """Simulate a control loop over a range of parameters, compare with theory and plot both.
 
-    Results are runs.parquet, study.json, a picture of each controller (PNG, SVG) and study.rrd. Exit code 1: a live
-    point did what virtual time did not say; with --from: no gain of the study would have been stable.
+    With --live, selected points are also measured on the real loop. Results: runs.parquet, study.json, a plot of each
+    controller (PNG, SVG) and study.rrd. Exit code 1: a live measurement contradicts the prediction; with --from: no
+    gain of the study is stable.
     """
     from rich.console import Console
 
@@ -49,17 +51,17 @@ def study(
     console = Console(stderr=True, quiet=as_json)
     if from_run is not None:
         if live:
-            raise InputError("--from takes what was recorded, and --live runs anew: choose one")
+            raise InputError("--from and --live can't be combined: use one of them")
         _from_recording(from_run, file, as_json, console)
         return
     if file is None:
-        raise InputError("name a study's file, or a recording with --from; examples/studies has one to start from")
-    said = _sweep(file, controller or [], out, live, console)
+        raise InputError("STUDY.TOML or --from RUN.MCAP is required; see examples/studies for an example")
+    results = _sweep(file, controller or [], out, live, console)
     if as_json:
-        print(json.dumps(said))
+        print(json.dumps(results))
     else:
-        _print(said, out)
-    if any(not point["as_predicted"] for point in said.get("live", [])):
+        _print_results(results, out)
+    if any(not point["as_predicted"] for point in results.get("live", [])):
         raise typer.Exit(1)
 
 
@@ -71,8 +73,8 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
 
     chosen = load_study(file).with_files(controllers)
     if live and not chosen.live:
-        raise InputError(f"{file}: --live wants points, and the study names none: add [[live]] with x and y")
-    # Before these, which take a moment: what is wrong with a study is said at once.
+        raise InputError(f"{file}: --live requires live points, but the study has none: add [[live]] with x and y")
+    # Imported after the validation, so that errors in the study are reported without delay.
     from hilrig_study.plots import Marker, plane_figure, save_plots, traces
     from hilrig_study.rerun_plots import save_study_rrd
     from hilrig_study.results import save_results
@@ -98,16 +100,16 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         from hilrig_runtime.config.lab import LabConfig
         from hilrig_study.live.live_points import run_live_points
 
-        def report(line: str) -> None:
+        def log(line: str) -> None:
             console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)
 
         @contextmanager
         def start_lab(lab: LabConfig, config: Path) -> Iterator[Callable[[], object]]:
-            with running_lab(lab, config, report, threading.Event()) as supervisor:
+            with running_lab(lab, config, log, threading.Event()) as supervisor:
                 yield supervisor.poll
 
-        measured = run_live_points(chosen, file.parent, out, start_lab, free_ports, report)
-    with console.status("drawing"):
+        measured = run_live_points(chosen, file.parent, out, start_lab, free_ports, log)
+    with console.status("plotting"):
         pictures = []
         for number in range(len(chosen.controllers)):
             name = chosen.controllers[number].name
@@ -119,39 +121,39 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         return save_results(chosen, swept, out, more)
 
 
-def _print(said: dict[str, Any], out: Path) -> None:
+def _print_results(results: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
     title = (
-        f"{said['title']}: {said['runs']:,} runs, {said['simulated_s']:,.0f} s simulated in {said['seconds']:.1f} s "
-        f"({said['times_real_time']:,.0f} times real time)"
+        f"{results['title']}: {results['runs']:,} runs, {results['simulated_s']:,.0f} s simulated in "
+        f"{results['seconds']:.1f} s ({results['times_real_time']:,.0f} × real time)"
     )
     table = Table(title=title, title_justify="left", title_style="bold")
-    for column in ("controller", "gain", "stable up to, ms added", "delay margin, ms", "jitter margin, ms"):
+    for column in ("controller", "gain", "stable up to added delay, ms", "delay margin, ms", "jitter margin, ms"):
         table.add_column(column, justify="left" if column == "controller" else "right")
-    for controller in said["controllers"]:
+    for controller in results["controllers"]:
         theory = controller["theory"]
         if not theory:
             table.add_row(controller["name"], "–", f"{controller['settled_share']:.0%} of runs settle", "–", "–")
-        # A dozen gains tell as much as two hundred.
+        # About twelve gains are enough for an overview.
         for one in theory[:: max(1, len(theory) // 12)]:
             nominal = one["nominal"] or {}
             until = one["stable_until_ms"]
             table.add_row(
                 controller["name"],
                 f"{one['gain']:.3g}",
-                "any looked at" if until is None else "unstable" if until < 0 else f"{until:.1f}",
+                "all tested" if until is None else "unstable" if until < 0 else f"{until:.1f}",
                 _ms(nominal.get("delay_margin_s")),
                 _ms(nominal.get("jitter_margin_s")),
             )
     console.print(table)
-    for point in said["live"]:
+    for point in results["live"]:
         console.print(
             f"live: {point['controller']} at x {point['x']:g}, y {point['y']:g}: loop p50 "
-            f"{point['live']['loop_p50_ms']:.1f} ms (virtual {point['virtual']['loop_p50_ms']:.1f}), error "
-            f"{point['live']['error_rms_deg']:.3f}° (virtual {point['virtual']['error_rms_deg']:.3f}): "
+            f"{point['live']['loop_p50_ms']:.1f} ms (predicted {point['virtual']['loop_p50_ms']:.1f}), error "
+            f"{point['live']['error_rms_deg']:.3f}° (predicted {point['virtual']['error_rms_deg']:.3f}): "
             + ("as predicted" if point["as_predicted"] else "NOT as predicted"),
             highlight=False,
         )
@@ -168,29 +170,29 @@ def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Cons
     from hilrig_study.study_config import load_study
 
     study = None if file is None else load_study(file)
-    with console.status("judging gains"):
-        judged = evaluate_gains(open_run(path), study).as_dict()
+    with console.status("evaluating gains"):
+        evaluation = evaluate_gains(open_run(path), study).as_dict()
     if as_json:
-        print(json.dumps(judged))
+        print(json.dumps(evaluation))
     else:
-        _print_judged(judged)
-    if not any(gain["stable"] for gain in judged["gains"]):
+        _print_gains(evaluation)
+    if not any(gain["stable"] for gain in evaluation["gains"]):
         raise typer.Exit(1)
 
 
-def _print_judged(judged: dict[str, Any]) -> None:
+def _print_gains(evaluation: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    latency = judged["latency"]
+    latency = evaluation["latency"]
     title = (
-        f"{judged['session']}: loop latency p50 {latency['p50_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
-        f"largest {latency['max_ms']:.1f} ms; step {judged['step_ms']:g} ms"
+        f"{evaluation['session']}: loop latency p50 {latency['p50_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
+        f"max {latency['max_ms']:.1f} ms; step {evaluation['step_ms']:g} ms"
     )
     table = Table(title=title, title_justify="left", title_style="bold")
-    for column in ("controller", "gain", "stable", "growth of the mean square", "expected cost", "delay to spare, ms"):
+    for column in ("controller", "gain", "stable", "mean-square growth", "expected cost", "delay margin, ms"):
         table.add_column(column, justify="left" if column == "controller" else "right")
-    for gain in judged["gains"]:
+    for gain in evaluation["gains"]:
         cost = gain["expected_cost"]
         table.add_row(
             gain["controller"],

@@ -1,4 +1,4 @@
-"""`hilrig top`: how the lab is, now."""
+"""`hilrig top`: current status of the lab's services and rigs."""
 
 import json
 import sys
@@ -39,20 +39,20 @@ RIG_COLUMNS: Final = {
     "recorded": 3,
     "state": 0,
 }
-"""Columns and their ranks: where a terminal is narrow the highest go first, and those of 0 stay."""
-TEXTS: Final = frozenset({"service", "host", "rig", "controller", "recorded", "state"})
-"""Columns that begin at the left."""
+"""Columns and their ranks: a narrow terminal hides the columns of the highest rank first, and never those of 0."""
+LEFT_ALIGNED_COLUMNS: Final = frozenset({"service", "host", "rig", "controller", "recorded", "state"})
+"""Columns with text."""
 
 
 def top(
     config: Config = None,
-    once: Annotated[bool, typer.Option("--once", help="Print it once and end.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print the status once and exit.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show a running lab: who holds each rig, its loop, what is recorded, and how the services are.
+    """Show the status of a running lab: services with their alerts; rigs with lease holder, loop latency, recording.
 
-    In a terminal it is kept up to date until Ctrl-C; the slowest loops come first, and what does not fit
-    is left out: rigs behind, columns that matter less.
+    In a terminal the display is updated until Ctrl-C. If it does not fit, the rigs with the lowest loop latency and
+    less important columns are hidden.
     """
     from rich.console import Console
     from rich.live import Live
@@ -70,23 +70,25 @@ def top(
                     print(json.dumps({"lab": lab.name} | watch.view.as_dict(time.monotonic())))
                 else:
                     console.print(
-                        picture(watch.view, time.monotonic(), None, console.width if sys.stdout.isatty() else None)
+                        render(watch.view, time.monotonic(), None, console.width if sys.stdout.isatty() else None)
                     )
             return
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 with watch.lock:
-                    shown = picture(watch.view, time.monotonic(), console.height, console.width)
-                live.update(shown, refresh=True)
+                    display = render(watch.view, time.monotonic(), console.height, console.width)
+                live.update(display, refresh=True)
                 time.sleep(REFRESH_S)
 
 
-def picture(view: "LabView", now_s: float, height: int | None, width: int | None = None) -> "Group":
-    """The two tables and what is wrong.
+def render(view: "LabView", now_s: float, height: int | None, width: int | None = None) -> "Group":
+    """Render the tables of services and rigs, and the alerts.
 
     Args:
-        height: lines at most, the slowest rigs first; None: all rigs, in their order.
-        width: characters at most, for which columns are left out; None: all columns.
+        view: the lab.
+        now_s: current time of the view's clock, s.
+        height: maximum number of lines, with the rigs of the highest latency first; None: all rigs, in their order.
+        width: maximum number of characters per line; None: all columns.
     """
     from rich.console import Group
     from rich.text import Text
@@ -105,22 +107,22 @@ def picture(view: "LabView", now_s: float, height: int | None, width: int | None
                 "queue": str(health.queue_depth),
                 "clock ms": f"{health.clock_offset_ns / 1e6:+.1f}" if health.clock_peer else "–",
             },
-            is_bad=view.is_silent(service, now_s),
+            is_highlighted=view.is_silent(service, now_s),
         )
         for service in view.services()
         for health in (service.health,)
     ]
-    troubles = [Text(f"! {trouble}", style="yellow") for trouble in view.troubles(now_s)]
-    shown = view.rigs(now_s)
-    room = len(shown) if height is None else max(1, height - len(services) - len(troubles) - 9)
-    if room < len(shown):
-        shown.sort(key=lambda rig: -(rig.loop_ms(0.99) or 0.0))
-        troubles.append(Text(f"… and {len(shown) - room} rigs more", style="dim"))
+    alerts = [Text(f"! {alert}", style="yellow") for alert in view.alerts(now_s)]
+    rig_views = view.rigs(now_s)
+    max_rigs = len(rig_views) if height is None else max(1, height - len(services) - len(alerts) - 9)
+    if max_rigs < len(rig_views):
+        rig_views.sort(key=lambda rig: -(rig.loop_ms(0.99) or 0.0))
+        alerts.append(Text(f"… and {len(rig_views) - max_rigs} more rigs", style="dim"))
     rigs = [
         Row(
             {
                 "rig": rig.rig,
-                "controller": rig.controller or "nobody",
+                "controller": rig.controller or "none",
                 "loop p50": _or_dash(rig.loop_ms(0.5)),
                 "p99 ms": _or_dash(rig.loop_ms(0.99)),
                 "samples": str(len(rig.loops_us)),
@@ -128,36 +130,36 @@ def picture(view: "LabView", now_s: float, height: int | None, width: int | None
                 "state": rig.state,
             }
         )
-        for rig in shown[:room]
+        for rig in rig_views[:max_rigs]
     ]
-    return Group(_table(services, SERVICE_COLUMNS, width), _table(rigs, RIG_COLUMNS, width), *troubles)
+    return Group(_table(services, SERVICE_COLUMNS, width), _table(rigs, RIG_COLUMNS, width), *alerts)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What a line of a table says, by column."""
+    """One row of a table: text by column."""
 
     cells: dict[str, str]
-    is_bad: bool = False
+    is_highlighted: bool = False
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, int], width: int | None) -> "Table":
-    """A table of those columns for which there is room; the ones of the highest rank go first."""
+    """Build a table of the columns that fit `width`; columns of the highest rank are dropped first."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     needed = {name: max([len(name), *(len(row.cells[name]) for row in rows)]) + 2 for name in columns}
-    kept = list(columns)
-    while width is not None and sum(needed[name] for name in kept) > width - 2:
-        last = max(kept, key=lambda name: columns[name])
-        if not columns[last]:
+    shown = list(columns)
+    while width is not None and sum(needed[name] for name in shown) > width - 2:
+        dropped = max(shown, key=lambda name: columns[name])
+        if not columns[dropped]:
             break
-        kept.remove(last)
+        shown.remove(dropped)
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in kept:
-        table.add_column(name, justify="left" if name in TEXTS else "right", no_wrap=True)
+    for name in shown:
+        table.add_column(name, justify="left" if name in LEFT_ALIGNED_COLUMNS else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(row.cells[name] for name in kept), style="red" if row.is_bad else None)
+        table.add_row(*(row.cells[name] for name in shown), style="red" if row.is_highlighted else None)
     return table
 
 

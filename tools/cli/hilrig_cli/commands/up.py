@@ -1,4 +1,4 @@
-"""`hilrig up`: the whole lab on this host, with nothing else installed."""
+"""`hilrig up`: runs all services of a lab on this host."""
 
 import subprocess
 import sys
@@ -13,18 +13,19 @@ from hilrig_cli.options import Config
 
 def up(
     config: Config = None,
-    edges: Annotated[int, typer.Option(help="Modbus edges that share the rigs: on several cores, for many rigs.")] = 1,
-    recorders: Annotated[int, typer.Option(help="Recorders that share the rigs.")] = 1,
+    edges: Annotated[int, typer.Option(help="Number of Modbus edges among which the rigs are divided.")] = 1,
+    recorders: Annotated[int, typer.Option(help="Number of recorders among which the rigs are divided.")] = 1,
     log_format: LogFormat = "text",
-    view: Annotated[bool, typer.Option("--view", help="Open the live view of the first rig in rerun.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Open the first rig in the rerun viewer.")] = False,
     stop_with_parent: StopWithParent = False,
 ) -> None:
-    """Start simulation, Modbus edge and recorder here, print each rig's Modbus address, and run until Ctrl-C.
+    """Start simulation, Modbus edge and recorder on this host, print each rig's Modbus address, and run until Ctrl-C.
 
-    A service that dies is restarted. Ctrl-C or SIGTERM ends everything in order: torques to zero, recordings finished.
+    A service that dies is restarted. Ctrl-C or SIGTERM stops all services in order: torques are zeroed and recordings
+    are finished.
     """
     from hilrig_cli.local.local_lab import POLL_S, running_lab
-    from hilrig_cli.local.supervisor import own_process_group, shared
+    from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.shutdown import stop_on_signals, stop_with_stdin
 
@@ -34,19 +35,19 @@ def up(
     if stop_with_parent:
         stop_with_stdin(stopping)
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         print(f"hilrig: {line}", file=sys.stderr, flush=True)
 
-    parts = shared([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
-    with running_lab(lab, config, say, stopping, parts, ["--log-format", log_format]) as supervisor:
+    processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
+    with running_lab(lab, config, log, stopping, processes, ["--log-format", log_format]) as supervisor:
         if not stopping.is_set():
             for rig, kinds in zip(lab.rigs, lab.addresses().values(), strict=True):
                 addresses = ", ".join(f"{kind} at {address}" for kind, address in kinds.items())
                 impairment = lab.impairment_of(rig).describe()
-                impaired = "" if impairment == "none" else f", impaired: {impairment}"
-                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{impaired}")
+                suffix = "" if impairment == "none" else f", impairment: {impairment}"
+                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{suffix}")
             print(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
-            print("running; Ctrl-C ends it", flush=True)
+            print("running; press Ctrl-C to stop", flush=True)
         viewer = None
         if view and not stopping.is_set():
             command = [sys.executable, "-m", "hilrig_cli", "live", lab.rigs[0].name]
@@ -56,4 +57,4 @@ def up(
             supervisor.poll()
         if viewer is not None:
             viewer.terminate()
-    print("ended", flush=True)
+    print("stopped", flush=True)

@@ -1,4 +1,4 @@
-"""`hilrig verify`: is a recording what the model makes of its efforts?"""
+"""`hilrig verify`: re-simulates recordings and compares every state."""
 
 import json
 from contextlib import suppress
@@ -19,37 +19,37 @@ def verify(
         float | None,
         typer.Option(
             min=0.0,
-            help="Deviation allowed, rad or m and their rates; default: none where it was recorded on a machine like "
-            "this one, else 1e-9.",
+            help="Allowed deviation of positions (rad, m) and velocities; default: 0 if it was recorded on an equal "
+            "platform, otherwise 1e-9.",
             show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Re-simulate recordings from their efforts and compare every state; the verdict is kept beside each file.
+    """Re-simulate recordings from their torques and compare every state; the verdict is stored next to each file.
 
-    Exit code 1: a recording (or one of them) is not what the model makes of its efforts.
+    Exit code 1: re-simulation does not reproduce at least one recording.
     """
     from rich.console import Console
     from rich.text import Text
 
+    from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
-    from hilrig_replay.io.index import write_verdict
-    from hilrig_replay.io.paths import recordings
+    from hilrig_replay.io.paths import find_recordings
 
     console = Console()
-    found = []
-    for path in recordings(runs):
+    verifications = []
+    for path in find_recordings(runs):
         verification = resimulate(path, tolerance)
-        # A note for the list of runs; in a folder that can't be written there is none.
+        # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
         with suppress(OSError):
             write_verdict(path, verification.same, verification.sentence())
-        found.append(verification)
+        verifications.append(verification)
         if not as_json:
             style = "green" if verification.same else "red"
             console.print(Text(f"{path.name}: {verification.sentence()}", style=style), soft_wrap=True)
     if as_json:
-        plain = [each.as_dict() for each in found]
+        plain = [each.as_dict() for each in verifications]
         print(json.dumps(plain[0] if len(plain) == 1 else {"runs": plain}))
-    if not all(each.same for each in found):
+    if not all(each.same for each in verifications):
         raise typer.Exit(1)

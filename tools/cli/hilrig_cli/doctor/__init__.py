@@ -1,40 +1,41 @@
-"""What `hilrig doctor` looks at: each check gives findings, and says what to mend."""
+"""Checks of `hilrig doctor`: each returns results with a level, a text and a fix."""
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Self
 
 
 class Level(Enum):
-    """How a finding is to be taken."""
+    """Severity of a check result."""
 
-    GOOD = "good"
-    NOTICE = "notice"
-    """Works, but somebody should know."""
-    WRONG = "wrong"
+    OK = "ok"
+    WARNING = "warning"
+    """The lab works, but the operator should know."""
+    ERROR = "error"
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was looked at."""
+class CheckResult:
+    """Result of one check."""
 
     check: str
-    """What was looked at, in a word or two."""
+    """Name of the check, one or two words."""
     level: Level
     text: str
-    mend: str = ""
-    """What to do about it; empty: nothing."""
+    fix: str = ""
+    """How to fix it; empty: nothing to do."""
 
+    @classmethod
+    def ok(cls, check: str, text: str) -> Self:
+        """Result of a check that passed."""
+        return cls(check, Level.OK, text)
 
-def good(check: str, text: str) -> Finding:
-    """It is as it should be."""
-    return Finding(check, Level.GOOD, text)
+    @classmethod
+    def warning(cls, check: str, text: str, fix: str = "") -> Self:
+        """Result for a condition that the operator should know."""
+        return cls(check, Level.WARNING, text, fix)
 
-
-def notice(check: str, text: str, mend: str = "") -> Finding:
-    """It works, but somebody should know."""
-    return Finding(check, Level.NOTICE, text, mend)
-
-
-def wrong(check: str, text: str, mend: str) -> Finding:
-    """It is to be mended."""
-    return Finding(check, Level.WRONG, text, mend)
+    @classmethod
+    def error(cls, check: str, text: str, fix: str) -> Self:
+        """Result for a condition that must be fixed."""
+        return cls(check, Level.ERROR, text, fix)

@@ -1,4 +1,4 @@
-"""Can this host carry the lab: ports, open files, punctuality, disk, software?"""
+"""Checks of this host: installed versions, ports, open files, timer accuracy, disk."""
 
 import os
 import shutil
@@ -9,115 +9,121 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from typing import Final
 
-from hilrig_cli.doctor import Finding, good, notice, wrong
-from hilrig_cli.local.local_lab import why_not_free
+from hilrig_cli.doctor import CheckResult, Level
+from hilrig_cli.local.local_lab import bind_error
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.timing.realtime import prefer_latency
+from hilrig_runtime.timing.realtime import set_short_slice
 
-OWN_FILES = 200
-"""Handles that a service needs beside its connections."""
-SLEEPS = 100
-BYTES_A_RIG_AND_HOUR = 30 * 2**20
-"""What a recording of a rig at a 20 ms step takes, rounded up."""
-_PROBE_TIMEOUT_S = 1.0
-_IDENTIFY = bytes.fromhex("0001 0000 0005 01 2B 0E 01 00")
+RESERVED_HANDLES: Final = 200
+"""File handles that a service needs besides its connections."""
+SLEEP_COUNT: Final = 100
+BYTES_PER_RIG_HOUR: Final = 30 * 2**20
+"""Size of a recording of one rig at a step of 20 ms, per hour, rounded up."""
+_PROBE_TIMEOUT_S: Final = 1.0
+_IDENTIFY: Final = bytes.fromhex("0001 0000 0005 01 2B 0E 01 00")
 
 
-def check_software() -> Iterator[Finding]:
-    """Which versions are installed here."""
+def check_software() -> Iterator[CheckResult]:
+    """Report the versions that are installed here."""
     found = []
     for name in ("hilrig", "eclipse-zenoh", "pymodbus", "mcap"):
         with suppress(PackageNotFoundError):
             found.append(f"{name} {version(name)}")
-    yield good("software", f"Python {sys.version.split()[0]}, {', '.join(found)}")
+    yield CheckResult.ok("software", f"Python {sys.version.split()[0]}, {', '.join(found)}")
 
 
-def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[Finding]:
-    """Each Modbus port of the lab is free, or an edge of ours serves it; `running`: services heard on the bus."""
+def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResult]:
+    """Check that each Modbus port of the lab is free or served by a hilrig edge.
+
+    Args:
+        lab: the lab.
+        running: kinds of service that are alive on the bus.
+    """
     ports = [*(lab.ports.items() if lab.edge.plain else ()), *lab.tls_ports.items()]
     served, free = 0, 0
     for rig, port in ports:
-        reason = why_not_free(lab.edge.host, port)
+        reason = bind_error(lab.edge.host, port)
         if reason is None:
             free += 1
-        elif _is_ours(lab.edge.host, port) or (port in lab.tls_ports.values() and "edge" in running):
+        elif _is_hilrig_edge(lab.edge.host, port) or (port in lab.tls_ports.values() and "edge" in running):
             served += 1
         else:
-            yield wrong(
+            yield CheckResult.error(
                 "ports",
-                f"rig {rig!r}: {lab.edge.host}:{port} can't be had ({reason}), and what has it is no edge of ours",
-                "end the program that listens there, or set another edge.first_port or the rig's own port in lab.toml",
+                f"rig {rig!r}: {lab.edge.host}:{port} is unavailable ({reason}) and not served by a hilrig edge",
+                "stop the program that uses the port, or change edge.first_port or the rig's port in lab.toml",
             )
     if served + free == len(ports):
-        yield good("ports", f"{served} of {len(ports)} Modbus ports served by hilrig, {free} free")
+        yield CheckResult.ok("ports", f"{served} of {len(ports)} Modbus ports served by hilrig, {free} free")
     if lab.edge.host not in ("127.0.0.1", "::1", "localhost") and lab.edge.plain and not _all_restricted(lab):
-        yield notice(
+        yield CheckResult.warning(
             "ports",
-            f"edge.host is {lab.edge.host}: whoever reaches the edge's host may take a rig without a certificate",
-            "name the networks of each rig (allow), or take [edge.tls] with plain = false",
+            f"edge.host is {lab.edge.host}: any host that reaches the edge can control a rig without a certificate",
+            "list the networks that may connect to each rig (allow), or use [edge.tls] with plain = false",
         )
 
 
-def check_open_files(lab: LabConfig) -> Iterator[Finding]:
-    """A process may open as many connections as the lab allows; a service takes all that its user may have."""
+def check_open_files(lab: LabConfig) -> Iterator[CheckResult]:
+    """Check that the limit of open files covers the lab's connections; a service raises its soft limit to it."""
     if sys.platform == "win32":
         return
     import resource
 
     _, limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = OWN_FILES + len(lab.rigs) * lab.edge.max_connections
+    needed = RESERVED_HANDLES + len(lab.rigs) * lab.edge.max_connections
     if limit == resource.RLIM_INFINITY or limit >= needed:
-        yield good("open files", f"{limit} may be open, {needed} are enough")
+        yield CheckResult.ok("open files", f"limit {limit}, required {needed}")
         return
-    likely = OWN_FILES + 4 * len(lab.rigs)
-    say = notice if limit >= likely else wrong
-    yield say(
+    likely = RESERVED_HANDLES + 4 * len(lab.rigs)
+    yield CheckResult(
         "open files",
-        f"{limit} may be open, {needed} are needed if every rig has edge.max_connections ({lab.edge.max_connections})",
-        f"a higher limit for its user (ulimit -Hn {needed} as root, or LimitNOFILE of the service), a smaller "
-        "edge.max_connections, or hilrig up --edges",
+        Level.WARNING if limit >= likely else Level.ERROR,
+        f"limit {limit}, but {needed} are required if every rig has edge.max_connections ({lab.edge.max_connections})",
+        f"raise the user's limit (ulimit -Hn {needed} as root, or LimitNOFILE of the service), reduce "
+        "edge.max_connections, or use several edges (hilrig up --edges)",
     )
 
 
-def check_punctuality(lab: LabConfig) -> Iterator[Finding]:
-    """A sleep ends in time, as far as that shows in a moment; `hilrig jitter` looks longer."""
-    prefer_latency()
-    lates = []
-    for _ in range(SLEEPS):
+def check_timer_accuracy(lab: LabConfig) -> Iterator[CheckResult]:
+    """Check that short sleeps end on time; a quick test only, `hilrig jitter` measures in detail."""
+    set_short_slice()
+    lateness_ns = []
+    for _ in range(SLEEP_COUNT):
         deadline_ns = time.monotonic_ns() + 1_000_000
         time.sleep(0.001)
-        lates.append(time.monotonic_ns() - deadline_ns)
-    late_ms = sorted(lates)[round(0.95 * (SLEEPS - 1))] / 1e6
+        lateness_ns.append(time.monotonic_ns() - deadline_ns)
+    late_ms = sorted(lateness_ns)[round(0.95 * (SLEEP_COUNT - 1))] / 1e6
     cores = os.cpu_count() or 1
-    text = f"{cores} cores; of {SLEEPS} sleeps 95 % ended within {late_ms:.2f} ms, the step is {lab.sim.step_ms:g} ms"
+    text = f"{cores} cores; lateness of {SLEEP_COUNT} sleeps: p95 {late_ms:.2f} ms; step {lab.sim.step_ms:g} ms"
     if late_ms < lab.sim.step_ms / 10:
-        yield good("punctuality", text)
+        yield CheckResult.ok("punctuality", text)
     else:
-        yield notice(
-            "punctuality", text, "end what else runs here, or take a longer sim.step_ms; hilrig jitter says more"
-        )
+        fix = "stop other programs on this host, or set a longer sim.step_ms; measure with hilrig jitter"
+        yield CheckResult.warning("punctuality", text, fix)
 
 
-def check_disk(lab: LabConfig) -> Iterator[Finding]:
-    """Recordings can be written, and there is room for a while."""
+def check_disk(lab: LabConfig) -> Iterator[CheckResult]:
+    """Check that recordings can be written and that the free space lasts for some hours."""
     folder = lab.recorder.folder
-    there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
-    if not os.access(there, os.W_OK):
-        yield wrong(
-            "disk", f"{folder}: recordings can't be written there", "set another recorder.folder, or its rights"
-        )
+    existing = next((path for path in (folder, *folder.absolute().parents) if path.exists()), folder)
+    if not os.access(existing, os.W_OK):
+        text = f"{folder}: recordings can't be written: no write permission"
+        yield CheckResult.error("disk", text, "set another recorder.folder, or change the folder's permissions")
         return
-    free = shutil.disk_usage(there).free
-    least = lab.recorder.min_free_mib * 2**20
-    hours = max(0.0, free - least) / (BYTES_A_RIG_AND_HOUR * len(lab.rigs))
+    free = shutil.disk_usage(existing).free
+    reserve = lab.recorder.min_free_mib * 2**20
+    hours = max(0.0, free - reserve) / (BYTES_PER_RIG_HOUR * len(lab.rigs))
     text = f"{_size(free)} free for recordings in {folder}"
-    if free <= least:
-        yield wrong("disk", f"{text}: recordings end below {lab.recorder.min_free_mib} MiB", "delete old recordings")
+    if free <= reserve:
+        text += f": recording stops below recorder.min_free_mib ({lab.recorder.min_free_mib} MiB)"
+        yield CheckResult.error("disk", text, "delete old recordings")
     elif hours < 8:
-        yield notice("disk", f"{text}, about {hours:.1f} h of this lab", "delete old ones, or set recorder.keep_gib")
+        fix = "delete old recordings, or set recorder.keep_gib"
+        yield CheckResult.warning("disk", f"{text}, enough for about {hours:.1f} h of this lab", fix)
     else:
-        yield good("disk", text)
+        yield CheckResult.ok("disk", text)
 
 
 def _size(bytes_: int) -> str:
@@ -128,8 +134,8 @@ def _all_restricted(lab: LabConfig) -> bool:
     return all(rig.allow for rig in lab.rigs)
 
 
-def _is_ours(host: str, port: int) -> bool:
-    """Whether who listens there identifies itself as this project's edge (function 43/14)."""
+def _is_hilrig_edge(host: str, port: int) -> bool:
+    """Whether the server on a port identifies itself as a hilrig edge (function 43/14)."""
     reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     with suppress(OSError, struct.error), socket.create_connection((reachable, port), _PROBE_TIMEOUT_S) as probe:
         probe.settimeout(_PROBE_TIMEOUT_S)

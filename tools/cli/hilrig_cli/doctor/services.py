@@ -1,11 +1,13 @@
-"""Who is on the bus: reachable at all, complete, of one version, with clocks that agree, without trouble?"""
+"""Checks of the services on the bus: reachability, completeness, alerts, real-time policy, versions, clocks."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from threading import Lock, Thread
+from typing import Final
 
-from hilrig_cli.doctor import Finding, good, notice, wrong
+from hilrig_cli.doctor import CheckResult, Level
+from hilrig_cli.service_kinds import SERVICE_KINDS
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import HilrigError, InputError
@@ -14,179 +16,198 @@ from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH, alive_key, source_of_alive_key
 
-SERVICES = ("sim", "edge", "recorder")
-LISTENING_S = 2.5
-"""Each service says once a second how it is."""
-CLOCK_NOTICE_S = 1.0
-CLOCK_WRONG_S = 60.0
-_GRANT = (
-    'on Linux write "<user> - rtprio 3" into /etc/security/limits.conf and log in anew, or LimitRTPRIO=3 into the '
-    "unit, or ulimits: {rtprio: 3} for the container; then start the services again"
+COLLECT_TIMEOUT_S: Final = 2.5
+"""Time to collect health reports; each service publishes one a second."""
+CLOCK_WARNING_S: Final = 1.0
+CLOCK_ERROR_S: Final = 60.0
+_REALTIME_FIX: Final = (
+    'on Linux add "<user> - rtprio 3" to /etc/security/limits.conf and log in again, or LimitRTPRIO=3 to the systemd '
+    "unit, or ulimits: {rtprio: 3} to the container; then restart the services"
 )
 
 
 @dataclass(slots=True)
-class Heard:
-    """What came over the bus."""
+class BusSnapshot:
+    """Liveliness tokens and health reports collected from the bus."""
 
     alive: set[str] = field(default_factory=set)
-    """ "<service>/<instance>" of those who show that they live."""
+    """ "<service>/<instance>" of each service with a liveliness token."""
     healths: dict[str, tuple[Health, int]] = field(default_factory=dict)
-    """The last report of each, and our wall clock when it came, ns."""
+    """Last report of each service, and this host's wall clock when it arrived, ns."""
 
     @property
     def services(self) -> set[str]:
-        """Kinds of service that live."""
+        """Kinds of service that are alive."""
         return {name.partition("/")[0] for name in self.alive}
 
 
-def is_one(name: str, wanted: str) -> bool:
-    """Whether "<service>/<instance>" is what is wanted: a service, or one instance of it."""
+def matches(name: str, wanted: str) -> bool:
+    """Whether "<service>/<instance>" is the wanted service ("edge") or the wanted instance ("edge/1")."""
     return wanted in (name, name.partition("/")[0])
 
 
-def listen(lab: LabConfig, identity: str = "tool", *, for_s: float = LISTENING_S, until: str = "") -> Heard:
-    """Listen on the lab's bus as `identity`; with `until` only until that service has said how it is, see `is_one`.
+def collect(
+    lab: LabConfig, identity: str = "tool", *, timeout_s: float = COLLECT_TIMEOUT_S, until: str = ""
+) -> BusSnapshot:
+    """Collect liveliness tokens and health reports from the lab's bus.
+
+    Args:
+        lab: the lab.
+        identity: name of the certificate to use on a secured bus.
+        timeout_s: time to collect.
+        until: return early once this service has reported its health, see `matches`.
 
     Raises:
         HilrigError: the bus can't be joined.
     """
-    heard, lock = Heard(), Lock()
+    snapshot, lock = BusSnapshot(), Lock()
 
     def on_health(key: str, payload: bytes) -> None:
         del key
         health = HEALTH.decode(payload)
         with lock:
-            heard.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
+            snapshot.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
 
     def on_alive(key: str, alive: bool) -> None:
         name = source_of_alive_key(key)
         with lock:
-            (heard.alive.add if alive else heard.alive.discard)(name)
+            (snapshot.alive.add if alive else snapshot.alive.discard)(name)
 
     with (
         ZenohBus(lab.bus, identity) as bus,
         bus.subscribe(HEALTH.key(lab.name, "*", "*"), on_health),
-        bus.watch(alive_key(lab.name, "*", "*"), on_alive),
+        bus.subscribe_liveliness(alive_key(lab.name, "*", "*"), on_alive),
     ):
-        deadline_s = time.monotonic() + for_s
+        deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             with lock:
-                if until and any(is_one(name, until) for name in heard.healths):
+                if until and any(matches(name, until) for name in snapshot.healths):
                     break
             time.sleep(0.02)
-    return heard
+    return snapshot
 
 
-def check_bus(lab: LabConfig) -> tuple[list[Finding], Heard | None]:
-    """Whether the bus can be joined, and what is heard there; nothing can be, where it can't."""
+def check_bus(lab: LabConfig) -> tuple[list[CheckResult], BusSnapshot | None]:
+    """Check that the bus can be joined; return the results and a snapshot, or None if it can't be joined."""
     where = f"router {lab.bus.router}" if lab.bus.topology == "router" else f"mesh on {lab.bus.host}"
     try:
-        heard = listen(lab)
+        snapshot = collect(lab)
     except HilrigError as error:
-        return [wrong("bus", str(error), _mend_of_bus(lab, error))], None
-    return [good("bus", f"{where}: joined")], heard
+        return [CheckResult.error("bus", str(error), _bus_fix(lab, error))], None
+    return [CheckResult.ok("bus", f"{where}: joined")], snapshot
 
 
-def _mend_of_bus(lab: LabConfig, error: HilrigError) -> str:
+def _bus_fix(lab: LabConfig, error: HilrigError) -> str:
     if lab.bus.tls is not None and isinstance(error, InputError):
-        return "give this host a command's certificate and its key (viewer, operator) beside ca.pem"
-    mend = "start the router (hilrig router), and compare bus.router" if lab.bus.topology == "router" else "see its log"
-    return mend if lab.bus.tls is None else f"{mend}; look at the certificates below"
+        return "copy a command's certificate and key (viewer or operator) to this host, into the folder of ca.pem"
+    if lab.bus.topology == "router":
+        fix = "start the router (hilrig router), and compare bus.router in lab.toml with its address"
+    else:
+        fix = "see the log of the service"
+    return fix if lab.bus.tls is None else f"{fix}; check the certificates below"
 
 
-def check_services(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
-    """Whether all that a lab needs is there."""
-    if not heard.services & set(SERVICES):
-        yield notice("services", f"nothing of lab {lab.name!r} runs", "start it: hilrig up, or service by service")
+def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResult]:
+    """Check that every kind of service runs, reports its health and has no alert."""
+    if not snapshot.services & set(SERVICE_KINDS):
+        text = f"no service of lab {lab.name!r} is running"
+        yield CheckResult.warning("services", text, "start the lab: hilrig up, or each service")
         return
-    missing = [service for service in SERVICES if service not in heard.services]
+    missing = [service for service in SERVICE_KINDS if service not in snapshot.services]
     if missing:
-        yield wrong("services", f"no {' and no '.join(missing)} runs", f"start it: hilrig {missing[0]}")
-    silent = sorted(name for name in heard.alive if name.partition("/")[0] in SERVICES and name not in heard.healths)
+        yield CheckResult.error("services", f"not running: {', '.join(missing)}", f"start it: hilrig {missing[0]}")
+    silent = sorted(
+        name for name in snapshot.alive if name.partition("/")[0] in SERVICE_KINDS and name not in snapshot.healths
+    )
     if silent:
-        yield wrong("services", f"{', '.join(silent)} shows that it lives, but says nothing", "start it again")
+        text = f"{', '.join(silent)}: alive, but sends no health reports"
+        yield CheckResult.error("services", text, "restart it")
     if not missing and not silent:
-        yield good("services", f"{', '.join(sorted(heard.alive))} live")
-    for name, (health, _) in sorted(heard.healths.items()):
-        if health.trouble:
-            yield wrong("services", f"{name}: {health.trouble}", "see what it says, and its log")
+        yield CheckResult.ok("services", f"running: {', '.join(sorted(snapshot.alive))}")
+    for name, (health, _) in sorted(snapshot.healths.items()):
+        if health.alert:
+            yield CheckResult.error("services", f"{name}: {health.alert}", "see the service's log")
         if health.lost_transport or health.lost_recorder:
             lost = health.lost_transport + health.lost_recorder
-            yield notice("services", f"{name}: {lost} messages lost since it started", "see the sizing in the docs")
+            text = f"{name}: {lost} messages lost since its start"
+            yield CheckResult.warning("services", text, "see 'Sizing' in docs/operations.md")
 
 
-def check_realtime(lab: LabConfig, heard: Heard) -> Iterator[Finding]:
-    """What closes the loop runs under the real-time policy; where nothing runs yet: whether this host grants it."""
+def check_realtime(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResult]:
+    """Check that simulation and edge run under the real-time policy; without services, that this host grants it."""
     if not lab.realtime:
-        yield good("real-time", "not asked for (realtime = false): other programs may hold the loop up")
+        text = "not requested (realtime = false): other programs can delay the loop"
+        yield CheckResult.ok("real-time", text)
         return
-    reports = [health for health, _ in heard.healths.values() if health.service in REALTIME_PRIORITIES]
+    reports = [health for health, _ in snapshot.healths.values() if health.service in REALTIME_PRIORITIES]
     if not reports:
         if _is_granted_here():
-            yield good("real-time", "this host grants the policy")
+            yield CheckResult.ok("real-time", "this host grants the real-time policy")
         else:
-            yield notice(
-                "real-time", "this host does not grant the policy: other programs may hold the loop up", _GRANT
-            )
+            text = "this host does not grant the real-time policy: other programs can delay the loop"
+            yield CheckResult.warning("real-time", text, _REALTIME_FIX)
         return
     ordinary = [health for health in reports if not health.realtime_priority]
     for health in ordinary:
         host = f" on {health.host}" if health.host else ""
-        yield notice(
+        yield CheckResult.warning(
             "real-time",
-            f"{health.service}/{health.instance}{host} was not granted the policy: other programs may hold it up",
-            _GRANT,
+            f"{health.service}/{health.instance}{host}: real-time policy not granted; other programs can delay it",
+            _REALTIME_FIX,
         )
     if not ordinary:
         names = (f"{health.service}/{health.instance} (priority {health.realtime_priority})" for health in reports)
-        yield good("real-time", f"granted to {', '.join(sorted(names))}")
+        yield CheckResult.ok("real-time", f"granted to {', '.join(sorted(names))}")
 
 
-def check_versions(healths: Iterable[Health], own: str) -> Iterator[Finding]:
-    """All services are of the version that this command is of."""
+def check_versions(healths: Iterable[Health], own: str) -> Iterator[CheckResult]:
+    """Check that all services have the version of this command."""
     versions: dict[str, list[str]] = {}
     for health in healths:
-        versions.setdefault(health.software_version or "an older version", []).append(
+        versions.setdefault(health.software_version or "unknown (older)", []).append(
             f"{health.service}/{health.instance}"
         )
     others = {version: names for version, names in versions.items() if version != own}
     for version, names in sorted(others.items()):
-        say = notice if _series(version) == _series(own) else wrong
-        yield say(
+        yield CheckResult(
             "versions",
-            f"{', '.join(sorted(names))} of {version}; this command is {own}",
-            "install the same version everywhere; services can be exchanged one by one",
+            Level.WARNING if _compatibility(version) == _compatibility(own) else Level.ERROR,
+            f"{', '.join(sorted(names))}: version {version}; this command: {own}",
+            "install the same version everywhere; services can be upgraded one by one",
         )
     if versions and not others:
-        yield good("versions", f"all of {own}")
+        yield CheckResult.ok("versions", f"all services: {own}")
 
 
-def check_clocks(reports: Sequence[tuple[Health, int]]) -> Iterator[Finding]:
-    """Hosts' wall clocks agree; no figure depends on that, but people compare dates. Each report with our clock, ns."""
+def check_clocks(reports: Sequence[tuple[Health, int]]) -> Iterator[CheckResult]:
+    """Check that the hosts' wall clocks agree. No latency depends on them; they date the recordings.
+
+    Args:
+        reports: each health report and this host's wall clock when it arrived, ns.
+    """
     if not reports:
         return
     offsets = {
         f"{health.service}/{health.instance}" + (f" on {health.host}" if health.host else ""): (
-            (health.wall_ns - heard_ns) / 1e9
+            (health.wall_ns - arrived_ns) / 1e9
         )
-        for health, heard_ns in reports
+        for health, arrived_ns in reports
     }
     name, offset_s = max(offsets.items(), key=lambda item: abs(item[1]))
-    if abs(offset_s) < CLOCK_NOTICE_S:
-        yield good("time", f"all clocks within {abs(offset_s) * 1e3:.0f} ms of this host's")
+    if abs(offset_s) < CLOCK_WARNING_S:
+        yield CheckResult.ok("time", f"all clocks within {abs(offset_s) * 1e3:.0f} ms of this host's")
         return
-    say = wrong if abs(offset_s) >= CLOCK_WRONG_S else notice
     ahead = "ahead of" if offset_s > 0 else "behind"
-    yield say(
+    yield CheckResult(
         "time",
-        f"the clock of {name} is {abs(offset_s):.1f} s {ahead} this host's; it dates recordings",
-        "synchronise the hosts' clocks (NTP); latencies do not depend on them",
+        Level.ERROR if abs(offset_s) >= CLOCK_ERROR_S else Level.WARNING,
+        f"the clock of {name} is {abs(offset_s):.1f} s {ahead} this host's; recordings are dated by it",
+        "synchronize the hosts' clocks (NTP); latencies do not depend on them",
     )
 
 
 def _is_granted_here() -> bool:
-    """Whether this user may go real-time on this host: tried, on a thread that ends with the trial."""
+    """Whether this host grants the real-time policy to this user; tried on a thread that ends with the trial."""
     granted: list[bool] = []
     trial = Thread(target=lambda: granted.append(go_realtime(max(REALTIME_PRIORITIES.values()))))
     trial.start()
@@ -194,7 +215,7 @@ def _is_granted_here() -> bool:
     return granted == [True]
 
 
-def _series(version: str) -> tuple[str, ...]:
-    """What must be equal for two versions to be compatible: before 1.0 the second number too."""
+def _compatibility(version: str) -> tuple[str, ...]:
+    """Parts of a version that must be equal for compatibility: the first; before 1.0 the second too."""
     parts = version.split(".")
     return tuple(parts[:2] if parts[0] == "0" else parts[:1])

@@ -1,1 +1,1 @@
-"""Labs on the local machine: supervision of their processes, and the demo."""
+"""Labs on this host: supervision of their processes, and the demo."""

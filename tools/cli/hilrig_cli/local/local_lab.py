@@ -1,4 +1,4 @@
-"""A lab on this host: services supervised, ready when controllers can connect, watched while it runs."""
+"""A lab on this host: checks its ports, starts its services, and waits until controllers can connect."""
 
 import socket
 import sys
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from hilrig_cli.local.supervisor import WHOLE_LAB, Part, Supervisor
+from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, ProcessSpec, Supervisor
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import MESH_ORDER
 from hilrig_runtime.config.lab import LabConfig
@@ -18,59 +18,62 @@ from hilrig_schemas.topics import alive_key
 
 POLL_S: Final = 0.05
 READY_TIMEOUT_S: Final = 60.0
-"""Generous: a cold start on a slow disk imports for a while."""
+"""Long, because a first start imports many files from a possibly slow disk."""
 
 
 @contextmanager
 def running_lab(
     lab: LabConfig,
     config: Path | None,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     stopping: threading.Event,
-    parts: Sequence[Part] = WHOLE_LAB,
+    processes: Sequence[ProcessSpec] = DEFAULT_PROCESSES,
     options: Sequence[str] = (),
 ) -> Iterator[Supervisor]:
-    """Start the services of `lab` (read from `config`) and give their supervisor once controllers can connect.
+    """Start the services of `lab` (read from `config`) and yield their supervisor once controllers can connect.
 
-    Each service gets `options` too. Setting `stopping` cuts the waiting short. Leaving the context ends every service,
-    in order.
+    Each service gets `options` too. Setting `stopping` ends the waiting. Leaving the context stops every service, in
+    order.
 
     Raises:
-        HilrigError: a service could not start; it said why on standard error.
+        HilrigError: a service could not start; its reason is on standard error.
     """
     _check_ports(lab)
-    with Supervisor(config, say, parts, options) as supervisor:
+    with Supervisor(config, log, processes, options) as supervisor:
         supervisor.start()
-        _wait_until_ready(lab, parts, supervisor, stopping)
-        supervisor.settled()
+        _wait_until_ready(lab, processes, supervisor, stopping)
+        supervisor.mark_ready()
         yield supervisor
 
 
 def _check_ports(lab: LabConfig) -> None:
-    """Say at once, and once, what each service would say: whoever else has the ports is heard on the bus like ours."""
-    wanted: list[tuple[str, str, int, str]] = []
+    """Check all ports before the start, so that an error is reported once and not by each service.
+
+    It also prevents that services of another lab on the same bus ports are mistaken for this lab's.
+    """
+    required: list[tuple[str, str, int, str]] = []
     if lab.edge.plain:
         key = "edge.first_port or the rig's port"
-        wanted += [(f"rig {rig!r}", lab.edge.host, port, key) for rig, port in lab.ports.items()]
-    wanted += [(f"rig {rig!r}", lab.edge.host, port, "edge.tls.first_port") for rig, port in lab.tls_ports.items()]
+        required += [(f"rig {rig!r}", lab.edge.host, port, key) for rig, port in lab.ports.items()]
+    required += [(f"rig {rig!r}", lab.edge.host, port, "edge.tls.first_port") for rig, port in lab.tls_ports.items()]
     if lab.bus.topology == "mesh":
         ports = range(lab.bus.first_port, lab.bus.first_port + len(MESH_ORDER))
-        wanted += [("the bus", lab.bus.host, port, "bus.first_port") for port in ports]
-    for what, host, port, key in wanted:
-        if (reason := why_not_free(host, port)) is not None:
+        required += [("the bus", lab.bus.host, port, "bus.first_port") for port in ports]
+    for owner, host, port, key in required:
+        if (reason := bind_error(host, port)) is not None:
             raise OperationError(
-                f"{what}: can't listen on {host}:{port} ({reason}): is another hilrig running here? "
-                f"End what has the port, or choose another {key} in lab.toml"
+                f"{owner}: can't listen on {host}:{port} ({reason}): is another hilrig running here? "
+                f"Stop the program that uses the port, or change {key} in lab.toml"
             )
 
 
-def why_not_free(host: str, port: int) -> str | None:
-    """Why nobody can listen on a TCP port of this machine now; None: somebody can."""
+def bind_error(host: str, port: int) -> str | None:
+    """Reason why a TCP port of this host can't be bound; None: it is free."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:
             if sys.platform != "win32":
-                # As the services do: a port that only waits for its last connection to fade counts as free.
+                # As in the services: a port with connections in TIME_WAIT only is free.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
@@ -78,15 +81,19 @@ def why_not_free(host: str, port: int) -> str | None:
     return None
 
 
-def _wait_until_ready(lab: LabConfig, parts: Sequence[Part], supervisor: Supervisor, stopping: threading.Event) -> None:
-    missing = {alive_key(lab.name, part.service, part.instance) for part in parts}
+def _wait_until_ready(
+    lab: LabConfig, processes: Sequence[ProcessSpec], supervisor: Supervisor, stopping: threading.Event
+) -> None:
+    missing = {alive_key(lab.name, spec.service, spec.instance) for spec in processes}
     deadline_s = time.monotonic() + READY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
-        bus.watch(alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None)
+        bus.subscribe_liveliness(
+            alive_key(lab.name, "*", "*"), lambda key, alive: missing.discard(key) if alive else None
+        )
         while missing and not stopping.is_set():
             supervisor.poll()
             if time.monotonic() > deadline_s:
                 raise OperationError(
-                    f"not up after {READY_TIMEOUT_S:.0f} s: nothing heard of {', '.join(sorted(missing))}"
+                    f"the lab is not ready after {READY_TIMEOUT_S:.0f} s; not on the bus: {', '.join(sorted(missing))}"
                 )
             time.sleep(POLL_S)

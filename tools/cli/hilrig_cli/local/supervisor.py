@@ -1,9 +1,8 @@
-"""The services of one host as child processes: started together, restarted when they die, ended in order.
+"""Supervisor of a host's services: starts them as child processes, restarts them, and stops them in order.
 
-Children are spawned, never forked, each in a process group of its own, so that Ctrl-C reaches this process alone and
-the order of ending stays ours: the edge first (it zeroes the torques and ends the sessions), the recorder last (it
-still hears of that). The wish to end is told by closing the child's standard input, which also tells it when this
-process dies.
+Children are spawned, never forked, each in its own process group, so that Ctrl-C reaches the supervisor only and the
+stop order is kept (see `service_kinds.STOP_ORDER`). A child stops when its standard input is closed, which also happens
+when the supervisor dies.
 """
 
 import contextlib
@@ -16,90 +15,90 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from hilrig_cli.service_kinds import SERVICE_KINDS, STOP_ORDER
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 
-START_ORDER: Final = ("sim", "edge", "recorder")
-STOP_ORDER: Final = ("edge", "sim", "recorder")
 STOP_TIMEOUT_S: Final = 2.4
-"""All children together; then they are killed. With the rest it stays below the 3 s that a user waits for."""
-FIRST_BACKOFF_S: Final = 0.1
-LONGEST_BACKOFF_S: Final = 5.0
-SETTLED_S: Final = 10.0
-"""A child that lived so long is restarted at once when it dies; before, the pause doubles each time."""
+"""Time for all children to stop before they are killed; below the 3 s in which `hilrig up` must end."""
+MIN_BACKOFF_S: Final = 0.1
+MAX_BACKOFF_S: Final = 5.0
+STABLE_AFTER_S: Final = 10.0
+"""Uptime after which the restart delay is reset; a child that dies earlier doubles it each time."""
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """One process of a lab."""
+class ProcessSpec:
+    """Specification of one process of a lab."""
 
     service: str
     instance: str = "1"
     rigs: tuple[str, ...] = ()
-    """Those that it serves; none named: all of the lab."""
+    """Rigs that it serves; empty: all rigs of the lab."""
 
     @property
     def name(self) -> str:
-        """What it is called to people."""
+        """Display name."""
         return self.service if self.instance == "1" else f"{self.service} {self.instance}"
 
     @property
     def options(self) -> list[str]:
-        """How the command line of its service says it."""
+        """Command and options that start the service."""
         rigs = ["--rigs", ",".join(self.rigs)] if self.rigs else []
         return [self.service, "--instance", self.instance, *rigs]
 
 
-WHOLE_LAB: Final = tuple(Part(service) for service in START_ORDER)
+DEFAULT_PROCESSES: Final = tuple(ProcessSpec(service) for service in SERVICE_KINDS)
+"""One process for each kind of service."""
 
 
-def shared(rigs: Sequence[str], *, edges: int = 1, recorders: int = 1) -> tuple[Part, ...]:
-    """The processes of a lab whose rigs are shared out among several edges and recorders, each a run of neighbours.
+def lab_processes(rigs: Sequence[str], *, edges: int = 1, recorders: int = 1) -> tuple[ProcessSpec, ...]:
+    """Processes of a lab whose rigs are divided among several edges and recorders, in contiguous ranges.
 
     Raises:
         InputError: there are more processes than rigs.
     """
-    parts = [Part("sim")]
+    processes = [ProcessSpec("sim")]
     for service, count in (("edge", edges), ("recorder", recorders)):
         if not 1 <= count <= len(rigs):
             raise InputError(f"--{service}s {count}: expected 1 to {len(rigs)}, the number of rigs")
         for number in range(count):
-            mine = rigs[number * len(rigs) // count : (number + 1) * len(rigs) // count]
-            parts.append(Part(service, str(number + 1), tuple(mine) if count > 1 else ()))
-    return tuple(parts)
+            own_rigs = rigs[number * len(rigs) // count : (number + 1) * len(rigs) // count]
+            processes.append(ProcessSpec(service, str(number + 1), tuple(own_rigs) if count > 1 else ()))
+    return tuple(processes)
 
 
 @dataclass
 class _Child:
-    part: Part
+    spec: ProcessSpec
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
-    backoff_s: float = FIRST_BACKOFF_S
+    backoff_s: float = MIN_BACKOFF_S
     restart_at_s: float | None = None
     restarts: int = 0
 
 
 class Supervisor:
-    """Runs the services of a lab; `say` gets a line for people whenever something changes.
+    """Runs the services of a lab; `log` receives a line for each change.
 
-    Use it as a context manager: leaving it ends every child.
+    Use it as a context manager: leaving it stops every child.
     """
 
     def __init__(
         self,
         config: Path | None,
-        say: Callable[[str], None],
-        parts: Sequence[Part] = WHOLE_LAB,
+        log: Callable[[str], None],
+        processes: Sequence[ProcessSpec] = DEFAULT_PROCESSES,
         options: Sequence[str] = (),
     ) -> None:
         self._config = config
-        self._say = say
+        self._log = log
         self._options = tuple(options)
-        self._children = {part.name: _Child(part) for part in parts}
+        self._children = {spec.name: _Child(spec) for spec in processes}
         self._ready = False
 
     @property
     def pids(self) -> Mapping[str, int]:
-        """Process id of each child that runs, by its part's name."""
+        """Process id of each running child, by its display name."""
         return {name: child.process.pid for name, child in self._children.items() if child.process is not None}
 
     def start(self) -> None:
@@ -107,15 +106,15 @@ class Supervisor:
         for child in self._children.values():
             self._spawn(child)
 
-    def settled(self) -> None:
-        """Say that the lab is up: from now on a child that dies is restarted, whatever its exit code says."""
+    def mark_ready(self) -> None:
+        """Mark the lab as ready: from now on a child that dies is restarted, whatever its exit code."""
         self._ready = True
 
     def poll(self) -> None:
-        """Look after the children; call it some ten times a second.
+        """Check the children and restart those that died; call it about ten times a second.
 
         Raises:
-            HilrigError: before the lab was up, a child ended by itself; it said why on standard error.
+            HilrigError: a child ended before the lab was ready; its reason is on standard error.
         """
         now_s = time.monotonic()
         for child in self._children.values():
@@ -124,23 +123,23 @@ class Supervisor:
             elif child.process is None and child.restart_at_s is not None and now_s >= child.restart_at_s:
                 self._spawn(child)
                 child.restarts += 1
-                self._say(f"{child.part.name} is started again")
+                self._log(f"{child.spec.name} restarted")
 
     def close(self) -> None:
-        """End the children in order; those that don't end in time are killed."""
+        """Stop the children in order; kill those that do not stop in time."""
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
         for service in STOP_ORDER:
-            ending = [child for child in self._children.values() if child.part.service == service and child.process]
-            # Those of a kind end side by side.
-            for child in ending:
+            stopping = [child for child in self._children.values() if child.spec.service == service and child.process]
+            # Children of one kind stop in parallel.
+            for child in stopping:
                 assert child.process is not None
                 _close_stdin(child.process)
-            for child in ending:
+            for child in stopping:
                 assert child.process is not None
                 try:
                     child.process.wait(timeout=max(0.1, deadline_s - time.monotonic()))
                 except subprocess.TimeoutExpired:
-                    self._say(f"{child.part.name} did not end in time and is killed")
+                    self._log(f"{child.spec.name} did not stop in time; killing it")
                     child.process.kill()
                     child.process.wait()
                 child.process = None
@@ -154,7 +153,7 @@ class Supervisor:
         self.close()
 
     def _spawn(self, child: _Child) -> None:
-        command = [sys.executable, "-m", "hilrig_cli", *child.part.options, *self._options, "--stop-with-parent"]
+        command = [sys.executable, "-m", "hilrig_cli", *child.spec.options, *self._options, "--stop-with-parent"]
         if self._config is not None:
             command += ["--config", str(self._config)]
         child.process = subprocess.Popen(command, stdin=subprocess.PIPE, **own_process_group())
@@ -167,16 +166,16 @@ class Supervisor:
         child.process = None
         if not self._ready:
             failure: type[HilrigError] = InputError if code == InputError.exit_code else OperationError
-            raise failure(f"the {child.part.name} service {_how_it_ended(code)} before the lab was up")
-        if now_s - child.started_s > SETTLED_S:
-            child.backoff_s = FIRST_BACKOFF_S
+            raise failure(f"the {child.spec.name} service {_describe_exit(code)} before the lab was up")
+        if now_s - child.started_s > STABLE_AFTER_S:
+            child.backoff_s = MIN_BACKOFF_S
         child.restart_at_s = now_s + child.backoff_s
-        child.backoff_s = min(LONGEST_BACKOFF_S, 2 * child.backoff_s)
-        self._say(f"{child.part.name} {_how_it_ended(code)}; restarting it")
+        child.backoff_s = min(MAX_BACKOFF_S, 2 * child.backoff_s)
+        self._log(f"{child.spec.name} {_describe_exit(code)}; restarting it")
 
 
 def own_process_group() -> dict[str, Any]:
-    """Arguments of `Popen` that keep a terminal's Ctrl-C away from a child."""
+    """Arguments of `Popen` that start a child in its own process group, so that Ctrl-C does not reach it."""
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
@@ -188,5 +187,5 @@ def _close_stdin(process: subprocess.Popen[bytes]) -> None:
             process.stdin.close()
 
 
-def _how_it_ended(code: int) -> str:
+def _describe_exit(code: int) -> str:
     return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"

@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop p50 / p99", "big wide"], ["late", "tick p99", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
@@ -202,24 +202,24 @@ function showLab(lab) {
   // Without services, the rigs are not marked as faulty.
   const runs = lab.services.some((service) => !service.silent);
   const cards = byId("cards"), rows = byId("rows").querySelector("tbody");
-  for (const known of lab.rigs) {
-    let rig = rigs.get(known.rig);
+  for (const status of lab.rigs) {
+    let rig = rigs.get(status.rig);
     if (!rig) {
-      rigs.set(known.rig, rig = new Rig(known.rig));
+      rigs.set(status.rig, rig = new Rig(status.rig));
       cards.append(rig.card);
       rows.append(rig.row);
       visible.observe(rig.card);
     }
-    rig.update(known, runs);
+    rig.update(status, runs);
   }
   const alarms = [...rigs.values()].filter((rig) => rig.level === "bad").length;
   const totals = [[rigs.size, rigs.size === 1 ? "rig" : "rigs"], [lab.rigs.filter((rig) => rig.controller).length, "in use"],
-    [lab.rigs.filter((rig) => rig.recording).length, "recorded"]];
+    [lab.rigs.filter((rig) => rig.recording).length, "recording"]];
   if (alarms) totals.push([alarms, alarms === 1 ? "alarm" : "alarms"]);
   byId("summary").replaceChildren(...totals.map(([number, label]) =>
     html("li", label.startsWith("alarm") ? {class: "alarm"} : {}, html("b", {}, String(number)), ` ${label}`)));
-  const alerts = lab.troubles.map((text) => ["warn", text]);
-  if (lab.link) alerts.unshift(["bad", lab.link]);
+  const alerts = lab.alerts.map((text) => ["warn", text]);
+  if (lab.bus_error) alerts.unshift(["bad", lab.bus_error]);
   else if (!runs) {
     alerts.unshift(["bad", `No services of the lab “${lab.lab}” found: start it with “hilrig up” and the same lab.toml.`]);
   }
@@ -241,7 +241,7 @@ function showServices(services) {
     const cells = [service.host, service.rigs, service.cpu_percent.toFixed(0), service.memory_mib.toFixed(0),
       service.lateness_p99_ms.toFixed(2), service.overruns, service.lost_transport + service.lost_recorder,
       service.clock_peer ? `${service.clock_offset_ms < 0 ? "−" : "+"}${Math.abs(service.clock_offset_ms).toFixed(1)} ± ${service.clock_uncertainty_ms.toFixed(1)}` : "–"];
-    const row = html("tr", service.silent || service.trouble ? {"data-level": "bad"} : {},
+    const row = html("tr", service.silent || service.alert ? {"data-level": "bad"} : {},
       html("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
     row.append(...cells.map((cell, number) => html("td", number ? {class: "n"} : {}, String(cell))));
     return row;
@@ -304,9 +304,9 @@ function showEvent(event) {
 
 function lengthOf(seconds) {
   if (seconds < 60) return `${seconds.toFixed(1)} s`;
-  const whole = Math.round(seconds), two = (number) => String(number).padStart(2, "0");
-  const minutes = Math.floor(whole / 60);
-  return minutes < 60 ? `${minutes}:${two(whole % 60)}` : `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(whole % 60)}`;
+  const total = Math.round(seconds), two = (number) => String(number).padStart(2, "0");
+  const minutes = Math.floor(total / 60);
+  return minutes < 60 ? `${minutes}:${two(total % 60)}` : `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(total % 60)}`;
 }
 
 function sizeOf(bytes) {
@@ -323,17 +323,17 @@ function showRuns(list) {
   const more = list.found > list.runs.length ? `, latest ${list.runs.length} shown` : "";
   setText(byId("runs-count"), list.error || (list.found === list.total ? `${list.total}${more}` : `${list.found} of ${list.total}${more}`));
   table.tBodies[0].replaceChildren(...list.runs.map((run) => {
-    const begun = run.start_ms ? new Date(run.start_ms).toLocaleString() : run.name;
-    const row = html("tr", run.trouble ? {"data-level": "bad"} : {}, html("th", {scope: "row", title: run.path}, begun),
+    const start = run.start_ms ? new Date(run.start_ms).toLocaleString() : run.name;
+    const row = html("tr", run.error ? {"data-level": "bad"} : {}, html("th", {scope: "row", title: run.path}, start),
       html("td", {}, run.rig));
     const links = html("td");
-    if (!run.open && !run.trouble) {
+    if (!run.open && !run.error) {
       links.append(html("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
         "aria-label": `Report of ${run.name}`}, "Report"));
     }
     if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
-    if (run.trouble) {
-      row.append(html("td", {class: "long", colspan: "8"}, run.trouble), links);
+    if (run.error) {
+      row.append(html("td", {class: "long", colspan: "8"}, run.error), links);
       return row;
     }
     const lost = run.lost_transport + run.lost_recorder + run.lost_file;
@@ -347,8 +347,8 @@ function showRuns(list) {
 
 // ---- requests
 
-async function fetchScenes(wanted) {
-  scenesVersion = wanted;
+async function fetchScenes(version) {
+  scenesVersion = version;
   try {
     scenes = await (await fetch("scenes")).json();
     showPoses(poses);

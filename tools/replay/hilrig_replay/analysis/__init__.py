@@ -1,1 +1,1 @@
-"""Measurements on recordings: latency, data quality, verification and comparison."""
+"""Measurements on recordings: latency, data quality, verification, comparison, and the index of a folder."""

@@ -1,8 +1,8 @@
-"""Runs beside each other: aligned in time, how far they differ in motion, torque and latency.
+"""Comparison of runs: aligns them in time and computes their differences in motion, torque and latency.
 
 The first run is the reference. Runs are aligned by their first state, by the first motion of the arm, or by the first
-event of a kind; then every other run is interpolated at the reference's times, where both were recorded. A run that
-can't be aligned does not hide the others.
+event of a kind. Every other run is then interpolated at the times of the reference, over their common time. A run that
+can't be aligned is skipped.
 """
 
 from collections.abc import Sequence
@@ -12,45 +12,45 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.summary import Course, RunSummary, summarise, under_command
+from hilrig_replay.analysis.summary import RunSummary, Trajectory, summarize, under_command
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 
-MOVING: Final = (0.01, 0.01, 0.005, 0.01)
-"""A joint faster than this moves; rad/s, rad/s, m/s, rad/s."""
-SHORTEST_S: Final = 0.1
+MOTION_THRESHOLD: Final = (0.01, 0.01, 0.005, 0.01)
+"""Minimum speed of a moving joint; rad/s, rad/s, m/s, rad/s."""
+MIN_OVERLAP_S: Final = 0.1
 
-Four = tuple[float, float, float, float]
+JointValues = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One run against the reference, over the time that both have."""
+    """Difference of a run from the reference over their common time."""
 
     session: str
     overlap_s: float
-    position_rms: Four
-    """Root mean square; rad, rad, m, rad."""
-    position_max: Four
-    """Largest magnitude; rad, rad, m, rad."""
+    position_rms: JointValues
+    """Root mean square of the position difference; rad, rad, m, rad."""
+    position_max: JointValues
+    """Largest magnitude of the position difference; rad, rad, m, rad."""
     tool_rms_mm: float
-    """Distance of the tools, root mean square, mm."""
+    """Root mean square of the distance between the tools, mm."""
     tool_max_mm: float
-    effort_rms: Four
-    """N·m, N·m, N, N·m."""
+    effort_rms: JointValues
+    """Root mean square of the effort difference; N·m, N·m, N, N·m."""
     loop_p50_ms: float | None
-    """Loop latency's median less the reference's, ms; None: one of them has none."""
+    """Median loop latency minus that of the reference, ms; None: one of the runs has no samples."""
     loop_p99_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Aligned zero of a run."""
+    """Time zero of an aligned run."""
 
     ns: int
-    """In the run's own time."""
+    """On the run's own time axis."""
     by: str
-    """What it is: `motion`, else where nothing moved under command the first `command`, else `start`; or an event."""
+    """Criterion: `motion`, `command` (no motion under command), `start` (no command either), or a kind of event."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,18 +58,18 @@ class Comparison:
     """Aligned runs, and their differences from the first."""
 
     aligned_by: str
-    """What was asked for."""
+    """The requested criterion."""
     runs: tuple[Run, ...]
     summaries: tuple[RunSummary, ...]
-    """Courses are on the aligned time axis."""
+    """Trajectories are on the aligned time axis."""
     origins: tuple[Origin, ...]
     differences: tuple[Difference, ...]
-    """One a run after the first."""
+    """One per run after the first."""
     left_out: tuple[str, ...] = ()
-    """Why a run is not in it, one sentence each."""
+    """Error message of each skipped run."""
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """Plain values for JSON."""
         return {
             "aligned_by": self.aligned_by,
             "runs": [
@@ -82,18 +82,18 @@ class Comparison:
 
 
 def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
-    """Compare runs with the first of them.
+    """Compare runs with the first one.
 
     Args:
-        runs: two or more; their time axes are moved (`timebase.origin_ns`) to the aligned zero.
-        align: `motion`, `start`, or an event's kind such as `PART_PICKED`.
+        runs: two or more; their time axes are shifted (`timebase.origin_ns`) to the aligned zero.
+        align: `motion`, `start`, or a kind of event such as `PART_PICKED`.
 
     Raises:
-        InputError: fewer than two runs, or the first, or all others, do not have the event to be aligned by, have no
-            common time, or are damaged.
+        InputError: there are fewer than two runs, or the first run or all others can't be aligned, have no common time,
+            or are damaged.
     """
     if len(runs) < 2:
-        raise InputError("a comparison needs two runs or more")
+        raise InputError(f"a comparison requires at least two runs, got {len(runs)}")
     reference, origin = _aligned(runs[0], align)
     kept, summaries, origins = [runs[0]], [reference], [origin]
     differences: list[Difference] = []
@@ -115,16 +115,16 @@ def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
 
 def _aligned(run: Run, align: str) -> tuple[RunSummary, Origin]:
     run.timebase.origin_ns = 0
-    origin = origin_of(run, align)
+    origin = find_origin(run, align)
     run.timebase.origin_ns = origin.ns
-    return summarise(run), origin
+    return summarize(run), origin
 
 
-def origin_of(run: Run, align: str) -> Origin:
-    """Aligned zero of a run whose time has not been moved.
+def find_origin(run: Run, align: str) -> Origin:
+    """Time zero of a run for a criterion; the time axis of the run must not be shifted.
 
     Raises:
-        InputError: it has no such event.
+        InputError: the run has no such event.
     """
     if align == "start":
         return Origin(0, "start")
@@ -137,32 +137,32 @@ def origin_of(run: Run, align: str) -> Origin:
         if len(found):
             return Origin(int(run.time_ns(found)[0]), align)
         kinds.update(block.events["kind"])
-    raise InputError(f"{run.path}: has no event {wanted}; it has {', '.join(sorted(kinds)) or 'none'}")
+    raise InputError(f"{run.path}: no event {wanted}; its events: {', '.join(sorted(kinds)) or 'none'}")
 
 
 def _first_motion(run: Run) -> Origin:
     first = Origin(0, "start")
     for block in run.blocks(frozenset({"state"})):
         states = block.states
-        # Before the session the arm may still settle: motion counts from a controller's first command on.
+        # The arm can still settle before the session: motion counts from the first command of a controller.
         if first.by == "start":
             commanded = under_command(run, states)
             if not commanded.any():
                 continue
             states = states[int(np.argmax(commanded)) :]
             first = Origin(int(run.time_ns(states[:1])[0]), "command")
-        moving = states[(np.abs(states["velocity"]) > MOVING).any(axis=1)][:1]
+        moving = states[(np.abs(states["velocity"]) > MOTION_THRESHOLD).any(axis=1)][:1]
         if len(moving):
             return Origin(int(run.time_ns(moving)[0]), "motion")
     return first
 
 
 def _difference(reference: RunSummary, other: RunSummary) -> Difference:
-    ours, theirs = reference.course, other.course
+    ours, theirs = reference.trajectory, other.trajectory
     low = max(ours.time_s[0], theirs.time_s[0])
     high = min(ours.time_s[-1], theirs.time_s[-1])
-    if high - low < SHORTEST_S:
-        raise InputError(f"{reference.session} and {other.session} have no common time once they are aligned")
+    if high - low < MIN_OVERLAP_S:
+        raise InputError(f"{reference.session} and {other.session}: no common time after alignment")
     at = ours.time_s[(ours.time_s >= low) & (ours.time_s <= high)]
     position = _at(theirs, theirs.position, at) - _at(ours, ours.position, at)
     effort = _at(theirs, theirs.effort, at) - _at(ours, ours.effort, at)
@@ -181,9 +181,9 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
     )
 
 
-def _at(course: Course, values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([np.interp(at, course.time_s, column) for column in values.T], axis=1)
+def _at(trajectory: Trajectory, values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([np.interp(at, trajectory.time_s, column) for column in values.T], axis=1)
 
 
-def _four(values: NDArray[np.float64]) -> Four:
+def _four(values: NDArray[np.float64]) -> JointValues:
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))

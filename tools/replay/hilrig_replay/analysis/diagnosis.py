@@ -1,7 +1,7 @@
-"""Why a loop is as slow as it is, in words, each with its evidence.
+"""Diagnosis of the loop latency: rules that explain a high latency, each with its evidence.
 
-Every rule is a function from the evidence of a run to a finding, or None where it does not apply. They state what was
-measured, what it looks like, and what to do about it.
+A rule is a function from the evidence of a run to a finding, or None if it does not apply. The text of a finding gives
+the measured values, the probable cause, and a fix if there is one.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,54 +12,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.data_quality import Stalls
-from hilrig_replay.analysis.disk_table import Spool
+from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_sim.arm.model import JOINT_SCALE
 
 MS: Final = 1e6
-EDGE_STALL_NS: Final = 5_000_000
-"""An answer that takes longer is not its own work any more."""
-SAME_STALL_NS: Final = 500_000_000
+EDGE_STALL_THRESHOLD_NS: Final = 5_000_000
+"""Minimum response time that counts as a stall: the processing of a request takes less."""
+STALL_MERGE_WINDOW_NS: Final = 500_000_000
+"""Late responses that are closer together than this belong to one stall."""
 WINDOW_S: Final = 10.0
-WINDOWS: Final = 6
-"""What needs the content of messages looks at so many windows of a run, evenly spread, whatever its length."""
+MAX_WINDOWS: Final = 6
+"""Maximum number of windows, evenly spread over a run, whose messages are examined."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that explains where the time goes."""
+    """A probable cause of the latency."""
 
     kind: str
     text: str
     evidence: dict[str, float]
-    """The figures that the text rests on, by name with the unit."""
+    """Measured values behind the text, by name with unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What the rules look at; times in ns."""
+    """Measured values of a run that the rules evaluate; times in ns."""
 
     run: Run
-    samples: Spool
-    """In their order, fields as `samples.SAMPLE`."""
+    samples: DiskTable
+    """Samples in the order of their states, fields as `SAMPLE_DTYPE`."""
     loop_ms: Statistics | None
-    """Of the samples; None: there are none."""
+    """Statistics of the loop latency; None: no samples."""
     stages_ms: Mapping[str, Statistics]
-    """Of the samples' stages; none where there are no samples."""
+    """Statistics of the stages; empty: no samples."""
     step_ns: int
     stalls: Stalls
-    """Ticks that were late by more than a step."""
+    """Ticks that were late by more than one step."""
     cycle_ns: float
-    """From one write to the next, median; 0: there are not two."""
+    """Median time between two writes; 0: fewer than two writes."""
     _windows: list[tuple[Rows, Rows, Rows]] = field(default_factory=list)
 
     def windows(self) -> list[tuple[Rows, Rows, Rows]]:
-        """States, commands and requests of a few windows of the run, evenly spread."""
+        """States, commands and requests of up to `MAX_WINDOWS` windows, evenly spread over the run."""
         if not self._windows:
             duration = self.run.duration_s
-            count = min(WINDOWS, max(1, round(duration / WINDOW_S)))
+            count = min(MAX_WINDOWS, max(1, round(duration / WINDOW_S)))
             for start in np.linspace(0, max(duration - WINDOW_S, 0), count):
                 records = self.run.between(float(start), float(start) + WINDOW_S)
                 self._windows.append((records.states, records.commands, records.traffic))
@@ -71,7 +72,7 @@ Rule = Callable[[Evidence], Finding | None]
 
 
 def diagnose(evidence: Evidence) -> Iterator[Finding]:
-    """Every finding that applies, the most telling first."""
+    """All findings that apply, in the order of `RULES`."""
     for rule in RULES:
         finding = rule(evidence)
         if finding is not None:
@@ -79,21 +80,21 @@ def diagnose(evidence: Evidence) -> Iterator[Finding]:
 
 
 def simulation_stall(evidence: Evidence) -> Finding | None:
-    """Ticks that came more than a step late."""
+    """Ticks that were more than one step late."""
     stalls = evidence.stalls
     if not stalls.count:
         return None
     longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return Finding(
         "simulation_stall",
-        f"the simulation stood still {_times(stalls.count)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: its host "
-        "was too busy, or suspended",
+        f"the simulation stalled {_times(stalls.count)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: its host was "
+        "overloaded or suspended",
         {"stalls": stalls.count, "longest_ms": longest_ms, "at_s": at_s},
     )
 
 
 def edge_stall(evidence: Evidence) -> Finding | None:
-    """Requests that waited in the edge for their answer, or writes before they left as commands."""
+    """Late responses of the Modbus edge, or writes that were published late as commands."""
     run, samples = evidence.run, evidence.samples
     requests = [requests for _, _, requests in evidence.windows() if len(requests)]
 
@@ -105,7 +106,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
 
     if not len(samples) and not requests:
         return None
-    limit_ns = max(EDGE_STALL_NS, 20 * median(lambda: (waited_ns for waited_ns, _ in waits())))
+    limit_ns = max(EDGE_STALL_THRESHOLD_NS, 20 * median(lambda: (waited_ns for waited_ns, _ in waits())))
     longest_ns, at_ns = limit_ns, 0
     for waited_ns, rows in waits():
         worst = int(np.argmax(waited_ns))
@@ -115,7 +116,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
         return None
 
     def late_ns() -> Iterator[NDArray[np.int64]]:
-        """When something waited, samples and requests together in the order of their time."""
+        """Times of the late samples and requests, in chronological order."""
         waits = [run.time_ns(rows)[rows["answered_ns"] - rows["arrived_ns"] > limit_ns] for rows in requests]
         others = np.sort(np.concatenate([np.empty(0, np.int64), *waits]))
         for rows in samples.blocks("edge", "sampled_ns", "incarnation"):
@@ -125,26 +126,25 @@ def edge_stall(evidence: Evidence) -> Finding | None:
             others = others[before:]
         yield others
 
-    # Whatever waited for the same stall waited at the same time.
-    stalls = 1 + sum(int((apart_ns > SAME_STALL_NS).sum()) for apart_ns in differences(late_ns)())
+    stalls = 1 + sum(int((apart_ns > STALL_MERGE_WINDOW_NS).sum()) for apart_ns in differences(late_ns)())
     longest_ms, at_s = longest_ns / MS, at_ns / 1e9
     return Finding(
         "edge_stall",
-        f"the Modbus edge stood still {_times(stalls)}, longest {longest_ms:.0f} ms at {at_s:.1f} s: what had arrived "
-        "waited there, for its host was too busy",
+        f"the Modbus edge stalled {_times(stalls)}, longest {longest_ms:.0f} ms at {at_s:.1f} s, and delayed the "
+        "requests: its host was overloaded",
         {"stalls": stalls, "longest_ms": longest_ms, "at_s": at_s},
     )
 
 
 def injected_delay(evidence: Evidence) -> Finding | None:
-    """Delay that was configured."""
+    """Delay that was injected by a configured impairment."""
     injected = evidence.stages_ms.get("injected")
     if injected is None or not injected.max:
         return None
     return Finding(
         "injected_delay",
-        f"{injected.mean:.1f} ms of the loop were added on purpose (impairment), both ways together, up to "
-        f"{injected.max:.1f} ms",
+        f"the configured impairment adds {injected.mean:.1f} ms to the loop on average, up to {injected.max:.1f} ms "
+        "(state link and command link together)",
         {"mean_ms": injected.mean, "max_ms": injected.max},
     )
 
@@ -156,33 +156,33 @@ def slow_polling(evidence: Evidence) -> Finding | None:
         return None
     return Finding(
         "slow_polling",
-        f"the controller writes every {cycle / MS:.1f} ms, the simulation steps every {step / MS:g} ms: each torque is "
-        f"held for {cycle / step:.1f} steps, and in between nothing reacts",
+        f"the controller writes every {cycle / MS:.1f} ms, but the simulation steps every {step / MS:g} ms: each "
+        f"torque is held for {cycle / step:.1f} steps",
         {"cycle_ms": cycle / MS, "step_ms": step / MS},
     )
 
 
 def slow_controller(evidence: Evidence) -> Finding | None:
-    """A controller that keeps a state for a long time before it writes."""
+    """A controller with a long time between reading a state and writing a command."""
     if evidence.loop_ms is None:
         return None
     held, loop = evidence.stages_ms["controller"].p50 * MS, evidence.loop_ms.p50 * MS
     if held < max(0.4 * loop, 5 * MS):
         return None
     cycle = evidence.cycle_ns
-    why = "it computes for so long, or its network is slow"
+    cause = "slow computation in the controller, or a slow network"
     if cycle and held > 0.8 * cycle and cycle > 1.25 * evidence.step_ns:
-        why = "it computes for so long, or reads right after writing and waits before the next write"
+        cause = "slow computation, or the controller reads right after writing and then waits before the next write"
     return Finding(
         "slow_controller",
-        f"{held / MS:.1f} ms of the loop's {loop / MS:.1f} ms pass between reading the positions and writing the "
-        f"torques: {why}",
+        f"{held / MS:.1f} ms of the loop latency of {loop / MS:.1f} ms are between reading the positions and writing "
+        f"the torques: {cause}",
         {"controller_ms": held / MS, "loop_ms": loop / MS, "cycle_ms": cycle / MS},
     )
 
 
 def beating(evidence: Evidence) -> Finding | None:
-    """Controller and simulation at nearly the same rate: the wait for the tick drifts through the whole step."""
+    """Controller and simulation at nearly the same rate: the wait for the tick drifts over the whole step."""
     samples, step = evidence.samples, evidence.step_ns
     if len(samples) < 50:
         return None
@@ -193,7 +193,7 @@ def beating(evidence: Evidence) -> Finding | None:
     changes = differences(waits)
 
     def drifts() -> Iterator[Floats]:
-        # Towards the nearest: a wait that falls below zero comes back a step higher.
+        # Wrapped to ± half a step: the wait jumps by one step when it passes zero.
         return ((change + step / 2) % step - step / 2 for change in changes())
 
     typical = median(drifts)
@@ -201,7 +201,7 @@ def beating(evidence: Evidence) -> Finding | None:
         return None
     if median(lambda: (np.abs(drift - typical) for drift in drifts())) > 0.05 * step:
         return None
-    # Most of the way it drifts one way, and comes round at least twice.
+    # The drift mostly has one sign, and wraps around at least twice.
     same_way = sum(int((np.sign(drift) == np.sign(typical)).sum()) for drift in drifts()) / (len(samples) - 1)
     rounds = sum(int((np.abs(change) > step / 2).sum()) for change in changes())
     if same_way < 0.75 or rounds < 2:
@@ -210,19 +210,20 @@ def beating(evidence: Evidence) -> Finding | None:
     period_s = step / abs(typical) * between_ns / 1e9
     return Finding(
         "beating",
-        f"the controller's cycle ({evidence.cycle_ns / MS:.2f} ms) beats with the step ({step / MS:g} ms): the wait "
-        f"for the tick drifts from {low / MS:.1f} to {high / MS:.1f} ms, once in {period_s:.1f} s",
+        f"the cycle of the controller ({evidence.cycle_ns / MS:.2f} ms) beats with the step ({step / MS:g} ms): the "
+        f"wait for the tick drifts between {low / MS:.1f} and {high / MS:.1f} ms with a period of {period_s:.1f} s",
         {"cycle_ms": evidence.cycle_ns / MS, "period_s": period_s, "low_ms": low / MS, "high_ms": high / MS},
     )
 
 
 ACK_DELAYS_MS: Final = ((39.0, 46.0), (195.0, 215.0))
-"""After so long TCP acknowledges on its own: 40 ms on Linux, 200 ms on Windows and many controllers."""
-ALL_LATE: Final = 0.9
+"""Ranges of TCP's delayed-acknowledgment timeout: 40 ms on Linux, 200 ms on Windows and many controllers."""
+SLOW_NETWORK_SHARE: Final = 0.9
+"""Share of delayed requests from which a slow network is a possible cause, too."""
 
 
 def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
-    """Requests that wait for an acknowledgement, because the client holds small segments back (Nagle's algorithm)."""
+    """Requests that wait for an acknowledgment, because the client delays small segments (Nagle's algorithm)."""
     gaps = []
     for _, _, requests in evidence.windows():
         for controller in np.unique(requests["controller"]):
@@ -236,20 +237,19 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
         if len(waited) < max(10, 0.1 * len(gaps_ms)) or waited.std() > 2.0:
             continue
         share = len(waited) / len(gaps_ms)
-        # Where every request comes so late, the way itself may be that long.
-        or_far = "" if share < ALL_LATE else "; or else its network is that slow, both ways together"
+        or_network = "" if share < SLOW_NETWORK_SHARE else "; or the network has this round-trip time"
         return Finding(
             "delayed_acknowledgement",
-            f"{share:.0%} of the requests came {np.median(waited):.1f} ms after the answer before them, the time after "
-            "which TCP acknowledges on its own: set TCP_NODELAY in the controller, and send each request in one piece"
-            + or_far,
+            f"{share:.0%} of the requests arrived {np.median(waited):.1f} ms after the previous response, which is "
+            "TCP's delayed-acknowledgment timeout: set TCP_NODELAY in the controller, and send each request with one "
+            f"call{or_network}",
             {"share": share, "wait_ms": float(np.median(waited))},
         )
     return None
 
 
 def previous_poll(evidence: Evidence) -> Finding | None:
-    """Torques that follow the state of the poll before the one just served: a pipeline of one cycle."""
+    """Torques that are computed from the state of the previous poll: a pipeline delay of one cycle."""
     found = [residuals for states, commands, _ in evidence.windows() for residuals in _residuals(states, commands)]
     if len(found) < 3:
         return None
@@ -260,8 +260,8 @@ def previous_poll(evidence: Evidence) -> Finding | None:
     cycle = evidence.cycle_ns
     return Finding(
         "previous_poll",
-        f"the torques follow the positions of the poll before, which explain them {ratio:.0f} times better than those "
-        f"just read: the controller works a cycle behind, which adds {cycle / MS:.1f} ms to what is measured here",
+        f"the torques fit the positions of the previous poll {ratio:.0f} times better than the positions just read: "
+        f"the controller is one cycle behind, which adds {cycle / MS:.1f} ms to the measured latency",
         {
             "unexplained_previous": float(previous),
             "unexplained_newest": float(newest),
@@ -272,11 +272,11 @@ def previous_poll(evidence: Evidence) -> Finding | None:
 
 
 def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[float, float]]:
-    """What a linear law leaves unexplained of the torques, given the positions just read, and those of a poll before.
+    """Unexplained share of the torques for a linear control law on the newest poll, and on the previous poll.
 
-    The law of a joint has its positions of two polls (so a derivative is in it) and a slow change in time, and is
-    fitted anew over every `length` commands. Positions are rounded as the registers round them: that noise is in the
-    controller's torques, and tells which poll they came from.
+    The law of a joint uses its positions at two polls (and so a derivative) and a slow trend, and is fitted to each
+    block of `length` commands. Positions are rounded like the registers: the quantization noise is in the torques of
+    the controller and shows which poll they were computed from.
     """
     commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
     if len(commands) < length or not len(states):
@@ -286,7 +286,7 @@ def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[flo
     commands, at = commands[known], at[known]
     if len(commands) < length:
         return []
-    # Polls that saw the same state say nothing about which one was used.
+    # Polls that returned the same state can't be distinguished.
     fresh = np.concatenate(([True], np.diff(commands["basis_step"].astype(np.int64)) > 0))
     commands, at = commands[fresh], at[fresh]
     read = np.round(states["position"][at] * JOINT_SCALE, 2)
@@ -298,17 +298,17 @@ def _residuals(states: Rows, commands: Rows, length: int = 24) -> list[tuple[flo
         spread = ((torques - torques.mean(axis=0)) ** 2).sum()
         if spread < 1e-9:
             continue
-        left = [
+        unexplained = [
             sum(_unexplained(read[rows - lag, j], read[rows - lag - 1, j], slow, torques[:, j]) for j in range(4))
             / spread
             for lag in (0, 1)
         ]
-        found.append((left[0], left[1]))
+        found.append((unexplained[0], unexplained[1]))
     return found
 
 
 def _unexplained(newer: Floats, older: Floats, slow: Floats, torque: Floats) -> float:
-    """Sum of squares that the best law leaves of a joint's torque."""
+    """Residual sum of squares of a joint's torque for the best linear law."""
     law = np.column_stack((newer - newer.mean(), newer - older, slow))
     fitted, *_ = np.linalg.lstsq(law, torque, rcond=None)
     return float(((torque - law @ fitted) ** 2).sum())

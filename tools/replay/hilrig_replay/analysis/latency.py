@@ -1,36 +1,37 @@
-"""Loop latency out of a recording: samples with their six stages, their statistics, whether they can be trusted.
+"""Loop latency of a recording: samples with their stages, statistics, data quality and diagnosis.
 
-A sample is a state at which a new command took effect. Its loop latency is t_k − t_b on the simulation's clock, b the
-state that the controller had last been served. Five stages are differences of two stamps of one clock; transport,
-both ways over the bus, is what remains. So the six add up exactly, and no clocks are compared (docs/timing.md).
+A sample is a state at which a new command took effect. Its loop latency is t_k − t_b on the clock of the simulation,
+where b is the last state that was served to the controller. Each stage except `transport` is a difference of two
+timestamps of one clock; `transport`, the time on the bus in both directions, is the remainder. The stages therefore add
+up exactly, and timestamps of different clocks are never compared (docs/timing.md).
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from hilrig_replay.analysis.data_quality import FitnessWatch, Lost
+from hilrig_replay.analysis.data_quality import DataQuality, Lost
 from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose
 from hilrig_replay.analysis.distribution import Statistics, percentiles
-from hilrig_replay.analysis.samples import STAGES, Matcher, SampleTable
+from hilrig_replay.analysis.samples import STAGES, CommandMatcher, SampleTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 
 
 @dataclass(frozen=True, slots=True)
 class Jitter:
-    """How far the loop strays; ms."""
+    """Variation of the loop latency, and lateness of the simulation's ticks; ms."""
 
     loop_std: float
     loop_p99_p1: float
-    """From the 1st to the 99th percentile of the loop latency."""
+    """99th minus 1st percentile of the loop latency."""
     tick_lateness: Statistics
-    """Of the simulation's ticks behind their deadlines."""
+    """Lateness of the simulation's ticks against their deadlines."""
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """What `hilrig latency` says of one run."""
+    """Result of a latency measurement of one run, as `hilrig latency` reports it."""
 
     session: str
     rig: str
@@ -38,49 +39,49 @@ class LatencyReport:
     samples: int
     step_ms: float
     loop_ms: Statistics | None
-    """None: nothing closed a loop; the reasons say so."""
+    """None: no closed loop (see `reasons`)."""
     stages_ms: dict[str, Statistics]
     jitter_ms: Jitter
     lost: Lost
     fit: bool
-    """Whether the recording supports claims about latency."""
+    """Whether the recording is valid for latency measurements."""
     reasons: tuple[str, ...]
-    """Why it is not fit; empty: it is."""
+    """Reasons why it is not valid; empty: it is valid."""
     findings: tuple[Finding, ...]
-    """Why the loop took what it took, in words."""
+    """Probable causes of the latency."""
     table: SampleTable = field(repr=False, compare=False)
-    """The samples themselves, fields as `samples.SAMPLE`: a column is `table["loop"]`, shape (samples,)."""
+    """The samples, fields as `samples.SAMPLE_DTYPE`; `table["loop"]` is a column, shape (samples,)."""
 
     def without_table(self) -> "LatencyReport":
-        """The same without the samples, for who keeps many reports."""
+        """Copy without the samples, to save memory when many reports are kept."""
         return replace(self, table=SampleTable())
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON: everything but the samples themselves."""
+        """Plain values for JSON, without the samples."""
         plain = asdict(self.without_table())
         del plain["table"]
         return plain
 
 
-def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyReport:
-    """Go through a run once, a block at a time: its samples, their statistics and the judgement.
+def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> LatencyReport:
+    """Measure the loop latency of a run in one pass, block by block.
 
     Args:
         run: the recording.
-        also: gets each block on the way, with states, commands, parts and events, so that one pass serves several.
+        on_block: called with each block (states, commands, parts, events), so that one pass serves several evaluations.
 
     Raises:
         InputError: the file is damaged.
     """
-    matcher, table, watch = Matcher(), SampleTable(), FitnessWatch(run)
+    matcher, table, quality = CommandMatcher(), SampleTable(), DataQuality(run)
     for block in run.blocks(frozenset({"state", "command", "event"})):
-        if also is not None:
-            also(block)
+        if on_block is not None:
+            on_block(block)
         samples = matcher.add(block.states, block.commands)
         table.add(samples)
-        watch.add(block.states, block.commands, samples)
-    table.end()
-    reasons = tuple(watch.reasons(matcher.unmatched))
+        quality.add(block.states, block.commands, samples)
+    table.finish()
+    reasons = tuple(quality.reasons(matcher.unmatched))
     loop, stages, spread = None, {}, 0.0
     if len(table):
         loop = Statistics.of(table.column("loop"))
@@ -93,8 +94,8 @@ def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyR
         loop_ms=loop,
         stages_ms=stages,
         step_ns=run.step_ns,
-        stalls=watch.stalls,
-        cycle_ns=watch.cycle_ns(),
+        stalls=quality.stalls,
+        cycle_ns=quality.cycle_ns(),
     )
     return LatencyReport(
         session=run.session,
@@ -104,8 +105,8 @@ def measure(run: Run, also: Callable[[Records], None] | None = None) -> LatencyR
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
         stages_ms=stages,
-        jitter_ms=Jitter(loop.std if loop else 0.0, spread, watch.lateness()),
-        lost=watch.lost(),
+        jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
+        lost=quality.lost(),
         fit=not reasons,
         reasons=reasons,
         findings=tuple(diagnose(evidence)),

@@ -1,7 +1,7 @@
-"""How often each controller reads and writes: requests counted in bins of a tenth of a second.
+"""Modbus request rates: reads and writes of each controller, counted in bins of 0.1 s.
 
-Requests come in pieces whose ends fall within a bin: a bin is given when a later one has begun. What is kept is one
-bin a controller and kind, and controllers beyond the first `MOST` are counted together.
+Requests are added in blocks whose ends can be within a bin, so a bin is returned when a later bin has begun. Only the
+current bin of each controller and kind is kept, and controllers beyond the first `MAX_CLIENTS` are counted together.
 """
 
 from collections.abc import Iterator
@@ -10,30 +10,30 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.io.columns import Rows, StringTable
 
 BIN_NS: Final = 100_000_000
-MOST: Final = 32
-OTHERS: Final = "others"
+MAX_CLIENTS: Final = 32
+OTHER_CLIENTS: Final = "others"
 KINDS: Final = ("reads", "writes")
 _READS: Final = (1, 2, 3, 4, 23, 43)
-_LONG_GAP: Final = 20
-"""A longer silence is given by its ends, bins."""
+_MAX_GAP_BINS: Final = 20
+"""Gaps of up to this number of bins are returned as empty bins; of longer gaps only the first and last bin."""
 
 Rate = tuple[str, str, NDArray[np.int64], NDArray[np.int64]]
-"""Controller, kind of request, beginnings of the bins, wall clock, ns, shape (n,), requests in each, shape (n,)."""
+"""Controller, kind of request, start times of the bins (wall clock, ns, shape (n,)), requests per bin (shape (n,))."""
 
 
 class RequestRates:
     """Counts the requests of one rig."""
 
-    def __init__(self, names: Names) -> None:
+    def __init__(self, names: StringTable) -> None:
         self._names = names
         self._clients: dict[int, str] = {}
         self._pending: dict[tuple[str, str], tuple[int, int]] = {}
 
     def add(self, traffic: Rows) -> Iterator[Rate]:
-        """Take in requests, fields as `columns.TRAFFIC`; the bins that are over."""
+        """Add requests, fields as `columns.TRAFFIC_DTYPE`; returns the bins that are complete."""
         read = np.isin(traffic["function"], _READS)
         clients = np.array([self._client(int(code)) for code in traffic["controller"]], dtype=object)
         for client in dict.fromkeys(clients):
@@ -43,7 +43,7 @@ class RequestRates:
                     yield from self._count(client, kind, bins)
 
     def end(self) -> Iterator[Rate]:
-        """The last bins, which nothing followed."""
+        """Return the last bin of each controller and kind."""
         for (client, kind), (number, count) in self._pending.items():
             yield client, kind, np.array([number]) * BIN_NS, np.array([count])
         self._pending.clear()
@@ -52,8 +52,8 @@ class RequestRates:
         client = self._clients.get(code)
         if client is None:
             client = self._names[code] or "unknown"
-            if len(self._clients) >= MOST:
-                return OTHERS
+            if len(self._clients) >= MAX_CLIENTS:
+                return OTHER_CLIENTS
             self._clients[code] = client
         return client
 
@@ -66,13 +66,13 @@ class RequestRates:
         self._pending[client, kind] = (int(numbers[-1]), int(counts[-1]))
         if len(numbers) == 1:
             return
-        # Between requests there were none: said at both ends of a long silence, in every bin of a short one.
+        # A short gap is filled with empty bins, a long gap with an empty bin at each end.
         empty = [
             at
             for one, following in zip(numbers[:-1].tolist(), numbers[1:].tolist(), strict=True)
-            for at in (range(one + 1, following) if following - one <= _LONG_GAP else (one + 1, following - 1))
+            for at in (range(one + 1, following) if following - one <= _MAX_GAP_BINS else (one + 1, following - 1))
         ]
-        over = np.concatenate((numbers[:-1], np.array(empty, np.int64)))
+        complete = np.concatenate((numbers[:-1], np.array(empty, np.int64)))
         counts = np.concatenate((counts[:-1], np.zeros(len(empty), np.int64)))
-        order = np.argsort(over)
-        yield client, kind, over[order] * BIN_NS, counts[order]
+        order = np.argsort(complete)
+        yield client, kind, complete[order] * BIN_NS, counts[order]

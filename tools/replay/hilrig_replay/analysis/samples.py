@@ -1,7 +1,7 @@
-"""Samples of the loop latency: the states at which a new command took effect, each with the stages of its way.
+"""Samples of the loop latency: the states at which a new command took effect, with the duration of each stage.
 
-The command of a sample can stand in a recording before it or after it, so samples are found in the blocks of a run one
-by one, and put in the order of their states.
+The command of a sample can be before or after its state in a recording. Samples are therefore matched block by block
+and then sorted in the order of their states.
 """
 
 from typing import Final
@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import Spool
-from hilrig_replay.io.columns import COMMAND, STATE, Rows
+from hilrig_replay.analysis.disk_table import DiskTable
+from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
 
 STAGES: Final = ("register_wait", "controller", "edge", "injected", "tick_wait", "transport")
-"""In the order in which a state's news goes round, `transport` last because it is the remainder."""
+"""Stages of the loop in the order of the data flow; `transport` is last because it is the remainder."""
 
-SAMPLE: Final = np.dtype(
+SAMPLE_DTYPE: Final = np.dtype(
     [
         ("step", "<u8"),
         ("incarnation", "<u8"),
@@ -29,57 +29,58 @@ SAMPLE: Final = np.dtype(
         ("state_served_ns", "<i8"),
     ]
 )
-"""One row a sample: `loop` and the stages in ns, `sampled_ns` on the simulation's clock, the two last on the edge's."""
+"""One row per sample: `loop` and the stages in ns, `sampled_ns` on the clock of the simulation, the last two fields on
+the clock of the edge."""
 
-WINDOW: Final = 4096
-"""So many rows before a block are still looked at, count: at 20 ms a step more than a minute."""
+MATCH_WINDOW_ROWS: Final = 4096
+"""Rows of previous blocks that are searched for a match: more than a minute at a step of 20 ms."""
 
 
-class Matcher:
-    """Finds the command behind each sample, from blocks in which the one can come before or after the other."""
+class CommandMatcher:
+    """Finds the command of each sample; the command can be in an earlier or later block than the state."""
 
     def __init__(self) -> None:
-        self._commands = np.empty(0, COMMAND)
-        self._waiting = np.empty(0, STATE)
-        self._given_up = 0
+        self._commands = np.empty(0, COMMAND_DTYPE)
+        self._waiting = np.empty(0, STATE_DTYPE)
+        self._dropped = 0
 
     @property
     def unmatched(self) -> int:
-        """Samples whose command has not come, count."""
-        return self._given_up + len(self._waiting)
+        """Number of samples whose command was not found."""
+        return self._dropped + len(self._waiting)
 
     def add(self, states: Rows, commands: Rows) -> NDArray[np.void]:
-        """Take in the next block, fields as `columns.STATE` and `columns.COMMAND`; the samples found with it."""
+        """Add the next block, fields as `STATE_DTYPE` and `COMMAND_DTYPE`; returns the samples that it completes."""
         effective = np.concatenate((self._waiting, states[states["basis_step"] != 0]))
         known = np.concatenate((self._commands, commands))
         rows, found = join_commands(effective, known)
         if len(known):
             found &= known["basis_step"][rows] == effective["basis_step"]
         missing = effective[~found]
-        self._waiting = missing[-WINDOW:].copy()
-        self._given_up += len(missing) - len(self._waiting)
-        self._commands = known[-max(WINDOW, len(commands)) :].copy()
+        self._waiting = missing[-MATCH_WINDOW_ROWS:].copy()
+        self._dropped += len(missing) - len(self._waiting)
+        self._commands = known[-max(MATCH_WINDOW_ROWS, len(commands)) :].copy()
         return _stages(effective[found], known[rows[found]])
 
 
-class SampleTable(Spool):
-    """Samples in the order of their states; whoever adds them says when there are no more."""
+class SampleTable(DiskTable):
+    """Samples in the order of their states; call `finish` after the last `add`."""
 
     def __init__(self) -> None:
-        super().__init__(SAMPLE)
-        self._held = np.empty(0, SAMPLE)
+        super().__init__(SAMPLE_DTYPE)
+        self._held = np.empty(0, SAMPLE_DTYPE)
 
     def add(self, samples: NDArray[np.void]) -> None:
-        """Take in some more; the newest wait for those whose command comes late."""
+        """Add samples; the newest are held back, because samples with a late command can precede them."""
         held = np.concatenate((self._held, samples))
         if len(held) > 1 and not _ordered(held):
             held = held[np.lexsort((held["sampled_ns"], held["incarnation"]))]
-        whole = max(len(held) - WINDOW, 0)
-        self._held = held[whole:].copy()
-        super().add(held[:whole].copy())
+        complete = max(len(held) - MATCH_WINDOW_ROWS, 0)
+        self._held = held[complete:].copy()
+        super().add(held[:complete].copy())
 
-    def end(self) -> None:
-        """Nothing comes any more."""
+    def finish(self) -> None:
+        """Add the samples that are still held back."""
         super().add(self._held)
         self._held = self._held[:0]
 
@@ -90,10 +91,10 @@ def _ordered(samples: NDArray[np.void]) -> bool:
 
 
 def join_commands(states: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The command in force at each state, by (session, seq): its row, and whether it is there; shapes (states,)."""
+    """The command that acts at each state, by (session, seq): its row, and whether it was found; shapes (states,)."""
     if not len(commands):
         return np.zeros(len(states), np.intp), np.zeros(len(states), np.bool_)
-    # A code has 16 bits, a sequence number far fewer than 48.
+    # A session code has 16 bits, a sequence number less than 48.
     keys = (commands["session"].astype(np.uint64) << np.uint64(48)) | commands["seq"]
     wanted = (states["session"].astype(np.uint64) << np.uint64(48)) | states["command_seq"]
     order = np.argsort(keys, kind="stable")
@@ -102,8 +103,8 @@ def join_commands(states: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArr
 
 
 def _stages(states: Rows, commands: Rows) -> NDArray[np.void]:
-    """Samples of states and their commands, row by row; the table of docs/timing.md."""
-    samples = np.empty(len(states), SAMPLE)
+    """Compute the samples of states and their commands, row by row, as defined in docs/timing.md."""
+    samples = np.empty(len(states), SAMPLE_DTYPE)
     for name in ("step", "incarnation", "sampled_ns", "wall_ns", "basis_step", "command_seq"):
         samples[name] = states[name]
     for name in ("write_arrived_ns", "state_served_ns"):

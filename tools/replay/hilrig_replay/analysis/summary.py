@@ -1,4 +1,4 @@
-"""What a run amounts to, in one pass: its latency, its motion, what happened in it, and a thinned course for plots."""
+"""Summary of a run, computed in one pass: latency, motion, events, grade, and a downsampled trajectory for plots."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.distribution import percentiles
 from hilrig_replay.analysis.latency import LatencyReport, measure
-from hilrig_replay.analysis.similarity import Torques
+from hilrig_replay.analysis.similarity import TorqueSketch
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.grade import Grade, Grader
-from hilrig_replay.grading.placement import TaskResult, placed_parts
-from hilrig_replay.grading.task_loading import task_of
+from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
+from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
@@ -22,8 +22,8 @@ from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, RigParameters
 
-COURSE_POINTS: Final = 4000
-"""A course keeps about so many states, however long the run."""
+TRAJECTORY_POINTS: Final = 4000
+"""Approximate number of states in a downsampled trajectory."""
 _SATURATED: Final = LARGEST_REGISTER_FORCE - 1e-9
 
 Floats = NDArray[np.float64]
@@ -31,23 +31,23 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What the arm did."""
+    """Motion of the arm in a run."""
 
     tool_path_m: float
-    """Length of the tool's way, m."""
+    """Path length of the tool, m."""
     top_speed: float
-    """Of the tool, m/s."""
+    """Maximum speed of the tool, m/s."""
     work_j: float
-    """Mechanical work of the drives, |effort · velocity| summed over time and joints, J."""
+    """Mechanical work of the drives, |effort · velocity| integrated over time and summed over the joints, J."""
     peak_effort: tuple[float, float, float, float]
-    """Largest magnitude applied; N·m, N·m, N, N·m."""
+    """Largest magnitude of the applied effort; N·m, N·m, N, N·m."""
     saturated_share: tuple[float, float, float, float]
-    """Share of the steps with the effort at its register's limit, by joint, 0 to 1."""
+    """Share of the steps with the effort at the limit of its register, by joint, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """A run's states, thinned evenly; each array has one row a state that was kept."""
+class Trajectory:
+    """Downsampled trajectory of a run; each array has one row per selected state."""
 
     time_s: Floats
     position: Floats
@@ -57,39 +57,39 @@ class Course:
     effort: Floats
     """Shape (n, 4); N·m, N·m, N, N·m."""
     tip: Floats
-    """The tool, world, m, shape (n, 3)."""
+    """Position of the tool, world, m, shape (n, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """One run, ready to be shown or compared."""
+    """Summary of one run, for reports and comparisons."""
 
     name: str
-    """What people call it: the file's name without its suffix, which is the session unless somebody renamed it."""
+    """Name of the file without suffix: the session id unless the file was renamed."""
     session: str
     rig: str
     lab: str
     controller: str
     start: str
-    """As recorded, UTC."""
+    """Start time as recorded, UTC."""
     duration_s: float
     ended: str
     latency: LatencyReport
     motion: Motion
     events: dict[str, int]
-    """How often each kind of event happened."""
-    task: TaskResult | None
-    """Which parts stand in their places at the end; None: there are no places."""
+    """Number of events by kind."""
+    placement: PlacementReport | None
+    """Placement of the parts at the end of the run; None: the scene has no parts or no places."""
     grade: Grade | None
-    """None: there was no task."""
+    """None: the run has no task."""
     box_ms: tuple[float, ...]
-    """Loop latency: its percentiles 1, 25, 50, 75 and 99; empty: there are no samples."""
-    course: Course = field(repr=False, compare=False)
-    torques: Torques = field(repr=False, compare=False)
-    """What its controllers wrote, to be held against other runs."""
+    """Percentiles 1, 25, 50, 75 and 99 of the loop latency; empty: no samples."""
+    trajectory: Trajectory = field(repr=False, compare=False)
+    torques: TorqueSketch = field(repr=False, compare=False)
+    """Torques written by the controllers, to be compared with other runs."""
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON: without what is there to be drawn."""
+        """Plain values for JSON, without the data for plots."""
         return {
             "name": self.name,
             "session": self.session,
@@ -102,23 +102,23 @@ class RunSummary:
             "latency": self.latency.as_dict(),
             "motion": asdict(self.motion),
             "events": self.events,
-            "parts_placed": None if self.task is None else self.task.placed,
-            "largest_placing_error_mm": None if self.task is None else self.task.largest_error_mm,
+            "parts_placed": None if self.placement is None else self.placement.placed,
+            "largest_placing_error_mm": None if self.placement is None else self.placement.largest_error_mm,
             "grade": None if self.grade is None else self.grade.as_dict(),
         }
 
 
-def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
-    """Go through a run once.
+def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
+    """Summarize a run in one pass.
 
     Args:
         run: the recording.
-        task: what it is graded by; None: what its own lab said.
+        task: task to grade the run by; None: the recorded task of its lab.
 
     Raises:
-        InputError: it is damaged, or its parameters or its task are not understood.
+        InputError: the file is damaged, or its parameters or its task are invalid.
     """
-    collector = _Collector(run, parameters_of(run.parameters_json), task or task_of(run))
+    collector = _Collector(run, parameters_of(run.parameters_json), task or recorded_task(run))
     latency = measure(run, collector.add)
     return RunSummary(
         name=run.path.stem,
@@ -132,19 +132,22 @@ def summarise(run: Run, task: TaskConfig | None = None) -> RunSummary:
         latency=latency,
         motion=collector.motion(),
         events=dict(sorted(collector.events.items())),
-        task=collector.task(),
+        placement=collector.placement(),
         grade=collector.grade(),
         box_ms=_box_ms(latency),
-        course=collector.course(),
+        trajectory=collector.trajectory(),
         torques=collector.torques,
     )
 
 
 def under_command(run: Run, states: Rows) -> NDArray[np.bool_]:
-    """Where a controller's command acts, shape (n,): what is from before its session may belong to the one before."""
+    """Whether a command of the session's controller acts at each state, shape (n,).
+
+    Commands before the start of the session can belong to the previous session.
+    """
     if run.controller:
         return np.asarray((states["command_seq"] > 0) & (states["session"] == run.names.code(run.session)))
-    # Recorded by hand, controllers come and go; where there is none, the edge's own command of no torque acts.
+    # A manual recording can contain several controllers; without one, the internal zero-torque command acts.
     return np.asarray((states["basis_step"] != 0) | (states["effort"] != 0).any(axis=1))
 
 
@@ -155,11 +158,13 @@ def _box_ms(latency: LatencyReport) -> tuple[float, ...]:
 
 
 class _Collector:
+    """Accumulates the summary of a run block by block."""
+
     def __init__(self, run: Run, parameters: RigParameters, task: TaskConfig | None) -> None:
         self._run = run
         self._parameters = parameters
         self._grader = None if task is None else Grader(task, parameters)
-        self._every = max(1, run.file.counts["state"] // COURSE_POINTS)
+        self._every = max(1, run.file.counts["state"] // TRAJECTORY_POINTS)
         self._pieces: list[tuple[Floats, Rows, Floats]] = []
         self._seen = 0
         self._last_tip: Floats | None = None
@@ -168,7 +173,7 @@ class _Collector:
         self._poses: dict[str, Any] = {}
         self._held = ""
         self.events: Counter[str] = Counter()
-        self.torques = Torques()
+        self.torques = TorqueSketch()
 
     def add(self, block: Records) -> None:
         self.events.update(block.events["kind"].tolist())
@@ -192,8 +197,8 @@ class _Collector:
         tip = pose[:, :3]
         if self._grader is not None:
             self._grader.add_states(time_s, pose, under_command(self._run, states))
-        way = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
-        lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
+        path = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
+        lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
         step_s = self._run.step_ns / 1e9
         self._path += float(lengths.sum())
         self._top_speed = max(self._top_speed, float(lengths.max(initial=0.0)) / step_s)
@@ -204,7 +209,7 @@ class _Collector:
         first = -self._seen % self._every
         self._pieces.append(
             (
-                # A view would keep the whole block.
+                # Copied, because a view would keep the complete block in memory.
                 time_s[first :: self._every].copy(),
                 states[first :: self._every].copy(),
                 tip[first :: self._every].copy(),
@@ -214,7 +219,7 @@ class _Collector:
         self._last_tip = tip[-1:]
 
     def grade(self) -> Grade | None:
-        return None if self._grader is None else self._grader.grade(self.task())
+        return None if self._grader is None else self._grader.grade(self.placement())
 
     def motion(self) -> Motion:
         return Motion(
@@ -225,15 +230,15 @@ class _Collector:
             saturated_share=_four(self._saturated / max(self._seen, 1)),
         )
 
-    def task(self) -> TaskResult | None:
+    def placement(self) -> PlacementReport | None:
         scene = self._parameters.scene
         if not scene.parts or not any(tray.places for tray in scene.trays):
             return None
-        return placed_parts(scene, list(self._poses.values()), held=self._held)
+        return evaluate_placement(scene, list(self._poses.values()), held=self._held)
 
-    def course(self) -> Course:
+    def trajectory(self) -> Trajectory:
         states = np.concatenate([states for _, states, _ in self._pieces])
-        return Course(
+        return Trajectory(
             time_s=np.concatenate([time_s for time_s, _, _ in self._pieces]),
             position=np.ascontiguousarray(states["position"]),
             velocity=np.ascontiguousarray(states["velocity"]),

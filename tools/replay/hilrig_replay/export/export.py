@@ -20,10 +20,10 @@ from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.recording_file import RawMessage
-from hilrig_replay.io.records import Decoder, Records, join_records, name_of
-from hilrig_replay.io.run import ALL, BLOCK_ROWS, Run
+from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
+from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import Event
@@ -79,7 +79,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
         OperationError: the folder can't be written.
     """
     paths = {name: folder / f"{name}.{kind}" for name in TABLES}
-    empty = join_records([])
+    empty = concatenate_records([])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as closing:
@@ -156,7 +156,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
 
 
 def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization", channel_ids: dict[str, int]) -> None:
-    messages = run.file.messages(ALL)
+    messages = run.file.messages(ALL_TOPICS)
     while block := list(islice(messages, BLOCK_ROWS)):
         visualization.prepare(block)
         for topic, sequence, log_ns, publish_ns, payload in block:
@@ -200,11 +200,11 @@ class _Visualization:
 
     def prepare(self, messages: Iterable[RawMessage]) -> None:
         """Compute the joint frames of the next states at once."""
-        decoder = Decoder(Names(), Timebase())
+        decoder = Decoder(StringTable(), Timebase())
         for topic, sequence, log_ns, _, payload in messages:
             if topic == "state":
                 decoder.add(topic, payload, sequence, log_ns)
-        states = decoder.take().states
+        states = decoder.drain().states
         frames = (joint.transforms(states["position"][:, number]) for number, joint in enumerate(self._arm.joints))
         self._poses = zip(states["wall_ns"].tolist(), *(zip(*both, strict=True) for both in frames), strict=True)
 
@@ -250,7 +250,7 @@ class _Visualization:
 
     def add_event(self, log_ns: int, event: Event) -> None:
         """Add an event as a log message."""
-        level = foxglove.LOG_LEVELS.get(name_of(Event.Severity, event.severity), 0)
+        level = foxglove.LOG_LEVELS.get(enum_name(Event.Severity, event.severity), 0)
         message = foxglove.Log(level=level, message=event.text, name=event.source)
         _set_time(message.timestamp, event.wall_ns)
         self._write("/log", log_ns, event.wall_ns, message)

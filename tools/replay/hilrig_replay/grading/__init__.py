@@ -1,1 +1,1 @@
-"""Grading of recordings against a lab's task."""
+"""Grading of recordings by the task of a lab."""

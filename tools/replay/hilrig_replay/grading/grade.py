@@ -1,7 +1,7 @@
-"""A run graded by its task, from the recording alone: poses reached, path followed, parts placed, and in what time.
+"""Grades a run by its task, from the recording alone: poses reached, path followed, parts placed, and times.
 
-Time counts from the first state on which a command of the controller acted. Nothing here knows what the controller
-wanted, only what the task asks for: errors are distances of the tool from that.
+Times are measured from the first state at which a command of the controller acted. Errors are distances of the tool
+from the task, because the setpoints of the controller are not known.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.grading.path_goal import PathGoal, PathResult
-from hilrig_replay.grading.placement import TaskResult
+from hilrig_replay.grading.placement import PlacementReport
 from hilrig_replay.grading.pose_goal import PoseGoals, PoseResult
 from hilrig_runtime.config.task import PlaceConfig, TaskConfig
 from hilrig_sim.arm.model import RigParameters
@@ -22,44 +22,44 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PlaceResult:
-    """How one part was placed."""
+    """Result of one part."""
 
     part: str
     placed: bool
     error_mm: float | None
-    """Distance of its middle from its place's, mm; None: it stands on none."""
+    """Distance between the centers of part and place, mm; None: the part is not on a place."""
     at_s: float | None
-    """When the magnet let go of it for the last time, s from the beginning of the task; None: it never did."""
+    """Time of the last release by the magnet, s from the start of the task; None: never released."""
 
     def sentence(self) -> str:
-        """What there is to say of it."""
+        """The result as a human-readable text."""
         if self.error_mm is None:
-            return "it stands on no place"
-        where = f"{self.error_mm:.2f} mm from its place"
-        return where if self.at_s is None else f"{where}, let go at {self.at_s:.1f} s"
+            return "not on a place"
+        error = f"{self.error_mm:.2f} mm from its place"
+        return error if self.at_s is None else f"{error}, released at {self.at_s:.1f} s"
 
 
 @dataclass(frozen=True, slots=True)
 class Grade:
-    """What a run is worth."""
+    """Grade of a run."""
 
     title: str
     score: float
-    """Share of the goals that were reached in time, 0 to 1: each pose is one, each part is one, and the path is one,
-    which counts by the share of it that was passed."""
+    """Share of the goals that were reached in time, 0 to 1. Each pose, each part and the path is one goal; an
+    unfinished path counts by the share that was covered."""
     passed: bool
-    """Whether all were."""
+    """Whether all goals were reached."""
     done_s: float | None
-    """When the last goal was reached, s from the beginning of the task; None: one is missing."""
+    """Time at which the last goal was reached, s from the start of the task; None: a goal is missing."""
     time_limit_s: float
-    """0: there is none."""
+    """Time limit, s; 0: no limit."""
     poses: tuple[PoseResult, ...]
     path: PathResult | None
     parts: tuple[PlaceResult, ...]
 
     @property
     def error_mm(self) -> float | None:
-        """The largest error of what counts: of poses held, of the path as root mean square, of parts placed, mm."""
+        """Largest error of the held poses, the path (root mean square) and the placed parts, mm."""
         errors = [pose.error_mm for pose in self.poses if pose.error_mm is not None]
         errors += [part.error_mm for part in self.parts if part.placed and part.error_mm is not None]
         if self.path is not None and self.path.rms_mm is not None:
@@ -68,14 +68,14 @@ class Grade:
 
     @property
     def rank(self) -> tuple[float, float, float]:
-        """Smaller is better: by score, then by time, then by error."""
+        """Sort key of a ranking, smaller is better: score, then time, then error."""
         done_s, error_mm = self.done_s, self.error_mm
         infinite = float("inf")
         return (-self.score, infinite if done_s is None else done_s, infinite if error_mm is None else error_mm)
 
     @property
     def percent(self) -> int:
-        """The score in whole per cent, 100 for nothing less than all."""
+        """Score in percent, rounded down: 100 only if all goals were reached."""
         return math.floor(100 * self.score + 1e-9)
 
     def headline(self) -> str:
@@ -88,7 +88,7 @@ class Grade:
         return f"{sum(reached for _, reached, _ in lines)} of {len(lines)} goals{within}"
 
     def lines(self) -> list[tuple[str, bool, str]]:
-        """Goal by goal: which, whether it was reached, and what there is to say of it."""
+        """Goals as (name, whether it was reached, result text)."""
         rows = [(f"pose {pose.name}", pose.reached_s is not None, pose.sentence()) for pose in self.poses]
         if self.path is not None:
             rows.append(("path", self.path.done_s is not None, self.path.sentence()))
@@ -96,12 +96,12 @@ class Grade:
         return rows
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """Plain values for JSON."""
         return {**asdict(self), "error_mm": self.error_mm}
 
 
 class Grader:
-    """Takes in a run piece by piece, and grades it at the end; its memory does not grow with the run."""
+    """Grades a run that is added block by block; its memory does not depend on the length of the run."""
 
     def __init__(self, task: TaskConfig, parameters: RigParameters) -> None:
         self._task = task
@@ -112,12 +112,12 @@ class Grader:
         self._began_s: float | None = None
 
     def add_states(self, time_s: Floats, pose: Floats, commanded: NDArray[np.bool_]) -> None:
-        """Take in states.
+        """Add states.
 
         Args:
-            time_s: when, shape (n,), growing.
-            pose: of the tool, shape (n, 4): x, y, z, m, and yaw, rad.
-            commanded: where a command of the session's controller acted, shape (n,).
+            time_s: times of the states, increasing, shape (n,).
+            pose: pose of the tool, shape (n, 4): x, y, z in m, yaw in rad.
+            commanded: whether a command of the session's controller acted, shape (n,).
         """
         if self._began_s is None:
             if not commanded.any():
@@ -136,14 +136,18 @@ class Grader:
                 self._path.add(within, pose[:, :3])
 
     def add_drop(self, part: str, time_s: float) -> None:
-        """Take in that the magnet let go of a part, on the same time as the states."""
+        """Add the release of a part by the magnet, on the time axis of the states."""
         self._dropped_s[part] = time_s
 
-    def grade(self, stood: TaskResult | None) -> Grade:
-        """The grade, once all of the run was taken in; `stood`: which parts stand on which places at the end."""
+    def grade(self, placement: PlacementReport | None) -> Grade:
+        """Compute the grade after all blocks were added.
+
+        Args:
+            placement: placement of the parts at the end of the run.
+        """
         poses = self._poses.results()
         path = None if self._path is None else self._path.result()
-        parts = () if self._task.place is None else self._placed(self._task.place, stood)
+        parts = () if self._task.place is None else self._part_results(self._task.place, placement)
         reached = [float(pose.reached_s is not None) for pose in poses] + [float(part.placed) for part in parts]
         times = [pose.reached_s for pose in poses] + [part.at_s if part.placed else None for part in parts]
         if path is not None:
@@ -162,14 +166,14 @@ class Grader:
             parts=parts,
         )
 
-    def _placed(self, place: PlaceConfig, stood: TaskResult | None) -> tuple[PlaceResult, ...]:
-        found = {} if stood is None else {part.part: part.error_mm for part in stood.parts}
-        asked = place.parts or tuple(part.name for part in self._parameters.scene.parts if part.ferromagnetic)
+    def _part_results(self, place: PlaceConfig, placement: PlacementReport | None) -> tuple[PlaceResult, ...]:
+        found = {} if placement is None else {part.part: part.error_mm for part in placement.parts}
+        required = place.parts or tuple(part.name for part in self._parameters.scene.parts if part.ferromagnetic)
         results = []
-        for name in asked:
+        for name in required:
             error_mm, dropped_s = found.get(name), self._dropped_s.get(name)
             at_s = None if dropped_s is None or self._began_s is None else dropped_s - self._began_s
-            # What was placed too late does not count; what stood there from the start was never placed.
+            # Parts that were released too late, or that were on a place from the start, do not count.
             in_time = at_s is not None and (not self._task.time_limit_s or at_s <= self._task.time_limit_s)
             placed = error_mm is not None and error_mm <= place.tolerance_mm and in_time
             results.append(PlaceResult(name, placed, error_mm, at_s))

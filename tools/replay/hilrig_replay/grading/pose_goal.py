@@ -1,8 +1,8 @@
-"""Poses to be reached one after the other: when each was, how far the tool overshot, and how well it was held.
+"""Pose goals: poses to be reached in sequence, with settling time, overshoot and error of each.
 
-A pose is reached when the tool was within its tolerances for as long as it is to be held; then the next one's turn
-begins. As in a step response, the settling time runs from the beginning of the turn to when the tool came to stay, and
-the overshoot is how far it went beyond the pose on the straight line from where the turn began.
+A pose is reached when the tool was within its tolerances for its hold time; then the next pose is the target. As in a
+step response, the settling time is measured from the start of the target's turn until the tool stays within the
+tolerances, and the overshoot is measured along the straight line from the start position of the turn to the pose.
 """
 
 import math
@@ -17,46 +17,46 @@ from hilrig_runtime.config.task import PoseConfig
 
 Floats = NDArray[np.float64]
 
-NEAR: Final = 0.1
-"""Overshoot counts once the tool came within this share of the way; before, a curved way may lead past the pose."""
+OVERSHOOT_START_SHARE: Final = 0.1
+"""Overshoot counts after the tool came within this share of the distance; before, a curved path can pass the pose."""
 
 _ROUNDING_S: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class PoseResult:
-    """How one pose was reached; times from the beginning of the task."""
+    """Result of one pose; times from the start of the task."""
 
     name: str
     turn_s: float | None
-    """When its turn began, s; None: it never did."""
+    """Time at which the pose became the target, s; None: never."""
     reached_s: float | None
-    """When it had been held for long enough, s; None: it was not."""
+    """Time at which the hold time was complete, s; None: not reached."""
     settling_s: float | None
-    """From the beginning of its turn until the tool came to stay, s."""
+    """Time from the start of the turn until the tool stayed within the tolerances, s."""
     overshoot_mm: float
-    """Farthest beyond it, mm."""
+    """Largest distance beyond the pose, mm."""
     overshoot_share: float
-    """The same as a share of the way to it, 0 to 1."""
+    """Overshoot as a share of the distance to the pose, 0 to 1."""
     error_mm: float | None
-    """Mean distance from it while it was held, mm."""
+    """Mean distance from the pose during the hold time, mm."""
     closest_mm: float | None
-    """Smallest distance from it during its turn, mm; None: its turn never came."""
+    """Smallest distance from the pose during its turn, mm; None: it never became the target."""
 
     def sentence(self) -> str:
-        """What there is to say of it."""
+        """The result as a human-readable text."""
         if self.turn_s is None:
-            return "its turn never came"
+            return "not attempted: an earlier pose was not reached"
         if self.reached_s is None or self.settling_s is None or self.error_mm is None:
-            return f"not held; at least {self.closest_mm:.1f} mm away" if self.closest_mm is not None else "not held"
+            return f"not held; closest distance {self.closest_mm:.1f} mm" if self.closest_mm is not None else "not held"
         return (
-            f"at {self.reached_s:.1f} s, settled in {self.settling_s:.2f} s, overshoot {self.overshoot_mm:.1f} mm "
-            f"({self.overshoot_share:.0%}), held within {self.error_mm:.2f} mm"
+            f"reached at {self.reached_s:.1f} s, settled in {self.settling_s:.2f} s, "
+            f"overshoot {self.overshoot_mm:.1f} mm ({self.overshoot_share:.0%}), mean error {self.error_mm:.2f} mm"
         )
 
 
 class PoseGoals:
-    """Watches the tool on its way from pose to pose."""
+    """Evaluates the motion of the tool from pose to pose."""
 
     def __init__(self, poses: Sequence[PoseConfig]) -> None:
         self._poses = poses
@@ -64,7 +64,7 @@ class PoseGoals:
         self._turn: _Turn | None = None
 
     def add(self, time_s: Floats, pose: Floats) -> None:
-        """Take in states, as `Grader.add_states`."""
+        """Add states: times, shape (n,), and poses of the tool, shape (n, 4), as in `Grader.add_states`."""
         at = 0
         while at < len(time_s) and len(self._results) < len(self._poses):
             if self._turn is None:
@@ -76,7 +76,7 @@ class PoseGoals:
                 self._turn = None
 
     def results(self) -> tuple[PoseResult, ...]:
-        """One a pose, in their order."""
+        """One result per pose, in the order of the poses."""
         results = list(self._results)
         if self._turn is not None:
             results.append(self._turn.result())
@@ -86,34 +86,34 @@ class PoseGoals:
 
 
 class _Turn:
-    """One pose's turn."""
+    """The time during which one pose is the target."""
 
     def __init__(self, pose: PoseConfig, turn_s: float, start: Floats) -> None:
         self._pose = pose
         self._turn_s = turn_s
         self._goal = np.array(pose.position_mm) / 1000
-        way = self._goal - start
-        self._length = float(np.linalg.norm(way))
-        self._direction = way / self._length if self._length else np.zeros(3)
+        direct_path = self._goal - start
+        self._length = float(np.linalg.norm(direct_path))
+        self._direction = direct_path / self._length if self._length else np.zeros(3)
         self._start = start
         self._near = False
         self._beyond = 0.0
         self._closest = math.inf
         self._since_s: float | None = None
-        """Since when the tool is there without a break."""
+        """Time since which the tool is within the tolerances without interruption."""
         self._sum, self._count = 0.0, 0
         self.reached_s: float | None = None
 
     def add(self, time_s: Floats, pose: Floats) -> int:
-        """Take in states up to where the pose is reached; how many that are."""
+        """Add states until the pose is reached; returns the number of states used."""
         apart = np.linalg.norm(pose[:, :3] - self._goal, axis=1)
-        there = apart <= self._pose.tolerance_mm / 1000
+        within = apart <= self._pose.tolerance_mm / 1000
         if self._pose.yaw_deg is not None:
-            turned = np.abs(np.angle(np.exp(1j * (pose[:, 3] - math.radians(self._pose.yaw_deg)))))
-            there &= turned <= math.radians(self._pose.yaw_tolerance_deg)
-        used = self._held(time_s, apart, there)
+            yaw_error = np.abs(np.angle(np.exp(1j * (pose[:, 3] - math.radians(self._pose.yaw_deg)))))
+            within &= yaw_error <= math.radians(self._pose.yaw_tolerance_deg)
+        used = self._update_hold(time_s, apart, within)
         apart, along = apart[:used], (pose[:used, :3] - self._start) @ self._direction - self._length
-        near = apart <= max(NEAR * self._length, self._pose.tolerance_mm / 1000)
+        near = apart <= max(OVERSHOOT_START_SHARE * self._length, self._pose.tolerance_mm / 1000)
         if not self._near and near.any():
             along = along[int(np.argmax(near)) :]
             self._near = True
@@ -122,23 +122,23 @@ class _Turn:
         self._closest = min(self._closest, float(apart.min()))
         return used
 
-    def _held(self, time_s: Floats, apart: Floats, there: NDArray[np.bool_]) -> int:
-        """Follow how long the tool stays; how many states until it was long enough, or all."""
-        changes = np.flatnonzero(np.diff(there)) + 1
-        for begin, end in zip([0, *changes.tolist()], [*changes.tolist(), len(there)], strict=True):
-            if not there[begin]:
+    def _update_hold(self, time_s: Floats, apart: Floats, within: NDArray[np.bool_]) -> int:
+        """Update the hold time; returns the number of states until it is complete, or all."""
+        changes = np.flatnonzero(np.diff(within)) + 1
+        for begin, end in zip([0, *changes.tolist()], [*changes.tolist(), len(within)], strict=True):
+            if not within[begin]:
                 self._since_s, self._sum, self._count = None, 0.0, 0
                 continue
             if self._since_s is None:
                 self._since_s = float(time_s[begin])
-            enough = begin + int(np.searchsorted(time_s[begin:end], self._since_s + self._pose.hold_s - _ROUNDING_S))
-            last = min(enough + 1, end)
+            complete = begin + int(np.searchsorted(time_s[begin:end], self._since_s + self._pose.hold_s - _ROUNDING_S))
+            last = min(complete + 1, end)
             self._sum += float(apart[begin:last].sum())
             self._count += last - begin
-            if enough < end:
-                self.reached_s = float(time_s[enough])
+            if complete < end:
+                self.reached_s = float(time_s[complete])
                 return last
-        return len(there)
+        return len(within)
 
     def result(self) -> PoseResult:
         reached = self.reached_s is not None

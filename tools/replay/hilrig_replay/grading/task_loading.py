@@ -1,4 +1,4 @@
-"""Which task a run is graded by: the one of its lab as it was recorded, or one that a teacher gives afterwards."""
+"""Loads and validates the task that a run is graded by: from its recording, or from a lab file."""
 
 import math
 import tomllib
@@ -9,45 +9,45 @@ from pydantic import ValidationError
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.validation import mistakes_in
+from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import RigParameters
 
 
-def task_of(run: Run) -> TaskConfig | None:
-    """The task in the `lab.toml` that a recording carries; None: it carries none.
+def recorded_task(run: Run) -> TaskConfig | None:
+    """The task in the recorded `lab.toml` of a run; None: no task is recorded.
 
-    The rest of that file is not looked at: a task can be read whatever the version that recorded it.
+    The rest of the file is ignored, so that recordings of other versions can be graded.
 
     Raises:
-        InputError: what it carries is no task that this version understands.
+        InputError: the recorded task is invalid in this version.
     """
     text = run.file.attachments.get("lab.toml", b"").decode("utf-8", errors="replace")
     try:
         task = tomllib.loads(text).get("task")
         return None if task is None else TaskConfig.model_validate(task)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{run.path}: its lab.toml is no valid TOML: {error}") from error
+        raise InputError(f"{run.path}: recorded lab.toml: invalid TOML: {error}") from error
     except ValidationError as error:
-        said = "; ".join(mistakes_in(error))
-        raise InputError(f"{run.path}: the task in its lab.toml is not understood: {said}") from error
+        errors = "; ".join(format_validation_error(error))
+        raise InputError(f"{run.path}: recorded lab.toml: invalid task: {errors}") from error
 
 
-def read_task(path: Path) -> TaskConfig:
-    """The task of a lab's file.
+def load_task(path: Path) -> TaskConfig:
+    """The task of a lab file.
 
     Raises:
-        InputError: it is no lab's file, or has no task.
+        InputError: the lab file is invalid or has no task.
     """
     task = load_lab(path).task
     if task is None:
-        raise InputError(f"{path}: has no task: it needs [[task.poses]], [task.path] or [task.place]")
+        raise InputError(f"{path}: no task: add [[task.poses]], [task.path] or [task.place]")
     return task
 
 
-def check_task(task: TaskConfig, parameters: RigParameters) -> None:
-    """Refuse what a rig can't do.
+def validate_task(task: TaskConfig, parameters: RigParameters) -> None:
+    """Check that a rig can perform a task.
 
     Raises:
         InputError: a pose or a point of the path is out of reach, or a part is not in the scene.
@@ -57,7 +57,7 @@ def check_task(task: TaskConfig, parameters: RigParameters) -> None:
         try:
             inverse(parameters.arm, (x, y, z, 0.0 if pose.yaw_deg is None else math.radians(pose.yaw_deg)))
         except UnreachableError as error:
-            raise InputError(f"task: pose {pose.name!r} can't be reached: {error}") from error
+            raise InputError(f"task: pose {pose.name!r} is out of reach: {error}") from error
     low, high = (float(forward(parameters.arm, (0.0, 0.0, d3, 0.0))[2]) for d3 in _strokes(parameters))
     for number, (x_mm, y_mm, z_mm) in enumerate(() if task.path is None else task.path.points_mm, start=1):
         within = low <= z_mm / 1000 <= high and bool(in_reach(parameters.arm, x_mm / 1000, y_mm / 1000))
@@ -67,12 +67,13 @@ def check_task(task: TaskConfig, parameters: RigParameters) -> None:
     for name in () if task.place is None else task.place.parts:
         if name not in known:
             raise InputError(
-                f"task: no part {name!r} that the magnet holds is in the scene; it has {', '.join(known) or 'none'}"
+                f"task.place.parts: no ferromagnetic part {name!r} in the scene; its ferromagnetic parts: "
+                f"{', '.join(known) or 'none'}"
             )
     if task.place is not None and not any(tray.places for tray in parameters.scene.trays):
-        raise InputError("task: parts are to be placed, and the scene has no tray")
+        raise InputError("task.place: the scene has no tray with places")
 
 
 def _strokes(parameters: RigParameters) -> tuple[float, float]:
-    """The quill at its lowest and at its highest, m."""
+    """Lowest and highest position of the quill, m."""
     return parameters.arm.upper[2], parameters.arm.lower[2]

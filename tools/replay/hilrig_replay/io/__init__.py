@@ -1,1 +1,1 @@
-"""Recordings read as arrays: files, columns, time bases and the index of a folder."""
+"""Reads recordings as arrays: files, columns and time bases."""

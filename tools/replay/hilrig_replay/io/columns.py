@@ -1,11 +1,11 @@
-"""Messages to rows: the fields of a recording as numpy structured arrays, decoded in bulk.
+"""Row types of a recording, and functions that decode messages in bulk to numpy structured arrays.
 
-Each table below is declared once, as fields with their numpy types; the row layout is the same for `struct`, which
-writes a message's fields into a buffer in one call, and for numpy, which reads the buffer as an array without a copy.
+Each row type is declared once, as a numpy dtype. Its layout is the same for `struct`, which packs the fields of a
+message into a buffer in one call, and for numpy, which reads the buffer as an array without a copy.
 
-Repeated doubles are the slow part of a protobuf message in Python. On the wire a packed `repeated double` is a length
-and the numbers' bytes, exactly as a `bytes` field: so messages are parsed here with a view of their type in which
-those fields are `bytes`, and the numbers go into the row as they are.
+Repeated doubles are slow to read from a protobuf message in Python. A packed `repeated double` is encoded as a length
+and the bytes of the numbers, exactly like a `bytes` field. Messages are therefore parsed with a variant of their type
+in which these fields are `bytes`, and the bytes are copied to the row unchanged.
 """
 
 import struct
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hilrig_schemas import JointState, TorqueCommand
 
 Rows: TypeAlias = NDArray[np.void]
-"""A structured array: one row a message, fields by name."""
+"""A structured array: one row per message, fields by name."""
 
 _STRUCT_CODES: Final = {
     "<i8": "q",
@@ -32,9 +32,9 @@ _STRUCT_CODES: Final = {
     "|b1": "?",
 }
 _VECTOR: Final = ("<f8", (4,))
-_FIRST_CAPACITY: Final = 1024
+_INITIAL_ROWS: Final = 1024
 
-STATE: Final = np.dtype(
+STATE_DTYPE: Final = np.dtype(
     [
         ("step", "<u8"),
         ("incarnation", "<u8"),
@@ -61,10 +61,10 @@ STATE: Final = np.dtype(
         ("safe", "|b1"),
     ]
 )
-"""One row a `JointState`, units as in joint_state.proto; `sequence` of the sender, `log_ns` arrival at the recorder
-(wall clock). `session` and `held_part` are codes of `Names`."""
+"""One row per `JointState`, units as in joint_state.proto. `sequence`: sequence number of the sender; `log_ns`: arrival
+at the recorder (wall clock); `session` and `held_part`: codes of a `StringTable`."""
 
-COMMAND: Final = np.dtype(
+COMMAND_DTYPE: Final = np.dtype(
     [
         ("seq", "<u8"),
         ("wall_ns", "<i8"),
@@ -87,9 +87,10 @@ COMMAND: Final = np.dtype(
         ("safe", "|b1"),
     ]
 )
-"""One row a `TorqueCommand`, units as in torque_command.proto; `session` and `controller` are codes of `Names`."""
+"""One row per `TorqueCommand`, units as in torque_command.proto; `session` and `controller` are codes of a
+`StringTable`."""
 
-TRAFFIC: Final = np.dtype(
+TRAFFIC_DTYPE: Final = np.dtype(
     [
         ("wall_ns", "<i8"),
         ("arrived_ns", "<i8"),
@@ -101,9 +102,9 @@ TRAFFIC: Final = np.dtype(
         ("exception", "|u1"),
     ]
 )
-"""One row a Modbus request, units as in modbus_traffic.proto; `wall_ns` is `arrived_ns` on the wall clock."""
+"""One row per Modbus request, units as in modbus_traffic.proto; `wall_ns` is `arrived_ns` on the wall clock."""
 
-PART: Final = np.dtype(
+PART_DTYPE: Final = np.dtype(
     [
         ("step", "<u8"),
         ("wall_ns", "<i8"),
@@ -115,56 +116,57 @@ PART: Final = np.dtype(
         ("held", "|b1"),
     ]
 )
-"""One row a `PartState` within a state: centre in the world, m, yaw in rad. `part` is a code of `Names`."""
+"""One row per `PartState` in a state: center of the part (world, m) and yaw (rad); `part` is a code of a
+`StringTable`."""
 
 
-class Names:
-    """Texts that repeat in a recording, as numbers: code 0 is the empty text.
+class StringTable:
+    """String interning table: maps repeated texts of a recording to 16-bit codes; code 0 is the empty text.
 
-    There are as many as a code of 16 bits can tell apart; later ones share the last. A controller that connects anew
-    for each request has another address each time.
+    The number of codes is bounded, because a controller that reconnects for each request has a different address each
+    time. When the codes are used up, further texts share the last code.
     """
 
-    MOST: Final = 1 << 16
-    OTHERS: Final = "others"
+    MAX_STRINGS: Final = 1 << 16
+    OVERFLOW_TEXT: Final = "others"
 
     def __init__(self) -> None:
         self._codes: dict[str, int] = {"": 0}
         self._texts: list[str] = [""]
 
     def code(self, text: str) -> int:
-        """Number of a text; a new text gets the next one, or the last one where none is left."""
+        """Code of a text; a new text gets the next code, or the shared last code if none is left."""
         code = self._codes.get(text)
         if code is None:
             code = len(self._texts)
-            if code == self.MOST:
+            if code == self.MAX_STRINGS:
                 return code - 1
             self._codes[text] = code
-            self._texts.append(text if code < self.MOST - 1 else self.OTHERS)
+            self._texts.append(text if code < self.MAX_STRINGS - 1 else self.OVERFLOW_TEXT)
         return code
 
     def __getitem__(self, code: int) -> str:
         return self._texts[code]
 
     def texts(self, codes: NDArray[np.integer]) -> NDArray[np.object_]:
-        """The texts of an array of codes, same shape, as Python strings."""
+        """Texts for an array of codes, same shape, as Python strings."""
         texts: NDArray[np.object_] = np.array(self._texts, dtype=object)
         return np.asarray(texts[codes])
 
 
-class Table:
-    """Rows that grow at their end; storage doubles, so that appending costs the same however long it gets."""
+class RowBuffer:
+    """Growing buffer of rows; its capacity doubles when full, so appending takes amortized constant time."""
 
     def __init__(self, dtype: np.dtype[np.void], capacity: int = 0) -> None:
         self._dtype = dtype
         self._struct = struct.Struct("<" + "".join(_code(dtype[name]) for name in dtype.names or ()))
         self._size = dtype.itemsize
-        self._buffer = bytearray(self._size * max(capacity, _FIRST_CAPACITY))
+        self._buffer = bytearray(self._size * max(capacity, _INITIAL_ROWS))
         self._end = 0
         self._pack = self._struct.pack_into
 
     def append(self, *fields: Any) -> None:
-        """Add a row: its fields in order, a vector as its bytes."""
+        """Add a row: the fields in order, a vector as bytes."""
         if self._end == len(self._buffer):
             self._buffer.extend(bytes(self._end))
         self._pack(self._buffer, self._end, *fields)
@@ -173,10 +175,10 @@ class Table:
     def __len__(self) -> int:
         return self._end // self._size
 
-    def take(self) -> Rows:
-        """Give the rows away, shape (number of rows,), and begin anew."""
+    def drain(self) -> Rows:
+        """Return the rows, shape (number of rows,), and empty the buffer."""
         rows = np.frombuffer(self._buffer, self._dtype, count=len(self))
-        self._buffer = bytearray(self._size * _FIRST_CAPACITY)
+        self._buffer = bytearray(self._size * _INITIAL_ROWS)
         self._end = 0
         return rows
 
@@ -186,7 +188,7 @@ def _code(dtype: np.dtype[Any]) -> str:
 
 
 def _bulk_view(message: type[Message]) -> type[Any]:
-    """`message`'s type with each `repeated double` as `bytes`: the same bytes on the wire, read faster."""
+    """Variant of a message type with each `repeated double` as `bytes`: same encoding, faster to parse."""
     described = descriptor_pb2.FileDescriptorProto()
     message.DESCRIPTOR.file.CopyToProto(described)
     package = described.package
@@ -206,12 +208,12 @@ _StateView: Final = _bulk_view(JointState)
 _CommandView: Final = _bulk_view(TorqueCommand)
 _NO_VECTOR: Final = bytes(32)
 
-Decode = Callable[[bytes, int, int], None]
-"""Adds one message to its table: its bytes, the sender's sequence, the time of arrival at the recorder (ns, wall)."""
+DecodeFunction = Callable[[bytes, int, int], None]
+"""Adds one message to its buffer: payload, sequence number of the sender, arrival at the recorder (ns, wall clock)."""
 
 
-def state_decoder(states: Table, parts: Table, names: Names) -> Decode:
-    """A function that adds `JointState` messages to a `STATE` table, and the parts in them to a `PART` table."""
+def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> DecodeFunction:
+    """Return a function that adds `JointState` messages to `states` and the parts in them to `parts`."""
     message = _StateView()
     parse, add, add_part, code = message.ParseFromString, states.append, parts.append, names.code
 
@@ -251,8 +253,8 @@ def state_decoder(states: Table, parts: Table, names: Names) -> Decode:
     return decode
 
 
-def command_decoder(commands: Table, names: Names) -> Decode:
-    """A function that adds `TorqueCommand` messages to a `COMMAND` table."""
+def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
+    """Return a function that adds `TorqueCommand` messages to `commands`."""
     message = _CommandView()
     parse, add, code = message.ParseFromString, commands.append, names.code
 
@@ -287,11 +289,11 @@ def _vector(packed: bytes) -> bytes:
     if len(packed) == 32:
         return packed
     if not packed:
-        # A vector that was never set: the message's sender had none.
+        # The sender did not set the vector.
         return _NO_VECTOR
-    raise DecodeError(f"a vector of {len(packed) // 8} numbers where 4 are due")
+    raise DecodeError(f"expected a vector of 4 numbers, got {len(packed) // 8}")
 
 
-def joined(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
-    """One array out of several; shape (sum of their lengths,)."""
+def concatenate_rows(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
+    """Concatenate arrays; shape (sum of their lengths,)."""
     return np.concatenate(pieces) if pieces else np.empty(0, dtype)

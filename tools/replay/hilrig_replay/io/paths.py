@@ -1,4 +1,4 @@
-"""Which recordings are meant: files, and folders with all in them; and what each is called beside the others."""
+"""Path arguments: expands folders to recordings, and gives each recording a display name."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -8,25 +8,25 @@ from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
 from hilrig_runtime.errors import InputError
 
 
-def recordings(given: Iterable[Path]) -> list[Path]:
-    """The recordings that files and folders stand for, in the order given, a folder's by name.
+def find_recordings(given: Iterable[Path]) -> list[Path]:
+    """The given files, and the recordings in the given folders (sorted by name), in the given order.
 
     Raises:
-        InputError: a folder has none.
+        InputError: a folder contains no recording.
     """
     found: list[Path] = []
     for path in given:
         if path.is_dir():
-            inside = sorted(path.rglob(f"*{MCAP_SUFFIX}"))
-            if not inside:
-                raise InputError(f"{path}: there is no recording ({MCAP_SUFFIX}) in this folder")
-            found.extend(inside)
+            in_folder = sorted(path.rglob(f"*{MCAP_SUFFIX}"))
+            if not in_folder:
+                raise InputError(f"{path}: this folder contains no recording ({MCAP_SUFFIX})")
+            found.extend(in_folder)
         else:
             found.append(path)
     return list(dict.fromkeys(found))
 
 
-def names_of(paths: Sequence[Path]) -> dict[Path, str]:
-    """A name for each of several recordings: its file's, with its folder where two files are called the same."""
+def display_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Display name of each recording: the file name without suffix; the path if several files have this name."""
     stems = Counter(path.stem for path in paths)
     return {path: path.stem if stems[path.stem] == 1 else str(path.with_suffix("")) for path in paths}

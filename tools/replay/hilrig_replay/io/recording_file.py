@@ -1,7 +1,7 @@
-"""A recording as a file: is it one, what does it say of itself, and its messages as bytes.
+"""A recording file: validation, metadata, and its messages as bytes.
 
-Chunks are read one at a time in the order of the file, which is each sender's order, so memory does not depend on
-the length. Where a range of time is asked for, the file's index tells which chunks to read.
+Chunks are read one at a time in file order, which preserves the order of each sender, so memory does not depend on the
+length. For a time range, only the chunks that the file's index lists for it are read.
 """
 
 import struct
@@ -32,12 +32,12 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
-from hilrig_replay.io.columns import Rows, Table
+from hilrig_replay.io.columns import RowBuffer, Rows
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
 
 SCHEMA_PACKAGE: Final = "hilrig.v1"
-"""The messages that this version reads."""
+"""Package of the message schemas that this version reads."""
 _NEVER_NS: Final = (1 << 63) - 1
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
@@ -45,20 +45,20 @@ _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 _FOOTER_BYTES: Final = 29
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
-CHUNK: Final = np.dtype(
+CHUNK_DTYPE: Final = np.dtype(
     [("first_ns", "<i8"), ("last_ns", "<i8"), ("offset", "<u8"), ("length", "<u8"), ("channels", "<u8")]
 )
-"""One row a chunk: arrival of its first and last message, where it stands in the file, and the channels in it, a bit
-each, those 64 apart sharing one; 0: it is not said. At most one a second, so that a day takes 4 MB."""
-_MESSAGE: Final = Opcode.MESSAGE.value
-"""Looked up once: an enumeration's value costs as much as reading a message."""
+"""One row per chunk: arrival of its first and last message, position and size in the file, and a bit mask of its
+channels (bit = channel id modulo 64; 0: not known). At most one chunk per second, so an index of a day takes 4 MB."""
+_MESSAGE_OPCODE: Final = Opcode.MESSAGE.value
+"""Cached, because the lookup of an enum value takes as long as reading a message."""
 
 
 class RawMessage(NamedTuple):
-    """One message of a file; times are wall clock, ns."""
+    """One message of a file; times are in ns, wall clock."""
 
     topic: str
-    """Name of its topic in the registry."""
+    """Name of the topic in the topic registry."""
     sequence: int
     log_ns: int
     publish_ns: int
@@ -66,37 +66,44 @@ class RawMessage(NamedTuple):
 
 
 class DamagedRecordingError(InputError):
-    """A file whose inside is not what it should be."""
+    """A recording whose content is damaged."""
 
     def __init__(self, path: Path, detail: str) -> None:
-        self.said = f"damaged ({detail or 'it ends too early'}): `hilrig recover {path}` saves what is whole"
-        """What is wrong, without the file's name."""
-        super().__init__(f"{path}: {self.said}")
+        self.description = (
+            f"damaged ({detail or 'unexpected end of data'}): run `hilrig recover {path}` to save the intact messages"
+        )
+        """The defect and its fix, without the file name."""
+        super().__init__(f"{path}: {self.description}")
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingFile:
-    """A recording that was found to be one; open it with `open_recording`."""
+    """A validated recording file; create it with `open_recording`."""
 
     path: Path
     metadata: dict[str, dict[str, str]]
-    """By name, then by key."""
+    """Metadata values by record name, then by key."""
     attachments: dict[str, bytes]
-    """By name."""
+    """Content of the attachments by name."""
     counts: dict[str, int]
-    """Messages of each topic."""
+    """Number of messages by topic."""
     start_ns: int
     """Arrival of the first message at the recorder, ns, wall clock."""
     end_ns: int
-    """Arrival of the last, ns, wall clock."""
+    """Arrival of the last message at the recorder, ns, wall clock."""
     _topic_of_channel: dict[int, str]
     _chunks: Rows
-    """In the order of the file, fields as `CHUNK`."""
+    """In file order, fields as `CHUNK_DTYPE`."""
 
     def messages(
         self, topics: frozenset[str], *, from_ns: int | None = None, until_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """The messages of some topics in the order of the file; a range is of their arrival, its end excluded.
+        """The messages of some topics in file order.
+
+        Args:
+            topics: names of the topics.
+            from_ns: start of the range of arrival times, wall clock; None: the beginning.
+            until_ns: end of the range, excluded; None: the end.
 
         Raises:
             InputError: the file is damaged.
@@ -107,7 +114,7 @@ class RecordingFile:
         try:
             with self.path.open("rb") as stream:
                 if len(self._chunks):
-                    for chunk in self._with(wanted, low, high):
+                    for chunk in self._select_chunks(wanted, low, high):
                         messages = _in_chunk(_read_chunk(stream, int(chunk["offset"]), int(chunk["length"])), wanted)
                         if low <= chunk["first_ns"] and chunk["last_ns"] < high:
                             yield from messages
@@ -125,8 +132,8 @@ class RecordingFile:
         except (McapError, ZstdError, struct.error, ValueError, RuntimeError, OSError) as error:
             raise DamagedRecordingError(self.path, str(error)) from error
 
-    def _with(self, channels: Iterable[int], low: int, high: int) -> Rows:
-        """The chunks that may have messages of some channels from a range of time."""
+    def _select_chunks(self, channels: Iterable[int], low: int, high: int) -> Rows:
+        """The chunks that may contain messages of the given channels in a time range."""
         chunks = self._chunks
         bits = np.uint64(_bits(channels))
         holds = (chunks["channels"] == 0) | (chunks["channels"] & bits != 0)
@@ -135,50 +142,50 @@ class RecordingFile:
 
 
 @dataclass(slots=True)
-class _Contents:
-    """What a file says of itself at its end, or where it has no such end, in all of it."""
+class _FileContents:
+    """Schemas, channels, metadata, attachments and counts of a file: from its summary section, or from all records."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel."""
+    """Number of messages by channel id."""
     start_ns: int = 0
     end_ns: int = 0
-    chunks: Table = field(default_factory=lambda: Table(CHUNK))
+    chunks: RowBuffer = field(default_factory=lambda: RowBuffer(CHUNK_DTYPE))
 
 
 def refuse_recording(output: Path) -> None:
-    """Refuse to write over a recording: a file with a recording's suffix or with MCAP's first bytes.
+    """Refuse to overwrite a recording: a file with the suffix of a recording or with the MCAP magic bytes.
 
     Raises:
         InputError: `output` is a recording.
     """
     try:
         with output.open("rb") as file:
-            begins_like_one = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+            has_magic = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
     except OSError:
-        # Missing, or not readable: the error of writing it is the one to report.
+        # Missing or unreadable: writing the file reports the error.
         return
-    if begins_like_one or output.name.removesuffix(PART_SUFFIX).endswith(MCAP_SUFFIX):
-        raise InputError(f"{output} is a recording: choose another output name")
+    if has_magic or output.name.removesuffix(PART_SUFFIX).endswith(MCAP_SUFFIX):
+        raise InputError(f"{output} is a recording and is not overwritten: choose another output name")
 
 
 def open_recording(path: Path) -> RecordingFile:
-    """Read what a file says of itself; its messages stay on the disk.
+    """Validate a file and read its metadata; the messages are not read.
 
     Raises:
-        InputError: there is no such file, it is no recording, it is torn, or a newer hilrig wrote it.
+        InputError: the file is missing, not a recording, truncated, damaged, or of a newer version.
     """
     try:
         with path.open("rb") as stream:
             _check_ends(path, stream)
-            contents = _summary(stream) or _by_reading(stream)
+            contents = _read_summary(stream) or _scan_records(stream)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: a folder, where a recording (.mcap) was expected") from None
+        raise InputError(f"{path}: expected a recording (.mcap), found a folder") from None
     except OSError as error:
         raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
     except (McapError, ZstdError, struct.error, ValueError, KeyError, RuntimeError, StopIteration) as error:
@@ -188,7 +195,7 @@ def open_recording(path: Path) -> RecordingFile:
     for channel, count in contents.counts.items():
         if channel in topic_of_channel:
             counts[topic_of_channel[channel]] += count
-    chunks = contents.chunks.take()
+    chunks = contents.chunks.drain()
     return RecordingFile(
         path=path,
         metadata=contents.metadata,
@@ -204,24 +211,24 @@ def open_recording(path: Path) -> RecordingFile:
 def _check_ends(path: Path, stream: IO[bytes]) -> None:
     head = stream.read(len(MCAP0_MAGIC))
     if not head:
-        raise InputError(f"{path}: empty: there is nothing in this file")
+        raise InputError(f"{path}: the file is empty")
     if head != MCAP0_MAGIC:
-        raise InputError(f"{path}: no MCAP file: its first bytes are not those of one")
+        raise InputError(f"{path}: not an MCAP file (bad magic)")
     stream.seek(-len(MCAP0_MAGIC), 2)
     if stream.tell() < len(MCAP0_MAGIC) or stream.read() != MCAP0_MAGIC:
-        unfinished = "still being written, or torn" if path.suffix == PART_SUFFIX else "torn"
-        raise InputError(f"{path}: {unfinished}: it has no end; `hilrig recover {path}` makes a whole file of it")
+        unfinished = "still being written, or truncated" if path.suffix == PART_SUFFIX else "truncated"
+        raise InputError(f"{path}: {unfinished} (no footer): run `hilrig recover {path}` to complete it")
     stream.seek(0)
 
 
-def _summary(stream: IO[bytes]) -> _Contents | None:
-    """What stands in the summary at the end of a file; None: it has none."""
+def _read_summary(stream: IO[bytes]) -> _FileContents | None:
+    """Contents of the summary section at the end of a file; None: the file has no summary section."""
     stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     start = Footer.read(_record(stream, Opcode.FOOTER)).summary_start
     if not start:
         return None
-    contents = _Contents()
-    elsewhere: list[MetadataIndex | AttachmentIndex] = []
+    contents = _FileContents()
+    index: list[MetadataIndex | AttachmentIndex] = []
     stream.seek(start)
     for opcode, data in _records(stream):
         if opcode == Opcode.CHUNK_INDEX.value:
@@ -242,14 +249,14 @@ def _summary(stream: IO[bytes]) -> _Contents | None:
             contents.counts = statistics.channel_message_counts
             contents.start_ns, contents.end_ns = statistics.message_start_time, statistics.message_end_time
         elif opcode == Opcode.METADATA_INDEX.value:
-            elsewhere.append(MetadataIndex.read(record))
+            index.append(MetadataIndex.read(record))
         elif opcode == Opcode.ATTACHMENT_INDEX.value:
-            elsewhere.append(AttachmentIndex.read(record))
+            index.append(AttachmentIndex.read(record))
         elif opcode == Opcode.FOOTER.value:
             break
-    for place in elsewhere:
-        stream.seek(place.offset)
-        if isinstance(place, MetadataIndex):
+    for entry in index:
+        stream.seek(entry.offset)
+        if isinstance(entry, MetadataIndex):
             metadata = Metadata.read(_record(stream, Opcode.METADATA))
             contents.metadata[metadata.name] = dict(metadata.metadata)
         else:
@@ -259,30 +266,30 @@ def _summary(stream: IO[bytes]) -> _Contents | None:
 
 
 def _records(stream: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of the records from here on."""
+    """Opcode and content of the records from the current position."""
     begin = stream.tell()
-    left = stream.seek(0, 2) - begin
+    remaining = stream.seek(0, 2) - begin
     stream.seek(begin)
-    while left >= _RECORD_HEAD.size:
+    while remaining >= _RECORD_HEAD.size:
         opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
-        left -= _RECORD_HEAD.size + length
-        if left < 0:
+        remaining -= _RECORD_HEAD.size + length
+        if remaining < 0:
             raise EndOfFile
         yield opcode, stream.read(length)
 
 
 def _record(stream: IO[bytes], expected: Opcode) -> ReadDataStream:
-    """The content of the record that stands here."""
+    """Content of the record at the current position."""
     for opcode, data in _records(stream):
         if opcode == expected.value:
             return ReadDataStream(BytesIO(data))
         break
-    raise McapError(f"no {expected.name.lower()} is where one should be")
+    raise McapError(f"expected a record {expected.name.lower()} at its indexed position")
 
 
-def _by_reading(stream: IO[bytes]) -> _Contents:
-    """What a summary would say, for a file that has none: a valid MCAP file may leave it out."""
-    contents = _Contents()
+def _scan_records(stream: IO[bytes]) -> _FileContents:
+    """Contents of a file without a summary section (optional in MCAP), collected from all its records."""
+    contents = _FileContents()
     stream.seek(0)
     for record in StreamReader(stream).records:
         if isinstance(record, Schema):
@@ -302,8 +309,8 @@ def _by_reading(stream: IO[bytes]) -> _Contents:
     return contents
 
 
-def _topics(path: Path, contents: _Contents) -> dict[int, str]:
-    """Topic of each channel id; channels that are not ours are left out."""
+def _topics(path: Path, contents: _FileContents) -> dict[int, str]:
+    """Topic of each channel id, without channels that hilrig did not define."""
     version = contents.metadata.get("hilrig.session", {}).get("schema_version", SCHEMA_PACKAGE)
     by_channel = {topic.channel: topic for topic in RECORDED.values()}
     found = {}
@@ -315,12 +322,13 @@ def _topics(path: Path, contents: _Contents) -> dict[int, str]:
         name = schema.name if schema is not None else "no schema"
         if name != topic.message.DESCRIPTOR.full_name:
             if not name.startswith("hilrig."):
-                raise InputError(f"{path}: no recording of hilrig: its channel {channel.topic} holds {name}")
+                raise InputError(f"{path}: not a hilrig recording: its channel {channel.topic} contains {name}")
             version = name.rpartition(".")[0]
         found[channel.id] = topic.name
     if version != SCHEMA_PACKAGE:
         raise InputError(
-            f"{path}: recorded with messages {version}, and this hilrig reads {SCHEMA_PACKAGE}: use a newer hilrig"
+            f"{path}: recorded with message schemas {version}, but this version reads {SCHEMA_PACKAGE}: "
+            "use a newer hilrig"
         )
     return found
 
@@ -338,7 +346,7 @@ def _read_chunk(stream: IO[bytes], offset: int, length: int) -> bytes:
     if len(record) != length:
         raise EndOfFile
     if record[0] != Opcode.CHUNK.value:
-        raise McapError("the index points to something that is no chunk")
+        raise McapError("an entry of the index does not point to a chunk")
     chunk = Chunk.read(ReadDataStream(BytesIO(record[_RECORD_HEAD.size :])))
     data, size = get_chunk_data_stream(chunk, validate_crc=True)
     return data.read(size)
@@ -350,7 +358,7 @@ def _in_chunk(data: bytes, wanted: dict[int, str]) -> Iterator[RawMessage]:
     while at < end:
         opcode, length = head(data, at)
         following = at + 9 + length
-        if opcode == _MESSAGE:
+        if opcode == _MESSAGE_OPCODE:
             _, _, channel, sequence, log_ns, publish_ns = message_head(data, at)
             topic = wanted.get(channel)
             if topic is not None:

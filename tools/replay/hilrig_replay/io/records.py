@@ -1,4 +1,4 @@
-"""Pieces of a run as arrays, and what makes them out of messages."""
+"""Blocks of a run as arrays, and the decoder that makes them from messages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,23 +7,23 @@ from typing import Any, Final
 import numpy as np
 
 from hilrig_replay.io.columns import (
-    COMMAND,
-    PART,
-    STATE,
-    TRAFFIC,
-    Decode,
-    Names,
+    COMMAND_DTYPE,
+    PART_DTYPE,
+    STATE_DTYPE,
+    TRAFFIC_DTYPE,
+    DecodeFunction,
+    RowBuffer,
     Rows,
-    Table,
+    StringTable,
     command_decoder,
-    joined,
+    concatenate_rows,
     state_decoder,
 )
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import Event
 
-EVENT: Final = np.dtype(
+EVENT_DTYPE: Final = np.dtype(
     [
         ("wall_ns", "<i8"),
         ("step", "<u8"),
@@ -34,43 +34,48 @@ EVENT: Final = np.dtype(
         ("message", "O"),
     ]
 )
-"""One row an `Event`: when, simulation's step (0: not known), kind and severity by name, text, the message whole."""
+"""One row per `Event`: time, step of the simulation (0: unknown), names of kind and severity, text, source, and the
+complete message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """A piece of a run; each array has one row a message, in its sender's order."""
+    """A block of a run; each array has one row per message, in the order of its sender."""
 
     states: Rows
-    """Shape (n,), fields as `columns.STATE`."""
+    """Shape (n,), fields as `columns.STATE_DTYPE`."""
     commands: Rows
-    """Shape (n,), fields as `columns.COMMAND`; a repeated command is not recorded again."""
+    """Shape (n,), fields as `columns.COMMAND_DTYPE`; a repeated command is not recorded again."""
     events: Rows
-    """Shape (n,), fields as `EVENT`."""
+    """Shape (n,), fields as `EVENT_DTYPE`."""
     traffic: Rows
-    """Shape (n,), fields as `columns.TRAFFIC`: one row a Modbus request."""
+    """Shape (n,), fields as `columns.TRAFFIC_DTYPE`: one row per Modbus request."""
     parts: Rows
-    """Shape (n,), fields as `columns.PART`: where the scene's parts are; only rows in which the sim stated them."""
+    """Shape (n,), fields as `columns.PART_DTYPE`: poses of the scene's parts, from the states that contain them."""
 
     @property
     def arrays(self) -> tuple[Rows, Rows, Rows, Rows, Rows]:
-        """All of them, in the order above."""
+        """All arrays, in the order of the fields."""
         return self.states, self.commands, self.events, self.traffic, self.parts
 
 
 class Decoder:
-    """Collects messages of a rig, from a file or from the bus, and gives them away as records."""
+    """Collects the messages of a rig, from a file or from the bus, and returns them as `Records`."""
 
-    def __init__(self, names: Names, timebase: Timebase) -> None:
+    def __init__(self, names: StringTable, timebase: Timebase) -> None:
         self._names = names
         self._timebase = timebase
-        self._states, self._commands, self._traffic = Table(STATE), Table(COMMAND), Table(TRAFFIC)
-        self._parts = Table(PART)
+        self._states, self._commands, self._traffic = (
+            RowBuffer(STATE_DTYPE),
+            RowBuffer(COMMAND_DTYPE),
+            RowBuffer(TRAFFIC_DTYPE),
+        )
+        self._parts = RowBuffer(PART_DTYPE)
         self._events: list[tuple[Any, ...]] = []
-        self._decoders = self._fresh()
+        self._decoders = self._new_decoders()
 
-    def _fresh(self) -> dict[str, Decode]:
-        # Not by way of `self`: a decoder that held itself would keep its tables until the next collection.
+    def _new_decoders(self) -> dict[str, DecodeFunction]:
+        # No reference to `self`: a reference cycle would keep the buffers until the next garbage collection.
         events = self._events
         return {
             "state": state_decoder(self._states, self._parts, self._names),
@@ -80,40 +85,44 @@ class Decoder:
         }
 
     def add(self, topic: str, payload: bytes, sequence: int, log_ns: int) -> None:
-        """Take in one message of a topic.
+        """Add one message of a topic.
 
         Raises:
-            google.protobuf.message.DecodeError: the bytes are no such message.
+            google.protobuf.message.DecodeError: the payload is not a valid message of this topic.
         """
         self._decoders[topic](payload, sequence, log_ns)
 
-    def take(self) -> Records:
-        """What was taken in since the last time."""
-        events = np.array(self._events, EVENT)
+    def drain(self) -> Records:
+        """Return and remove the messages that were added since the last call."""
+        events = np.array(self._events, EVENT_DTYPE)
         self._events.clear()
-        records = Records(self._states.take(), self._commands.take(), events, self._traffic.take(), self._parts.take())
-        self._timebase.note(records.states)
-        # A message that is parsed into again and again gives nothing back: its memory grows with what it was given.
-        self._decoders = self._fresh()
+        records = Records(
+            self._states.drain(), self._commands.drain(), events, self._traffic.drain(), self._parts.drain()
+        )
+        self._timebase.update(records.states)
+        # A protobuf message that is reused for parsing never frees memory: new decoders bound its growth.
+        self._decoders = self._new_decoders()
         return records
 
 
 def _event_row(payload: bytes) -> tuple[Any, ...]:
     event = Event.FromString(payload)
-    kind = name_of(Event.Kind, event.kind)
-    severity = name_of(Event.Severity, event.severity)
+    kind = enum_name(Event.Kind, event.kind)
+    severity = enum_name(Event.Severity, event.severity)
     return (event.wall_ns, event.step, kind, severity, event.text, event.source, event)
 
 
-def name_of(enum: Any, number: int) -> str:
-    """Name of an enum's value; its number, where a later version added it."""
+def enum_name(enum: Any, number: int) -> str:
+    """Name of an enum value; its number if it is unknown (added by a later version)."""
     try:
         return str(enum.Name(number))
     except ValueError:
         return str(number)
 
 
-def join_records(pieces: Sequence[Records]) -> Records:
-    """One piece out of several, in their order."""
-    dtypes = (STATE, COMMAND, EVENT, TRAFFIC, PART)
-    return Records(*(joined([piece.arrays[at] for piece in pieces], dtype) for at, dtype in enumerate(dtypes)))
+def concatenate_records(blocks: Sequence[Records]) -> Records:
+    """Concatenate blocks in the given order."""
+    dtypes = (STATE_DTYPE, COMMAND_DTYPE, EVENT_DTYPE, TRAFFIC_DTYPE, PART_DTYPE)
+    return Records(
+        *(concatenate_rows([block.arrays[at] for block in blocks], dtype) for at, dtype in enumerate(dtypes))
+    )

@@ -1,7 +1,7 @@
-"""A recording as arrays: `open_run(path)` for the commands, for notebooks, and for whatever reads a run.
+"""A recording as arrays: `open_run(path)`, used by the commands and in notebooks.
 
-Opening reads what the file says of itself; the arrays are read when they are asked for. `blocks` gives a run piece by
-piece, so that what goes through it once needs the same memory for a minute and for a day; `between` reads a range.
+Opening a run reads the metadata of the file; the arrays are read on first access. `blocks` iterates over a run in
+blocks, so one pass needs the same memory for a minute and for a day; `between` reads a time range.
 """
 
 from collections.abc import Iterator, Mapping
@@ -14,200 +14,208 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile, open_recording
-from hilrig_replay.io.records import Decoder, Records, join_records
+from hilrig_replay.io.records import Decoder, Records, concatenate_records
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError
 
-ALL: Final = frozenset({"state", "command", "event", "traffic"})
+ALL_TOPICS: Final = frozenset({"state", "command", "event", "traffic"})
 BLOCK_ROWS: Final = 20_000
-_USUAL_STEP_NS: Final = 20_000_000
-_SLACK_NS: Final = 2_000_000_000
-"""A message arrives at the recorder at most so long after it was sent, as a rule; a range is read that much wider."""
+_DEFAULT_STEP_NS: Final = 20_000_000
+_MAX_RECORDING_DELAY_NS: Final = 2_000_000_000
+"""Assumed maximum time from sending a message to its arrival at the recorder; a time range is extended by it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """What a recording says is not in it."""
+    """Number of lost messages as stated in a recording."""
 
     transport: int
-    """Messages that never reached the recorder, count."""
+    """Messages that did not arrive at the recorder."""
     recorder: int
-    """Messages that reached it and could not be written, count."""
+    """Messages that arrived and could not be written."""
     file: int = 0
-    """Messages that were in the file before it was damaged, and could not be recovered, count."""
+    """Messages of a damaged file that could not be recovered."""
 
 
 class Run:
-    """One recording; make it with `open_run`. Times of its rows are seconds from its first state (`time_s`)."""
+    """A loaded recording; create it with `open_run`. `time_s` gives the time of a row in s from the first state."""
 
     def __init__(self, file: RecordingFile) -> None:
         self.file = file
         self.path = file.path
         self.metadata: Mapping[str, Mapping[str, str]] = file.metadata
-        """As recorded: metadata records by name, then key; all are text."""
-        self.names = Names()
-        """Texts behind the codes in the arrays."""
+        """Recorded metadata texts by record name, then by key."""
+        self.names = StringTable()
+        """Texts of the codes in the arrays."""
         self.timebase = Timebase()
         first = next(iter(self.blocks(frozenset({"state"}), rows=1)), None)
         if first is None:
             raise InputError(
-                f"{self.path}: an empty recording: it holds no state of the arm "
+                f"{self.path}: empty recording: it contains no state of the arm "
                 f"({sum(file.counts.values())} other messages)"
             )
 
     @property
     def start_wall_ns(self) -> int:
-        """The first state on the wall clock, ns since 1970-01-01 UTC."""
+        """Wall-clock time of the first state, ns since 1970-01-01 UTC."""
         return self.timebase.start_wall_ns
 
-    # -- what it says of itself ------------------------------------------------------------------------------------
+    # -- metadata --------------------------------------------------------------------------------------------------
 
     @property
     def session(self) -> str:
-        """Id of the session; where the file does not say it, its name."""
-        return self._said("session", "session") or self.path.stem
+        """Id of the session; the file name without suffix if the id is not recorded."""
+        return self._metadata_text("session", "session") or self.path.stem
 
     @property
     def rig(self) -> str:
         """Name of the rig."""
-        return self._said("session", "rig") or "rig"
+        return self._metadata_text("session", "rig") or "rig"
 
     @property
     def lab(self) -> str:
-        """Name of the lab; empty: the file does not say it."""
-        return self._said("session", "lab")
+        """Name of the lab; empty: not recorded."""
+        return self._metadata_text("session", "lab")
 
     @property
     def controller(self) -> str:
-        """Address of the controller, "host:port"; empty: recorded by hand."""
-        return self._said("session", "controller")
+        """Address of the controller, "host:port"; empty: a manual recording."""
+        return self._metadata_text("session", "controller")
 
     @property
     def started(self) -> str:
-        """When the session began, UTC, as recorded; empty: the file does not say it."""
-        return self._said("session", "start")
+        """Start time of the session, UTC, as recorded; empty: not recorded."""
+        return self._metadata_text("session", "start")
 
     @property
     def ended(self) -> str:
-        """How the recording ended, and why; empty: the file does not say it."""
-        return ": ".join(filter(None, (self._said("summary", "ended"), self._said("summary", "reason"))))
+        """How the recording ended, and why; empty: not recorded."""
+        return ": ".join(
+            filter(None, (self._metadata_text("summary", "ended"), self._metadata_text("summary", "reason")))
+        )
 
     @cached_property
     def step_ns(self) -> int:
-        """Length of a step, ns: as configured, or where the file does not say it, as the states tell."""
-        said = self.number("config", "step_ns")
-        if said:
-            return said
+        """Duration of a simulation step, ns: as configured, or estimated from the states if not recorded."""
+        configured = self.number("config", "step_ns")
+        if configured:
+            return configured
         states = next(iter(self.blocks(frozenset({"state"}), rows=1000))).states
-        mine = states[states["incarnation"] == states["incarnation"][0]]
-        steps = int(mine["step"][-1]) - int(mine["step"][0])
+        first_run = states[states["incarnation"] == states["incarnation"][0]]
+        steps = int(first_run["step"][-1]) - int(first_run["step"][0])
         if not steps:
-            return _USUAL_STEP_NS
-        # Each tick is late by some microseconds; a step is a round number.
-        duration_ns = int(mine["sampled_ns"][-1]) - int(mine["sampled_ns"][0])
+            return _DEFAULT_STEP_NS
+        # Ticks are late by some microseconds; the configured duration is a round number.
+        duration_ns = int(first_run["sampled_ns"][-1]) - int(first_run["sampled_ns"][0])
         return max(round(duration_ns / steps / 100_000) * 100_000, 1)
 
     @property
     def parameters_json(self) -> str:
-        """The rig's parameters for `hilrig_sim.arm.model.RigParameters`; empty: the file does not say them."""
-        return self._said("config", "parameters_json")
+        """Parameters of the rig for `hilrig_sim.arm.model.RigParameters`; empty: not recorded."""
+        return self._metadata_text("config", "parameters_json")
 
     @property
     def urdf(self) -> str:
-        """The arm as URDF; empty: the recording has none."""
+        """The arm as URDF; empty: not recorded."""
         data = self.file.attachments.get(f"{self.rig}.urdf", b"")
         if not data:
             data = next((data for name, data in self.file.attachments.items() if name.endswith(".urdf")), b"")
-        return data.decode("utf-8", errors="replace") or self._said("config", "urdf")
+        return data.decode("utf-8", errors="replace") or self._metadata_text("config", "urdf")
 
     @property
     def losses(self) -> Losses | None:
-        """What the recorder counted as lost; None: the file does not say it."""
+        """Lost messages as counted by the recorder; None: not recorded."""
         transport, recorder = self.number("summary", "lost_transport"), self.number("summary", "lost_recorder")
         if transport is None or recorder is None:
             return None
-        held = self.number("summary", "messages") or 0
-        missing = max(0, held - sum(self.file.counts.values())) if self.damaged else 0
+        written = self.number("summary", "messages") or 0
+        missing = max(0, written - sum(self.file.counts.values())) if self.damaged else 0
         return Losses(transport, recorder, missing)
 
     @property
     def damaged(self) -> bool:
-        """Whether it was saved from damage in its middle, so that messages between others may be missing."""
-        not_whole = self.number("recovered", "damaged_bytes") or 0
-        return not_whole > (self.number("recovered", "torn_bytes") or 0) or bool(self.number("recovered", "orphans"))
+        """Whether the file was recovered from damage before its end, so that messages in between may be missing."""
+        damaged_bytes = self.number("recovered", "damaged_bytes") or 0
+        truncated_bytes = self.number("recovered", "torn_bytes") or 0
+        return damaged_bytes > truncated_bytes or bool(self.number("recovered", "orphans"))
 
     @property
     def recovered(self) -> bool:
-        """Whether the file was saved from a tear: its end may be missing."""
+        """Whether the file was recovered after a truncation: its end may be missing."""
         return "recovered" in self.ended or "hilrig.recovered" in self.metadata
 
     def number(self, record: str, key: str) -> int | None:
-        """A whole number out of the metadata record `hilrig.<record>`; None: it does not say one."""
+        """Integer value of the metadata record `hilrig.<record>`; None: not recorded."""
         try:
-            return int(self._said(record, key))
+            return int(self._metadata_text(record, key))
         except ValueError:
             return None
 
-    def _said(self, record: str, key: str) -> str:
+    def _metadata_text(self, record: str, key: str) -> str:
         return self.metadata.get(f"hilrig.{record}", {}).get(key, "")
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last as they arrived at the recorder, s."""
+        """Time from the arrival of the first message at the recorder to the last, s."""
         return (self.file.end_ns - self.file.start_ns) / 1e9
 
     # -- arrays ----------------------------------------------------------------------------------------------------
 
     @cached_property
     def states(self) -> Rows:
-        """Every state, shape (n,), fields as `columns.STATE`."""
-        return self._whole("state").states
+        """All states, shape (n,), fields as `columns.STATE_DTYPE`."""
+        return self._read_all("state").states
 
     @cached_property
     def parts(self) -> Rows:
-        """Where the parts are, shape (n,), fields as `columns.PART`."""
-        return self._whole("state").parts
+        """Poses of the parts, shape (n,), fields as `columns.PART_DTYPE`."""
+        return self._read_all("state").parts
 
     @cached_property
     def commands(self) -> Rows:
-        """Every command, shape (n,), fields as `columns.COMMAND`."""
-        return self._whole("command").commands
+        """All commands, shape (n,), fields as `columns.COMMAND_DTYPE`."""
+        return self._read_all("command").commands
 
     @cached_property
     def events(self) -> Rows:
-        """Every event, shape (n,), fields as `records.EVENT`."""
-        return self._whole("event").events
+        """All events, shape (n,), fields as `records.EVENT_DTYPE`."""
+        return self._read_all("event").events
 
     @cached_property
     def traffic(self) -> Rows:
-        """Every Modbus request, shape (n,), fields as `columns.TRAFFIC`."""
-        return self._whole("traffic").traffic
+        """All Modbus requests, shape (n,), fields as `columns.TRAFFIC_DTYPE`."""
+        return self._read_all("traffic").traffic
 
-    def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL) -> Records:
-        """What was sent in a range of the run's time, `until_s` excluded; only that part of the file is read."""
+    def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL_TOPICS) -> Records:
+        """Messages that were sent in a time range, `until_s` excluded; only that part of the file is read."""
         low, high = (self.start_wall_ns + round(limit * 1e9) for limit in (from_s, until_s))
-        pieces = list(self.blocks(topics, from_ns=low, until_ns=high + _SLACK_NS))
+        blocks = list(self.blocks(topics, from_ns=low, until_ns=high + _MAX_RECORDING_DELAY_NS))
 
-        def cut(rows: Rows) -> Rows:
+        def select(rows: Rows) -> Rows:
             return rows[(rows["wall_ns"] >= low) & (rows["wall_ns"] < high)]
 
-        whole = join_records(pieces)
-        return Records(*(cut(rows) for rows in whole.arrays))
+        return Records(*(select(rows) for rows in concatenate_records(blocks).arrays))
 
     def blocks(
         self,
-        topics: frozenset[str] = ALL,
+        topics: frozenset[str] = ALL_TOPICS,
         *,
         rows: int = BLOCK_ROWS,
         from_ns: int | None = None,
         until_ns: int | None = None,
     ) -> Iterator[Records]:
-        """The run in pieces of about `rows` messages, in the order of the file.
+        """Iterate over the run in blocks of about `rows` messages, in file order.
 
-        Messages of different senders are beside each other as they arrived: a state's command can be in the block
-        before or after it. `from_ns` and `until_ns` limit the time of arrival at the recorder, wall clock.
+        Messages of different senders are in their order of arrival, so the command of a state can be in the block
+        before or after it.
+
+        Args:
+            topics: names of the topics to read.
+            rows: messages per block.
+            from_ns: start of the range of arrival times at the recorder, wall clock; None: the beginning.
+            until_ns: end of the range, excluded; None: the end.
 
         Raises:
             InputError: the file is damaged.
@@ -220,30 +228,30 @@ class Run:
                 count += 1
                 if count >= rows:
                     count = 0
-                    yield decoder.take()
+                    yield decoder.drain()
         except DecodeError as error:
             raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
-            yield decoder.take()
+            yield decoder.drain()
 
-    def _whole(self, topic: str) -> Records:
-        return join_records(list(self.blocks(frozenset({topic}))))
+    def _read_all(self, topic: str) -> Records:
+        return concatenate_records(list(self.blocks(frozenset({topic}))))
 
     # -- time ------------------------------------------------------------------------------------------------------
 
     def time_s(self, rows: Rows) -> NDArray[np.float64]:
-        """When the rows were sent, shape as `rows`: seconds from the run's first state (`timebase`)."""
+        """Times at which the rows were sent, s from the first state of the run (see `timebase`), shape as `rows`."""
         return self.time_ns(rows) / 1e9
 
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
-        """As `time_s`, in whole ns."""
+        """Same as `time_s`, in integer ns."""
         return self.timebase.time_ns(rows)
 
 
 def open_run(path: Path | str) -> Run:
-    """Open a recording; its arrays are read when they are asked for.
+    """Open a recording; its arrays are read on first access.
 
     Raises:
-        InputError: there is no such file, it is no recording, it is empty, torn or damaged, or a newer hilrig wrote it.
+        InputError: the file is missing, not a recording, empty, truncated, damaged, or of a newer version.
     """
     return Run(open_recording(Path(path)))

@@ -1,4 +1,4 @@
-"""The time of a run: seconds from its first state, for rows that were stamped by different clocks."""
+"""Common time axis of a run: seconds from its first state, for rows with timestamps of different clocks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,22 +7,22 @@ from hilrig_replay.io.columns import Rows
 
 
 class Timebase:
-    """Places rows on one axis.
+    """Maps the timestamps of rows to one time axis.
 
-    States, and what is made of them, go by the simulation's monotonic clock; across a restart of the simulation, which
-    begins a new clock, the wall clock carries over. All else goes by the wall clock.
+    States, and rows derived from them, are placed by the monotonic clock of the simulation. A restart of the simulation
+    starts a new clock, which is aligned by the wall clock. All other rows are placed by the wall clock.
     """
 
     def __init__(self) -> None:
         self.start_wall_ns = 0
-        """The first state on the wall clock, ns since 1970-01-01 UTC; 0: none has come."""
+        """Wall-clock time of the first state, ns since 1970-01-01 UTC; 0: no state was added."""
         self.origin_ns = 0
-        """What counts as time zero, ns from the first state: moved to align runs with each other."""
+        """Time zero of the axis, ns from the first state; changed to align runs."""
         self._offsets: dict[int, int] = {}
         self._anchor: tuple[int, int] = (0, 0)
 
-    def note(self, states: Rows) -> None:
-        """Take in states, fields as `columns.STATE`, before their time is asked for."""
+    def update(self, states: Rows) -> None:
+        """Add states, fields as `columns.STATE_DTYPE`; required before their times are computed."""
         if not len(states):
             return
         if not self.start_wall_ns:
@@ -37,7 +37,7 @@ class Timebase:
         self._anchor = (int(states["wall_ns"][-1]), int(states["step"][-1]))
 
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
-        """When the rows were sent, shape as `rows`: ns from the run's first state."""
+        """Times at which the rows were sent, ns from the first state of the run, shape as `rows`."""
         names = rows.dtype.names or ()
         if "sampled_ns" not in names:
             return np.asarray(rows["wall_ns"] - self.start_wall_ns - self.origin_ns)
@@ -48,10 +48,10 @@ class Timebase:
         return np.asarray(times - self.origin_ns)
 
     def steps(self, rows: Rows, step_ns: int) -> NDArray[np.int64]:
-        """The simulation's step at the time of rows, shape as `rows`; where they don't say it, by the wall clock."""
+        """Simulation step of each row, shape as `rows`; estimated from the wall clock if a row has no step."""
         wall_ns, step = self._anchor
-        by_clock = np.maximum(step + (rows["wall_ns"] - wall_ns) // step_ns, 0)
+        estimated = np.maximum(step + (rows["wall_ns"] - wall_ns) // step_ns, 0)
         if "step" not in (rows.dtype.names or ()):
-            return np.asarray(by_clock)
-        said = rows["step"].astype(np.int64)
-        return np.asarray(np.where(said > 0, said, by_clock))
+            return np.asarray(estimated)
+        recorded = rows["step"].astype(np.int64)
+        return np.asarray(np.where(recorded > 0, recorded, estimated))

@@ -1,15 +1,15 @@
-"""The Modbus requests of a recording as rows, in the form that they have now and in the one of before."""
+"""Decodes the Modbus requests of a recording to rows, in the current message format and in the previous one."""
 
 import struct
 
 from google.protobuf.message import DecodeError
 
-from hilrig_replay.io.columns import Decode, Names, Table
+from hilrig_replay.io.columns import DecodeFunction, RowBuffer, StringTable
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
 
-def traffic_decoder(requests: Table, names: Names) -> Decode:
-    """A function that adds the requests of `ModbusTraffic` messages to a `columns.TRAFFIC` table."""
+def traffic_decoder(requests: RowBuffer, names: StringTable) -> DecodeFunction:
+    """Return a function that adds the requests of `ModbusTraffic` messages to a `columns.TRAFFIC_DTYPE` buffer."""
     message = ModbusTraffic()
     parse, add = message.ParseFromString, requests.append
 
@@ -26,7 +26,7 @@ def traffic_decoder(requests: Table, names: Names) -> Decode:
             for index, arrived_ns, after_ns in columns:
                 add(wall_from_monotonic + arrived_ns, arrived_ns, arrived_ns + after_ns, *kinds[index])
         except (ValueError, IndexError, struct.error) as error:
-            raise DecodeError(f"requests that do not fit together: {error}") from error
+            raise DecodeError(f"inconsistent request columns: {error}") from error
         for request in message.requests:
             arrived_ns = request.arrived_ns
             add(wall_from_monotonic + arrived_ns, arrived_ns, request.answered_ns, *fields(request))

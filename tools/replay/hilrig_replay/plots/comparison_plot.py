@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hilrig_replay.analysis.compare import Comparison
-from hilrig_replay.analysis.distribution import tail
+from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.summary import RunSummary
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
@@ -32,19 +32,19 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
     for joint in range(4):
         axes = figure.add_subplot(grid[joint, 0])
         for number, summary in enumerate(runs):
-            color, course = RUN_COLORS[number % len(RUN_COLORS)], summary.course
-            values = course.position[:, joint] * JOINT_SCALE[joint]
-            axes.plot(course.time_s, values, color=color, linewidth=1.1, label=summary.session)
+            color, trajectory = RUN_COLORS[number % len(RUN_COLORS)], summary.trajectory
+            values = trajectory.position[:, joint] * JOINT_SCALE[joint]
+            axes.plot(trajectory.time_s, values, color=color, linewidth=1.1, label=summary.session)
         unit = "mm" if joint == 2 else "°"
         label_axes(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")
     figure.axes[0].legend(fontsize=7, frameon=False)
     top, latency = figure.add_subplot(grid[:2, 1]), figure.add_subplot(grid[2:, 1])
     for number, summary in enumerate(runs):
-        course = summary.course
+        trajectory = summary.trajectory
         color = RUN_COLORS[number % len(RUN_COLORS)]
-        top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=color, linewidth=0.9)
+        top.plot(trajectory.tip[:, 0] * 1e3, trajectory.tip[:, 1] * 1e3, color=color, linewidth=0.9)
         if summary.latency.samples:
-            loop_ns, share = tail(summary.latency.table.column("loop"))
+            loop_ns, share = complementary_cdf(summary.latency.table.column("loop"))
             latency.step(loop_ns / 1e6, share, where="post", color=color, linewidth=1.2)
     top.set_aspect("equal", adjustable="datalim")
     label_axes(top, "Tool paths, top view", "x, mm", "y, mm")

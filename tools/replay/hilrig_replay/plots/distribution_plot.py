@@ -31,9 +31,9 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
         _bars(times, rows, [None if run.grade is None else run.grade.done_s for run in runs])
         label_axes(times, "Completion time, s", "", "")
     else:
-        _bars(goals, rows, [None if run.task is None else float(run.task.placed) for run in runs])
+        _bars(goals, rows, [None if run.placement is None else float(run.placement.placed) for run in runs])
         label_axes(goals, "Parts placed", "", "")
-        _bars(times, rows, [None if run.task is None else run.task.largest_error_mm for run in runs])
+        _bars(times, rows, [None if run.placement is None else run.placement.largest_error_mm for run in runs])
         label_axes(times, "Placement error, mm", "", "")
     _bars(work, rows, [run.motion.work_j for run in runs])
     label_axes(work, "Drive work, J", "", "")

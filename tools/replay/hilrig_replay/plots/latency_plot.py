@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hilrig_replay.analysis.distribution import tail
+from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.latency import LatencyReport
 from hilrig_replay.analysis.samples import STAGES
 from hilrig_replay.io.run import Run
@@ -122,7 +122,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
 
 
 def _tail(axes: Axes, report: LatencyReport) -> None:
-    loop_ns, share_above = tail(report.table.column("loop"))
+    loop_ns, share_above = complementary_cdf(report.table.column("loop"))
     axes.step(loop_ns / 1e6, share_above, where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
     set_log_scale(axes)
     axes.grid(color="#e5e5e5", linewidth=0.6)

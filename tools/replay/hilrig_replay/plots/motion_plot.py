@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from hilrig_replay.analysis.summary import Course
+from hilrig_replay.analysis.summary import Trajectory
 from hilrig_replay.geometry.scene import workspace_outline
 from hilrig_replay.plots.axes_style import label_axes
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
@@ -17,15 +17,17 @@ from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
 TASK_COLOR: Final = "#2e9e57"
 
 
-def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
+def motion_figure(trajectory: Trajectory, parameters: RigParameters, task: TaskConfig | None = None) -> Figure:
     """Figure of one run: positions, efforts, and the tool path with trays, task targets and the workspace outline."""
     figure = Figure(figsize=(11, 5), layout="constrained", dpi=110)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     position, effort = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
     for joint in range(4):
-        color, values = JOINT_COLORS[joint], course.position[:, joint] * JOINT_SCALE[joint]
-        position.plot(course.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
-        effort.plot(course.time_s, course.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint])
+        color, values = JOINT_COLORS[joint], trajectory.position[:, joint] * JOINT_SCALE[joint]
+        position.plot(trajectory.time_s, values, color=color, linewidth=1.2, label=JOINT_SYMBOLS[joint])
+        effort.plot(
+            trajectory.time_s, trajectory.effort[:, joint], color=color, linewidth=1.0, label=EFFORT_SYMBOLS[joint]
+        )
     label_axes(position, "Joint positions (θ in °, d3 in mm)", "", "")
     label_axes(effort, "Joint efforts (τ1, τ2, τ4 in N·m; τ3 in N)", "time since start, s", "")
     for axes in (position, effort):
@@ -33,7 +35,7 @@ def motion_figure(course: Course, parameters: RigParameters, task: TaskConfig | 
         axes.margins(x=0.01)
     top = figure.add_subplot(grid[:, 1])
     _draw_workspace(top, parameters, task)
-    top.plot(course.tip[:, 0] * 1e3, course.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
+    top.plot(trajectory.tip[:, 0] * 1e3, trajectory.tip[:, 1] * 1e3, color=RUN_COLORS[1], linewidth=0.9)
     label_axes(top, "Tool path, top view", "x, mm", "y, mm")
     return figure
 

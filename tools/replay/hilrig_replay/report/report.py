@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import Statistics
-from hilrig_replay.analysis.similarity import alike
-from hilrig_replay.analysis.summary import RunSummary, summarise
+from hilrig_replay.analysis.similarity import find_similar
+from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
-from hilrig_replay.grading.task_loading import task_of
-from hilrig_replay.io.paths import names_of
+from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
@@ -22,7 +22,7 @@ from hilrig_replay.plots.palette import EFFORT_SYMBOLS, STAGE_NAMES
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
-from hilrig_runtime.process.process_pool import all_cores
+from hilrig_runtime.process.process_pool import process_pool
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
 ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
@@ -135,7 +135,7 @@ def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
             if runs[one].session == runs[other].session
             else f"{int(100 * share)} % of the torques written by the controllers are identical"
         )
-        for one, other, share in alike([run.torques for run in runs])
+        for one, other, share in find_similar([run.torques for run in runs])
     )
 
 
@@ -164,12 +164,12 @@ def _pages(
     paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
 ) -> Iterator[_Page | InputError]:
     """Page of each run, or the reason why it is missing, in the order of `paths`."""
-    names = names_of(paths)
+    names = display_names(paths)
     tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
     if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
         yield from map(_page_or_error, *tasks)
     else:
-        with all_cores(len(paths), workers) as executor:
+        with process_pool(len(paths), workers) as executor:
             yield from executor.map(_page_or_error, *tasks)
 
 
@@ -181,11 +181,13 @@ def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | Non
 
 
 def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:
-    summary = summarise(run, task)
+    summary = summarize(run, task)
     parameters = parameters_of(run.parameters_json)
-    targets = task or task_of(run)
+    targets = task or recorded_task(run)
     figures = [
-        html_figure(motion_figure(summary.course, parameters, targets), "joint positions, joint efforts and tool path")
+        html_figure(
+            motion_figure(summary.trajectory, parameters, targets), "joint positions, joint efforts and tool path"
+        )
     ]
     if summary.latency.loop_ms is not None:
         figures.append(
@@ -227,10 +229,10 @@ def _facts(page: _Page) -> str:
     facts = [(f"{summary.duration_s:.1f} s", f"duration; {summary.ended or 'unknown ending'}")]
     if summary.grade is not None:
         facts.append((f"{summary.grade.percent} %", f"task: {summary.grade.headline()}"))
-    if summary.task is not None:
-        error = summary.task.largest_error_mm
+    if summary.placement is not None:
+        error = summary.placement.largest_error_mm
         within = "none placed" if error is None else f"largest error {error:.1f} mm"
-        facts.append((f"{summary.task.placed} of {len(summary.task.parts)}", f"parts placed; {within}"))
+        facts.append((f"{summary.placement.placed} of {len(summary.placement.parts)}", f"parts placed; {within}"))
     loop = summary.latency.loop_ms
     if loop is None:
         facts.append(("–", f"loop latency: {summary.latency.reasons[-1]}"))
@@ -334,7 +336,7 @@ def _grade_cells(summary: RunSummary) -> list[str]:
 
 
 def _placement_cells(summary: RunSummary) -> list[str]:
-    task = summary.task
+    task = summary.placement
     return ["–"] * 2 if task is None else [f"{task.placed} of {len(task.parts)}", _or_dash(task.largest_error_mm)]
 
 
@@ -343,7 +345,7 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 
 def _rank(page: _Page) -> tuple[float, ...]:
-    task, grade = page.summary.task, page.summary.grade
+    task, grade = page.summary.placement, page.summary.grade
     # Without a controller the tool path is the shortest, so that such a run comes last among equals.
     path_m = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:

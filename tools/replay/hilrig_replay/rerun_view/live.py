@@ -12,7 +12,7 @@ from typing import Final
 import rerun as rr
 from google.protobuf.message import DecodeError
 
-from hilrig_replay.io.columns import Names
+from hilrig_replay.io.columns import StringTable
 from hilrig_replay.io.records import Decoder
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
@@ -55,7 +55,7 @@ class Follower:
         self._log = log
         self._task = task
         self._pending: deque[tuple[str, bytes, int]] = deque(maxlen=_MAX_PENDING_MESSAGES)
-        self._names, self._timebase = Names(), Timebase()
+        self._names, self._timebase = StringTable(), Timebase()
         self._decoder = Decoder(self._names, self._timebase)
         self._view: RerunRigWriter | None = None
         self._incarnation = 0
@@ -98,7 +98,7 @@ class Follower:
                 self._decoder.add(topic, payload, 0, arrived_ns)
             except DecodeError:
                 self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
-        records = self._decoder.take()
+        records = self._decoder.drain()
         # Only states count: the edge keeps repeating its command after the simulation has stopped.
         if len(records.states):
             self._last_state_ns = now_ns
@@ -126,7 +126,7 @@ class Follower:
             self._view.update_geometry(geometry)
 
     def _query_geometry(self) -> RigGeometry | None:
-        for answer in self._bus.ask(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
+        for answer in self._bus.query(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
             if answer.payload and not answer.error:
                 config = CONFIG.decode(answer.payload)
                 return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)

@@ -17,11 +17,11 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
-from hilrig_replay.analysis.data_quality import behind_ns
-from hilrig_replay.analysis.request_rates import BIN_NS, MOST, OTHERS, Rate, RequestRates
-from hilrig_replay.analysis.samples import STAGES, Matcher, join_commands
+from hilrig_replay.analysis.data_quality import tick_lateness_ns
+from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
+from hilrig_replay.analysis.samples import STAGES, CommandMatcher, join_commands
 from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
-from hilrig_replay.io.columns import Names, Rows
+from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.plots.palette import (
@@ -86,7 +86,7 @@ class RerunRigWriter:
         stream: rr.RecordingStream,
         geometry: RigGeometry,
         timebase: Timebase,
-        names: Names,
+        names: StringTable,
         *,
         root: str = "",
         color: str | None = None,
@@ -97,7 +97,7 @@ class RerunRigWriter:
         self._names = names
         self._root = root
         self._color = color
-        self._matcher = Matcher()
+        self._matcher = CommandMatcher()
         self._current_states: dict[str, str] = {}
         self._torque_source = ""
         self._source_colors = {_SAFE: "#e45756", _NO_CONTROLLER: "#3a424c"}
@@ -238,7 +238,7 @@ class RerunRigWriter:
         self._scalars("position", times, q * JOINT_SCALE)
         self._scalars("velocity", times, states["velocity"] * JOINT_SCALE)
         self._scalars("effort/applied", times, states["effort"])
-        self._scalars("lateness", times, behind_ns(states, self._geometry.step_ns)[:, None] / 1e6)
+        self._scalars("lateness", times, tick_lateness_ns(states, self._geometry.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)
         self._add_state("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._add_state("part", states, self._names.texts(states["held_part"]))
@@ -341,10 +341,10 @@ class RerunRigWriter:
     def _assign_colors(self, sources: NDArray[np.object_]) -> None:
         """Assign a color to each source; those beyond the first `MOST` are merged, as in the request rates."""
         new = sorted(set(sources) - {""} - self._source_colors.keys())
-        room = max(MOST - len(self._source_colors), 0)
+        room = max(MAX_CLIENTS - len(self._source_colors), 0)
         if new[room:]:
-            sources[[source in new[room:] for source in sources]] = OTHERS
-            new = new[:room] if OTHERS in self._source_colors else [*new[:room], OTHERS]
+            sources[[source in new[room:] for source in sources]] = OTHER_CLIENTS
+            new = new[:room] if OTHER_CLIENTS in self._source_colors else [*new[:room], OTHER_CLIENTS]
         if new:
             for source in new:
                 self._source_colors[source] = RUN_COLORS[len(self._source_colors) % len(RUN_COLORS)]

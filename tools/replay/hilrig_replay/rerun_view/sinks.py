@@ -1,5 +1,7 @@
 """Rerun sinks: recording streams into a file or a viewer."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import rerun as rr
@@ -28,9 +30,28 @@ def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStre
     except OSError as error:
         raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
     stream = rr.RecordingStream(APPLICATION, recording_id=name)
-    stream.save(path, default_blueprint=blueprint)
+    with _reports_write_errors(path):
+        stream.save(path, default_blueprint=blueprint)
     stream.send_recording_name(name)
     return stream
+
+
+def flush_file(stream: rr.RecordingStream, path: Path) -> None:
+    """Write everything that was sent to a stream of `to_file`, and wait for it.
+
+    Raises:
+        OperationError: the file can't be written.
+    """
+    with _reports_write_errors(path):
+        stream.flush()
+
+
+@contextmanager
+def _reports_write_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        raise OperationError(f"{path}: can't be written: {error}") from error
 
 
 def to_viewer(grpc_port: int, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:

@@ -6,12 +6,12 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilrig_replay.grading.task_loading import task_of
+from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
 from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
-from hilrig_replay.rerun_view.sinks import to_file, to_viewer
+from hilrig_replay.rerun_view.sinks import flush_file, to_file, to_viewer
 from hilrig_runtime.errors import InputError
 
 
@@ -22,7 +22,7 @@ def geometry_of(run: Run) -> RigGeometry:
         InputError: the recording's URDF or parameters are invalid.
     """
     try:
-        return RigGeometry.of(run.urdf, run.parameters_json, run.step_ns, task_of(run))
+        return RigGeometry.of(run.urdf, run.parameters_json, run.step_ns, recorded_task(run))
     except InputError as error:
         raise InputError(f"{run.path}: {error}") from error
 
@@ -35,7 +35,7 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    _write(to_file(path, _name(chosen), _layout(chosen)), chosen)
+    _write(to_file(path, _name(chosen), _layout(chosen)), chosen, file=path)
 
 
 def send_runs(runs: Sequence[Run], grpc_port: int, is_closed: Callable[[], bool]) -> None:
@@ -66,7 +66,19 @@ def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
     return layout(root_names(runs))
 
 
-def _write(stream: rr.RecordingStream, runs: Sequence[Run], is_closed: Callable[[], bool] = lambda: False) -> None:
+def _write(
+    stream: rr.RecordingStream,
+    runs: Sequence[Run],
+    is_closed: Callable[[], bool] = lambda: False,
+    *,
+    file: Path | None = None,
+) -> None:
+    """Write runs block by block to a viewer, or to a file.
+
+    rerun encodes and writes on its own threads and holds every block that is not written yet. A file is flushed after
+    each block, so the memory depends neither on the length of the run nor on the scheduling of these threads. A viewer
+    is not flushed, because it may close at any time.
+    """
     with stream:
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
@@ -75,5 +87,7 @@ def _write(stream: rr.RecordingStream, runs: Sequence[Run], is_closed: Callable[
                 if is_closed():
                     return
                 view.add(block)
+                if file is not None:
+                    flush_file(stream, file)
             view.end()
     stream.disconnect()

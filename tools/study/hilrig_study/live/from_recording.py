@@ -29,13 +29,13 @@ from hilrig_study.theory.margins import linearize_law
 
 Ints = NDArray[np.int64]
 
-GAINS: Final = np.round(np.geomspace(0.1, 2.0, 14), 3)
+DEFAULT_GAINS: Final = np.round(np.geomspace(0.1, 2.0, 14), 3)
 """Gain factors evaluated by default, without a study file."""
-MAX_AGE_STEPS: Final = 12
+MAX_RECORDED_AGE_STEPS: Final = 12
 """Upper limit of the age, steps; larger ages are clipped, because they are rare stalls."""
 MAX_SPARE_STEPS: Final = 6
 """Largest additional delay that is tried, steps."""
-_STOP_CLEARANCE: Final = np.array([0.01, 0.01, 0.001, 0.01])
+_MIN_STOP_DISTANCE: Final = np.array([0.01, 0.01, 0.001, 0.01])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def recorded_ages(run: Run) -> list[Ints]:
             )
         last = np.maximum.accumulate(np.where(rows["basis_step"] != 0, np.arange(len(rows)), -1))[new[0] :]
         ages = steps[new[0] :] - rows["basis_step"][last].astype(np.int64)
-        sequences.append(np.clip(ages[: new[-1] - new[0] + 1], 1, MAX_AGE_STEPS))
+        sequences.append(np.clip(ages[: new[-1] - new[0] + 1], 1, MAX_RECORDED_AGE_STEPS))
     if not sequences:
         raise InputError(f"{run.path}: no loop latency: no command of a controller took effect in this session")
     return sequences
@@ -118,7 +118,9 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     chain = age_chain(sequences)
     rig = RigParameters.from_json(run.parameters_json)
     pose = np.clip(
-        np.median(run.states["position"], axis=0), rig.arm.lower + _STOP_CLEARANCE, rig.arm.upper - _STOP_CLEARANCE
+        np.median(run.states["position"], axis=0),
+        rig.arm.lower + _MIN_STOP_DISTANCE,
+        rig.arm.upper - _MIN_STOP_DISTANCE,
     )
     step_s = run.step_ns * 1e-9
     plant_model = linearize(rig.arm, pose.tolist())
@@ -151,8 +153,9 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
 def _gains(study: StudyConfig | None) -> NDArray[np.float64]:
     for axis in () if study is None else (study.x, study.y):
         if axis.what == "gain":
-            return axis.points if len(axis.points) <= len(GAINS) else axis.points[:: -(-len(axis.points) // len(GAINS))]
-    return GAINS
+            stride = max(1, -(-len(axis.points) // len(DEFAULT_GAINS)))
+            return axis.points[::stride]
+    return DEFAULT_GAINS
 
 
 def _law(

@@ -15,7 +15,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
 from hilrig_modbus_edge.registers import codec
-from hilrig_modbus_edge.registers import map as registers
+from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
 from hilrig_runtime.errors import OperationError
 from hilrig_study.controllers.control_laws import Controller, Measurement
 from hilrig_study.simulation.simulated_loop import Scenario
@@ -56,14 +56,14 @@ class RigClient:
 
     def position(self) -> tuple[float, float, float, float]:
         """Read the joint positions, registers 5-8; rad, rad, m, rad."""
-        values = self._request(lambda: self._client.read_holding_registers(registers.POSITION, count=4))
+        values = self._request(lambda: self._client.read_holding_registers(POSITION_ADDRESS, count=4))
         return codec.position_of(b"".join(value.to_bytes(2, "big") for value in values))
 
     def write(self, effort: list[float]) -> None:
         """Write the efforts, registers 1-4; N·m, N·m, N, N·m."""
         data, _ = codec.words_of_effort(effort)
         values = [int.from_bytes(data[at : at + 2], "big") for at in range(0, 8, 2)]
-        self._request(lambda: self._client.write_registers(registers.TORQUE, values))
+        self._request(lambda: self._client.write_registers(TORQUE_ADDRESS, values))
 
     def close(self) -> None:
         """Close the connection."""

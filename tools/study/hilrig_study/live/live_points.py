@@ -14,7 +14,14 @@ from typing import Any, Final
 import numpy as np
 
 from hilrig_replay.io.run import Run, open_run
-from hilrig_runtime.config.impairment import BernoulliLoss, ConstantDelay, NoLoss, UniformDelay, WayImpairment, Ways
+from hilrig_runtime.config.impairment import (
+    BernoulliLoss,
+    ConstantDelay,
+    LinkImpairment,
+    LinkImpairments,
+    NoLoss,
+    UniformDelay,
+)
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_study.live.live_loop import RigClient, drive, measure_tick_phase
@@ -66,13 +73,13 @@ def run_live_points(
     recordings = out / "recordings"
     shutil.rmtree(recordings, ignore_errors=True)
     for step_ms in sorted({float(cell["step_ms"][0]) for cell in cells}):
-        mine = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
+        indices = [index for index, cell in enumerate(cells) if cell["step_ms"][0] == step_ms]
         config = out / f"lab-{step_ms:g}ms.toml"
-        rigs = {f"point{i + 1}": _ways(study, cells[i]) for i in mine}
+        rigs = {f"point{i + 1}": _point_impairments(study, cells[i]) for i in indices}
         _write_lab(config, study, step_ms, rigs, recordings, find_ports)
         lab = load_lab(config)
         with start_lab(lab, config) as check_processes:
-            for index in mine:
+            for index in indices:
                 point, number = points[index]
                 report(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
                 run = _run_point(study, folder, lab, f"point{index + 1}", cells[index], check_processes)
@@ -85,29 +92,34 @@ def _point_values(point: PointConfig, controller: str, run: Run) -> dict[str, An
     return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
-def _ways(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> Ways:
+def _point_impairments(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
     """Return the link impairments of a point.
 
     Raises:
         InputError: the command link is impaired by the study and by the swept values.
     """
-    base = study.ways(int(cell["controller"][0]))
+    base = study.link_impairments(int(cell["controller"][0]))
     delay_ms, jitter_ms, loss = (float(cell[name][0]) for name in ("delay_ms", "jitter_ms", "loss"))
     if not (delay_ms or jitter_ms or loss):
         return base
-    if not base.command.does_nothing:
+    if not base.command.is_inactive:
         raise InputError(
             "live points: the command link is impaired by the study and by a swept value; use only one of them"
         )
     delay = (
         UniformDelay(low_ms=delay_ms, high_ms=delay_ms + jitter_ms) if jitter_ms else ConstantDelay(delay_ms=delay_ms)
     )
-    command = WayImpairment(delay=delay, loss=BernoulliLoss(rate=loss) if loss else NoLoss())
+    command = LinkImpairment(delay=delay, loss=BernoulliLoss(rate=loss) if loss else NoLoss())
     return base.model_copy(update={"command": command})
 
 
 def _write_lab(
-    config: Path, study: StudyConfig, step_ms: float, rigs: Mapping[str, Ways], recordings: Path, find_ports: FindPorts
+    config: Path,
+    study: StudyConfig,
+    step_ms: float,
+    rigs: Mapping[str, LinkImpairments],
+    recordings: Path,
+    find_ports: FindPorts,
 ) -> None:
     single_rig_lab = study.lab(step_ms)
     ports = find_ports(5020, len(rigs) + 1)
@@ -121,8 +133,8 @@ def _write_lab(
         f"scene = {_toml({'trays': [], 'parts': []})}",
     ]
     arm = _toml(single_rig_lab.rigs[0].arm.model_dump())
-    for name, ways in {CLOCK_RIG: Ways(), **rigs}.items():
-        impairment = {"seed": study.seed, **ways.model_dump()}
+    for name, links in {CLOCK_RIG: LinkImpairments(), **rigs}.items():
+        impairment = {"seed": study.seed, **links.model_dump()}
         lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {_toml(impairment)}"]
     try:
         config.write_text("\n".join(lines) + "\n", encoding="utf-8")

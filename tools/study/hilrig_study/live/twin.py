@@ -16,7 +16,7 @@ from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 from hilrig_study.study_config import StudyConfig
-from hilrig_study.sweep import CELL, run_cells, timelines
+from hilrig_study.sweep import CELL_DTYPE, run_cells, timelines
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
 
     Args:
         study: the study of the point.
-        cell: the point, (1,), fields as `CELL`.
+        cell: the point, (1,), fields as `CELL_DTYPE`.
         run: its recording.
         folder: folder of the study file.
 
@@ -113,7 +113,7 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     # No failure limit: a live run is not stopped when its error is large.
     task = study.task.model_copy(update={"limit": (1e6, 1e6, 1e9, 1e6)})
     twin_study = study.model_copy(update={"loop": loop, "task": task})
-    cells = np.zeros(TWIN_RUNS, CELL)
+    cells = np.zeros(TWIN_RUNS, CELL_DTYPE)
     cells[:] = cell[0]
     cells["run"] = np.arange(TWIN_RUNS)
     _, outcome = run_cells(twin_study, cells, folder, keep=True)

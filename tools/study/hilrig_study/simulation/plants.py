@@ -34,7 +34,7 @@ class ArmPlant:
         """Create `runs` arms of a rig at rest at `start`; finished runs are reset to `pose`."""
         self._plant = Plant([rig] * runs)
         for run in range(runs):
-            self._plant.place(run, tuple(start), (0.0, 0.0, 0.0, 0.0))
+            self._plant.set_state(run, tuple(start), (0.0, 0.0, 0.0, 0.0))
         self._pose = np.array(pose)[:, np.newaxis]
         self._magnet = np.zeros(runs, dtype=np.bool_)
         self.position = self._plant.position

@@ -18,7 +18,7 @@ from hilrig_runtime.errors import InputError
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-NEVER: Final = np.iinfo(np.int64).max
+LOST_NS: Final = np.iinfo(np.int64).max
 """Arrival time of a lost message, ns."""
 NO_POLL: Final = -1
 """Value of `in_force` before the first command acts."""
@@ -133,12 +133,12 @@ def timeline(
     poll_ns = timing.phase_ns + np.arange(polls, dtype=np.int64) * timing.period_ns
     arrived = poll_ns + timing.compute_ns + timing.transport_ns + command_delay_ns
     if state_lost is not None:
-        released = np.where(state_lost, NEVER, released)
+        released = np.where(state_lost, LOST_NS, released)
     if command_lost is not None:
-        arrived = np.where(command_lost, NEVER, arrived)
+        arrived = np.where(command_lost, LOST_NS, arrived)
     basis = _newest(released, poll_ns)
     # Before the first state has arrived, the controller writes no command.
-    arrived = np.where(basis < 0, NEVER, arrived)
+    arrived = np.where(basis < 0, LOST_NS, arrived)
     in_force = _newest(arrived, tick_ns)
     changed = np.diff(in_force, prepend=NO_POLL) != 0
     latency = np.zeros(ticks, dtype=np.int64)
@@ -156,6 +156,6 @@ def _newest(available_ns: Ints, query_ns: Ints) -> Ints:
     if not len(available_ns):
         return np.full(len(query_ns), -1, dtype=np.int64)
     order = np.argsort(available_ns, kind="stable")
-    newest = np.maximum.accumulate(np.where(available_ns[order] == NEVER, -1, order))
+    newest = np.maximum.accumulate(np.where(available_ns[order] == LOST_NS, -1, order))
     count = np.searchsorted(available_ns[order], query_ns, side="right")
     return np.where(count > 0, newest[np.maximum(count - 1, 0)], -1).astype(np.int64)

@@ -65,18 +65,18 @@ def age_chain(sequences: Sequence[Ints]) -> AgeChain:
     """
     # Ticks before the first command get distinct states, so that the length of this phase is reproduced.
     labels = [np.where(ages > 0, ages, -1 - np.arange(len(ages))) for ages in sequences]
-    known = np.unique(np.concatenate(labels)) if labels else np.empty(0, dtype=np.int64)
-    if not (known > 0).any():
+    states = np.unique(np.concatenate(labels)) if labels else np.empty(0, dtype=np.int64)
+    if not (states > 0).any():
         raise InputError("no loop latency: no command acts in any of the runs")
-    counts, start = np.zeros((len(known), len(known))), np.zeros(len(known))
+    counts, start = np.zeros((len(states), len(states))), np.zeros(len(states))
     for label in labels:
-        rows = np.searchsorted(known, label)
+        rows = np.searchsorted(states, label)
         np.add.at(counts, (rows[:-1], rows[1:]), 1.0)
         start[rows[0]] += 1.0
     total = counts.sum(axis=1, keepdims=True)
     # A state that occurs only at the end of a run becomes absorbing, so that each row sums to 1.
-    transition = np.where(total > 0, counts / np.maximum(total, 1.0), np.eye(len(known)))
-    return AgeChain(np.maximum(known, 0), transition, start / start.sum())
+    transition = np.where(total > 0, counts / np.maximum(total, 1.0), np.eye(len(states)))
+    return AgeChain(np.maximum(states, 0), transition, start / start.sum())
 
 
 def transition_matrices(phi: Floats, gamma: Floats, law: LinearLaw, max_age: int) -> list[Floats]:
@@ -127,8 +127,8 @@ def _growth(p: Floats, stacked: Floats) -> float:
     entries = stacked.size
 
     def shifted(moments: Floats) -> Floats:
-        moved = p @ (stacked @ moments.reshape(stacked.shape) @ transposed).reshape(count, -1)
-        return np.asarray(moved.ravel() + moments.ravel())
+        updated = p @ (stacked @ moments.reshape(stacked.shape) @ transposed).reshape(count, -1)
+        return np.asarray(updated.ravel() + moments.ravel())
 
     if entries <= ARNOLDI_SUBSPACE_SIZE:
         return float(np.linalg.eigvals(np.apply_along_axis(shifted, 0, np.eye(entries))).real.max()) - 1.0

@@ -24,7 +24,7 @@ Complex = NDArray[np.complex128]
 STABLE_RADIUS: Final = 1.0 - 1e-9
 """Spectral radius below which a loop is stable; the distance to 1 covers rounding of an integrator's pole."""
 _SETTLING_POLLS: Final = 200
-_FREQUENCIES: Final = 1000
+_FREQUENCY_POINTS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ def margins(phi: Floats, gamma: Floats, law: LinearLaw, timing: LoopTiming, late
     radius = spectral_radius(loop_matrix(phi, gamma, law, nominal, command_delay_ns=delay_ns))
     if radius >= STABLE_RADIUS:
         return Margins(False, radius, 0.0, math.nan, 0.0)
-    frequency = np.geomspace(1e-2, math.pi / step_s, _FREQUENCIES)
+    frequency = np.geomspace(1e-2, math.pi / step_s, _FREQUENCY_POINTS)
     loop = loop_transfer(phi, gamma, law, latency_steps, frequency)
     delay_s, crossover = _delay_margin(loop, frequency)
     closed = np.linalg.solve(np.eye(4) + loop, loop)

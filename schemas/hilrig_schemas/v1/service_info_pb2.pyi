@@ -6,7 +6,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
-class Roster(_message.Message):
+class ServiceInfo(_message.Message):
     __slots__ = ("service", "instance", "incarnation", "host", "software_version", "wall_ns", "rigs", "addresses")
     SERVICE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]

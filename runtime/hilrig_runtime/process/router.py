@@ -10,7 +10,7 @@ from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.shutdown import (
     CLOSE_TIMEOUT_S,
-    end_when_closing_hangs,
+    force_exit_after,
     stop_on_signals,
     stop_with_stdin,
     wait_for,
@@ -45,7 +45,7 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
     stop_on_signals(stopping)
     if stop_with_parent:
         stop_with_stdin(stopping)
-    end_when_closing_hangs(stopping, CLOSE_TIMEOUT_S)
+    force_exit_after(stopping, CLOSE_TIMEOUT_S)
     config = router_config(lab.bus, lab.name, endpoint)
     try:
         session = zenoh.open(config)

@@ -1,7 +1,7 @@
-"""The list of recordings in a folder: what each says of itself, kept in an index that makes ten thousand quick.
+"""Index of the recordings in a folder: caches the metadata of each, so listing ten thousand recordings is fast.
 
-A finished recording never changes, so what was read of it once holds as long as its size and time are the same. The
-index is a help and nothing more: it can be deleted at any time and is made again from the files.
+A finished recording never changes, so its entry is valid as long as size and modification time are the same. The index
+is only a cache: it can be deleted at any time and is rebuilt from the files.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ from hilrig_runtime.errors import HilrigError, InputError
 INDEX_NAME: Final = ".hilrig-index.json"
 INDEX_VERSION: Final = 3
 VERDICT_SUFFIX: Final = ".verified"
-"""What `hilrig verify` found stands beside a recording, in a file of the recording's name and this."""
-RECORDING: Final = "recording"
-"""How a recording that is being written "ended"."""
+"""Suffix of the file next to a recording with the result of `hilrig verify`."""
+IN_PROGRESS: Final = "recording"
+"""Value of `RunEntry.ended` for a recording that is being written."""
 
 _HEAD: Final = struct.Struct("<BQ")
 _FOOTER: Final = struct.Struct("<BQQQI")
@@ -41,48 +41,48 @@ _TAIL_BYTES: Final = 64 * 1024
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """What the list says of one recording."""
+    """Entry of the index for one recording."""
 
     path: str
-    """Relative to the folder that is listed."""
+    """Relative to the folder of the index."""
     size: int
-    """Bytes."""
+    """Size of the file, bytes."""
     mtime_ns: int
     rig: str = ""
     lab: str = ""
     session: str = ""
     part: int = 1
-    """Which file of its session it is, from 1."""
+    """Number of the segment in its session, from 1."""
     controller: str = ""
     start_wall_ns: int = 0
     """Arrival of the first message, ns since 1970-01-01 UTC."""
     duration_s: float = 0.0
     messages: int = 0
     ended: str = ""
-    """How it ended, one word or two; `recording`: it has not yet."""
+    """How the recording ended, as recorded; `recording`: it is being written."""
     reason: str = ""
     lost_transport: int = 0
     lost_recorder: int = 0
     lost_file: int = 0
-    """Messages that were in it before it was damaged."""
+    """Number of messages that were lost by damage of the file."""
     overruns: int = 0
     missed_steps: int = 0
     clock_steps: int = 0
     trouble: str = ""
-    """Why the file can't be used; empty: it can."""
+    """Error that makes the file unusable; empty: no error."""
     measured: bool = False
-    """Whether the four below were looked for."""
+    """Whether the next four fields were measured."""
     loop_p50_ms: float | None = None
     loop_p99_ms: float | None = None
     fit: bool | None = None
-    """Whether its latencies can be relied on."""
+    """Whether the recording is valid for latency measurements."""
     unfit_reasons: tuple[str, ...] = ()
     verified: bool | None = None
-    """Whether re-simulation gave the same states; None: nobody tried."""
+    """Whether the re-simulation reproduced the states; None: not verified."""
 
 
 class RunIndex:
-    """The recordings below a folder, newest first."""
+    """Index of the recordings in a folder and its subfolders, newest first."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -90,15 +90,15 @@ class RunIndex:
         self._changed = False
 
     def load(self, *, rebuild: bool = False) -> list[RunEntry]:
-        """Read what is new below the folder; with `rebuild` everything.
+        """Read new and changed recordings; with `rebuild` all recordings.
 
         Raises:
             InputError: there is no such folder.
         """
         if not self.folder.is_dir():
-            what = "a file, where a folder of recordings was expected" if self.folder.exists() else "no such folder"
-            raise InputError(f"{self.folder}: {what}")
-        # What was read before holds also where the folder can't be written.
+            defect = "expected a folder of recordings, found a file" if self.folder.exists() else "no such folder"
+            raise InputError(f"{self.folder}: {defect}")
+        # Entries in memory are reused, so that a folder without write permission is not read again each time.
         known = {} if rebuild else self._known or self._read()
         self._changed = rebuild
         self._known = {}
@@ -113,12 +113,12 @@ class RunIndex:
         return sorted(entries, key=lambda entry: (entry.start_wall_ns, entry.path), reverse=True)
 
     def measure(self, entries: list[RunEntry], on_progress: Callable[[int], None] | None = None) -> list[RunEntry]:
-        """The same entries with the loop's latency, read from the recordings where it was not looked for before."""
+        """Add the loop latency to the entries; it is measured from recordings that were not measured before."""
         measured = []
         for done, entry in enumerate(entries):
             if on_progress is not None:
                 on_progress(done)
-            if not entry.measured and not entry.trouble and entry.ended != RECORDING:
+            if not entry.measured and not entry.trouble and entry.ended != IN_PROGRESS:
                 found = measure_entry(self.folder, entry)
                 self._known[entry.path] = replace(found, verified=None)
                 self._changed = True
@@ -128,19 +128,19 @@ class RunIndex:
         return measured
 
     def save(self) -> None:
-        """Keep what was read, if it changed; a folder that can't be written is read again next time."""
+        """Write the index if it changed; ignores a folder without write permission."""
         if not self._changed:
             return
         names = [field.name for field in fields(RunEntry)]
-        rows = [list(asdict(entry).values()) for entry in self._known.values() if entry.ended != RECORDING]
+        rows = [list(asdict(entry).values()) for entry in self._known.values() if entry.ended != IN_PROGRESS]
         path = self.folder / INDEX_NAME
-        draft = path.with_name(f"{INDEX_NAME}.{os.getpid()}")
+        temporary = path.with_name(f"{INDEX_NAME}.{os.getpid()}")
         with contextlib.suppress(OSError):
             try:
-                draft.write_text(json.dumps({"version": INDEX_VERSION, "fields": names, "runs": rows}))
-                draft.replace(path)
+                temporary.write_text(json.dumps({"version": INDEX_VERSION, "fields": names, "runs": rows}))
+                temporary.replace(path)
             finally:
-                draft.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
 
     def _read(self) -> dict[str, RunEntry]:
         try:
@@ -155,35 +155,35 @@ class RunIndex:
                 known[row[0]] = RunEntry(*row)
             return known
         except (OSError, ValueError, KeyError, TypeError, IndexError):
-            # Damaged, or of another version: it is made again.
+            # Damaged, or of another version: the index is rebuilt.
             return {}
 
 
 def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
-    """What a file says of itself; what is wrong with it stands in `trouble`."""
+    """Entry of a file from its metadata; a defect of the file is reported in `trouble`."""
     blank = RunEntry(relative, info.st_size, info.st_mtime_ns, rig=Path(relative).parent.name)
     path = folder / relative
     try:
         with path.open("rb") as stream:
             if relative.endswith(UNFINISHED_SUFFIX):
-                return _part_entry(blank, stream)
+                return _unfinished_entry(blank, stream)
             return _finished_entry(blank, stream, info.st_size)
     except OSError as error:
         return replace(blank, trouble=f"can't be read: {error.strerror}")
     except _UnusableError as error:
         return replace(blank, trouble=str(error))
     except (McapError, struct.error, ValueError, KeyError, IndexError) as error:
-        return replace(blank, trouble=f"damaged: {error or type(error).__name__}; try `hilrig recover`")
+        return replace(blank, trouble=f"damaged ({error or type(error).__name__}): run `hilrig recover`")
 
 
 def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
-    """An entry with the latency of its loop, read from its recording; what damage that finds stands in `trouble`."""
+    """Add the loop latency of a recording to its entry; damage of the file is reported in `trouble`."""
     path = folder / entry.path
     try:
         report = measure(open_run(path))
     except HilrigError as error:
-        # Whole, and yet without a figure: how it ended says more than that it can't be measured.
-        trouble = error.said if isinstance(error, DamagedRecordingError) else ""
+        # `trouble` is for damaged files only: for others, the list shows how the recording ended.
+        trouble = error.description if isinstance(error, DamagedRecordingError) else ""
         return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), trouble=trouble)
     loop = report.loop_ms
     return replace(
@@ -197,17 +197,17 @@ def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
 
 
 def write_verdict(path: Path, verified: bool, detail: str = "") -> None:
-    """Note beside a recording whether re-simulation gave the same states.
+    """Write the result of a verification to a file next to the recording.
 
     Raises:
-        OSError: the folder can't be written.
+        OSError: the file can't be written.
     """
     verdict = {"verified": verified, "size": path.stat().st_size, "detail": detail}
     path.with_name(path.name + VERDICT_SUFFIX).write_text(json.dumps(verdict) + "\n")
 
 
 def read_verdict(path: Path) -> bool | None:
-    """What is noted beside a recording; None: nothing, or it was about another file of that name."""
+    """Result of the last verification of a recording; None: no result, or a result of another file of this name."""
     try:
         verdict = json.loads(path.with_name(path.name + VERDICT_SUFFIX).read_text())
         return bool(verdict["verified"]) if verdict["size"] == path.stat().st_size else None
@@ -216,7 +216,7 @@ def read_verdict(path: Path) -> bool | None:
 
 
 class _UnusableError(Exception):
-    pass
+    """A file that can't be used as a recording; the text is the defect."""
 
 
 def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
@@ -235,64 +235,64 @@ def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
                 elif item.name.endswith((MCAP_SUFFIX, UNFINISHED_SUFFIX)):
                     yield relative, item.stat()
             except OSError:
-                # Renamed or deleted since it was listed.
+                # Renamed or deleted after the folder was listed.
                 continue
 
 
 def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
     magic = len(MCAP0_MAGIC)
     if size == 0:
-        raise _UnusableError("empty")
+        raise _UnusableError("the file is empty")
     if stream.read(magic) != MCAP0_MAGIC:
-        raise _UnusableError("no MCAP file")
+        raise _UnusableError("not an MCAP file (bad magic)")
     tail_size = min(size, _TAIL_BYTES)
     stream.seek(size - tail_size)
     tail = stream.read(tail_size)
     footer_size = _FOOTER.size
     if tail[-magic:] != MCAP0_MAGIC or len(tail) < magic + footer_size:
-        raise _UnusableError("torn: it has no end; `hilrig recover` makes a whole file of it")
+        raise _UnusableError("truncated (no footer): run `hilrig recover` to complete it")
     opcode, _, summary_start, _, checksum = _FOOTER.unpack_from(tail, len(tail) - magic - footer_size)
     if opcode != Opcode.FOOTER.value or not 0 < summary_start < size:
-        raise _UnusableError("it has no index; `hilrig recover` makes one")
+        raise _UnusableError("no summary section: run `hilrig recover` to add it")
     if summary_start < size - tail_size:
         stream.seek(summary_start)
         summary = stream.read(size - summary_start)
     else:
         summary = tail[summary_start - size :]
     if checksum not in (0, zlib.crc32(summary[: -magic - 4])):
-        raise _UnusableError("damaged: the checksum of its index does not hold; try `hilrig recover`")
+        raise _UnusableError("damaged (bad checksum of the summary section): run `hilrig recover`")
     statistics: Statistics | None = None
-    places: dict[str, MetadataIndex] = {}
+    metadata_index: dict[str, MetadataIndex] = {}
     for opcode, content in _records(summary[: -magic - footer_size]):
         if opcode == Opcode.STATISTICS.value:
             statistics = Statistics.read(ReadDataStream(BytesIO(content)))
         elif opcode == Opcode.METADATA_INDEX.value:
-            place = MetadataIndex.read(ReadDataStream(BytesIO(content)))
-            places[place.name] = place
+            position = MetadataIndex.read(ReadDataStream(BytesIO(content)))
+            metadata_index[position.name] = position
     if statistics is None:
-        raise _UnusableError("it has no statistics; `hilrig recover` makes them")
-    session, summing_up = (_metadata(stream, places.get(name)) for name in ("hilrig.session", "hilrig.summary"))
-    held = int(summing_up.get("messages", 0)) if "hilrig.recovered" in places else 0
-    entry = _described(blank, session)
+        raise _UnusableError("no statistics record: run `hilrig recover` to add it")
+    session, trailer = (_metadata(stream, metadata_index.get(name)) for name in ("hilrig.session", "hilrig.summary"))
+    written = int(trailer.get("messages", 0)) if "hilrig.recovered" in metadata_index else 0
+    entry = _with_session(blank, session)
     return replace(
         entry,
         start_wall_ns=statistics.message_start_time or entry.start_wall_ns,
         duration_s=(statistics.message_end_time - statistics.message_start_time) / 1e9,
         messages=statistics.message_count,
-        ended=summing_up.get("ended", ""),
-        reason=summing_up.get("reason", ""),
-        lost_transport=int(summing_up.get("lost_transport", 0)),
-        lost_recorder=int(summing_up.get("lost_recorder", 0)),
-        lost_file=max(0, held - statistics.message_count),
-        overruns=int(summing_up.get("overruns", 0)),
-        missed_steps=int(summing_up.get("missed_steps", 0)),
-        clock_steps=int(summing_up.get("clock_steps", 0)),
-        trouble="" if session else "no recording of hilrig",
+        ended=trailer.get("ended", ""),
+        reason=trailer.get("reason", ""),
+        lost_transport=int(trailer.get("lost_transport", 0)),
+        lost_recorder=int(trailer.get("lost_recorder", 0)),
+        lost_file=max(0, written - statistics.message_count),
+        overruns=int(trailer.get("overruns", 0)),
+        missed_steps=int(trailer.get("missed_steps", 0)),
+        clock_steps=int(trailer.get("clock_steps", 0)),
+        trouble="" if session else "not a hilrig recording",
     )
 
 
-def _part_entry(blank: RunEntry, stream: IO[bytes]) -> RunEntry:
-    """A file that is being written, or was left by a recorder that was killed: its beginning tells whose it is."""
+def _unfinished_entry(blank: RunEntry, stream: IO[bytes]) -> RunEntry:
+    """Entry of a file that is being written, or whose recorder was killed: from the session metadata at its start."""
     head = stream.read(_TAIL_BYTES)
     session: dict[str, str] = {}
     for opcode, content in _records(head[len(MCAP0_MAGIC) :]):
@@ -301,10 +301,10 @@ def _part_entry(blank: RunEntry, stream: IO[bytes]) -> RunEntry:
             if metadata.name == "hilrig.session":
                 session = metadata.metadata
                 break
-    return replace(_described(blank, session), ended=RECORDING, reason="it is being written, or waits to be recovered")
+    return replace(_with_session(blank, session), ended=IN_PROGRESS, reason="being written, or not yet recovered")
 
 
-def _described(blank: RunEntry, session: dict[str, str]) -> RunEntry:
+def _with_session(blank: RunEntry, session: dict[str, str]) -> RunEntry:
     return replace(
         blank,
         rig=session.get("rig", blank.rig),
@@ -323,14 +323,14 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         at += _HEAD.size
         if at + length > len(data):
             return
-        # A long recording's index is mostly chunks, which are of no interest here.
+        # Skipped, because chunk indexes are most of the summary section of a long recording and are not used here.
         if opcode != Opcode.CHUNK_INDEX.value:
             yield opcode, data[at : at + length]
         at += length
 
 
-def _metadata(stream: IO[bytes], place: MetadataIndex | None) -> dict[str, Any]:
-    if place is None:
+def _metadata(stream: IO[bytes], position: MetadataIndex | None) -> dict[str, Any]:
+    if position is None:
         return {}
-    stream.seek(place.offset + _HEAD.size)
-    return dict(Metadata.read(ReadDataStream(BytesIO(stream.read(place.length - _HEAD.size)))).metadata)
+    stream.seek(position.offset + _HEAD.size)
+    return dict(Metadata.read(ReadDataStream(BytesIO(stream.read(position.length - _HEAD.size)))).metadata)

@@ -1,0 +1,179 @@
+"""One Modbus TCP connection: receives requests, executes them in order, and sends the responses.
+
+pymodbus's own server answers only the first of several requests in one segment and has no limits, so the bytes are
+handled here. A connection executes a limited number of requests per turn of the event loop. While a client does not
+read its responses, no further requests are read from it.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from pymodbus.constants import ExcCodes
+
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Request, decode_frames
+from hilrig_modbus_edge.protocol.pdu import exception_response, execute
+from hilrig_modbus_edge.registers.map import UNIT_IDS
+from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_runtime.counters import Counters
+
+BUFFER_BYTES: Final = 2048
+"""Size of the receive buffer: several of the longest requests, and few enough for a short turn."""
+MAX_REQUESTS_PER_TURN: Final = 16
+"""Requests of one connection per turn of the event loop; also the TCP guide's limit of transactions."""
+_PDU: Final = HEADER.size
+"""Offset of the PDU in a frame, bytes."""
+_TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
+
+_pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
+
+
+class ConnectionOwner(Protocol):
+    """The server of a connection, as far as the connection uses it."""
+
+    device: Device
+    counters: Counters
+    request_log: RequestLog
+    monotonic_ns: Callable[[], int]
+    connections: "set[Connection]"
+
+    def report_malformed(self, client: Client, defect: str) -> None:
+        """Count and log a connection that is closed because of its malformed data."""
+
+
+class Connection(asyncio.BufferedProtocol):
+    """Protocol object of one client's connection."""
+
+    def __init__(self, server: ConnectionOwner, transport: asyncio.Transport, client: Client) -> None:
+        self.client = client
+        self._server = server
+        self._transport = transport
+        self._device = server.device
+        self._monotonic_ns = server.monotonic_ns
+        self._log_request = server.request_log.record
+        self._counters = server.counters
+        self._buffer = bytearray(BUFFER_BYTES)
+        self._view = memoryview(self._buffer)
+        self._filled = 0
+        self._backlog: list[Request] = []
+        self._arrived_ns = 0
+        self._malformed = ""
+        self._blocked = False
+        self._reason = ""
+
+    # -- called by asyncio
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """See `asyncio.BaseProtocol`."""
+        if self not in self._server.connections:
+            return
+        self._server.connections.remove(self)
+        self._server.counters.connections -= 1
+        cause = f"connection lost: {exc}" if exc else "connection closed by the client"
+        self._device.disconnect(self.client, self._reason or cause)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
+        """See `asyncio.BufferedProtocol`."""
+        return self._view[self._filled :] if self._filled else self._view
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """See `asyncio.BufferedProtocol`."""
+        now_ns = self._monotonic_ns()
+        if MIN_FRAME <= nbytes <= MAX_FRAME and not self._filled and not self._backlog:
+            # Fast path for the most common case, exactly one request; same result as the general path below.
+            transaction, protocol, length, unit = _unpack_header(self._buffer)
+            if nbytes == 6 + length and not protocol:
+                self.client.record_request(now_ns)
+                pdu = self._view[_PDU:nbytes].tobytes()
+                self._transport.write(self._reply(transaction, unit, pdu, now_ns))
+                return
+        if self._transport.is_closing():
+            # asyncio's TLS transport still delivers data that was already received.
+            return
+        filled = self._filled + nbytes
+        requests, used, malformed = decode_frames(self._buffer[:filled])
+        self._filled = filled - used
+        if self._filled:
+            self._buffer[: self._filled] = self._buffer[used:filled]
+        if requests:
+            self.client.record_request(now_ns)
+        if len(requests) <= MAX_REQUESTS_PER_TURN and not self._backlog:
+            self._answer(requests, now_ns)
+            if malformed:
+                self._close_malformed(malformed)
+            return
+        is_draining = bool(self._backlog)
+        self._backlog += requests
+        self._arrived_ns = now_ns
+        self._malformed = malformed
+        self._transport.pause_reading()
+        if not is_draining:
+            self._drain_backlog()
+
+    def pause_writing(self) -> None:
+        """See `asyncio.BaseProtocol`."""
+        self._blocked = True
+        self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """See `asyncio.BaseProtocol`."""
+        self._blocked = False
+        self._drain_backlog()
+
+    # -- called by the server
+
+    def feed(self, data: bytes) -> None:
+        """Process data that was received before the connection was attached."""
+        while data and not self._transport.is_closing():
+            room = self.get_buffer(-1)
+            count = min(len(room), len(data))
+            room[:count] = data[:count]
+            self.buffer_updated(count)
+            data = data[count:]
+
+    def close(self, reason: str) -> None:
+        """Close the connection; `reason` is reported."""
+        self._reason = reason
+        self._transport.abort()
+
+    # -- inside
+
+    def _drain_backlog(self) -> None:
+        """Execute the next requests of the backlog; resume reading when it is empty."""
+        if self._blocked or self._transport.is_closing():
+            return
+        if not self._backlog:
+            self._transport.resume_reading()
+            return
+        turn, self._backlog = self._backlog[:MAX_REQUESTS_PER_TURN], self._backlog[MAX_REQUESTS_PER_TURN:]
+        self._answer(turn, self._arrived_ns)
+        if not self._backlog and self._malformed:
+            self._close_malformed(self._malformed)
+        else:
+            asyncio.get_running_loop().call_soon(self._drain_backlog)
+
+    def _answer(self, requests: list[Request], arrived_ns: int) -> None:
+        if requests:
+            self._transport.write(b"".join([self._reply(*request, arrived_ns) for request in requests]))
+
+    def _reply(self, transaction: int, unit: int, pdu: bytes, arrived_ns: int) -> bytes:
+        client = self.client
+        if unit in UNIT_IDS:
+            reply = execute(self._device, client, pdu, arrived_ns)
+        else:
+            reply = exception_response(pdu[0], _TARGET_SILENT)
+        code = reply[1] if reply[0] & 0x80 else 0
+        self._log_request(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
+        self._counters.requests += 1
+        return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
+
+    def _close_malformed(self, defect: str) -> None:
+        self._server.report_malformed(self.client, defect)
+        self._reason = f"not Modbus TCP: {defect}"
+        # Not aborted: the responses to the valid requests before are sent first.
+        self._transport.close()
+
+
+assert BUFFER_BYTES > MAX_FRAME
