@@ -1,9 +1,8 @@
 """The one registry of topics: key on the bus, message type, kind of traffic, channel in a recording.
 
-No key string stands anywhere else. A key is `hil/<lab>/<rig>/<name>` for what concerns a rig and
-`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; their names, as `log` and
-`health`, are therefore no names for a rig. Nor are the services' own: an event that concerns one of
-them as a whole stands in the rig's place.
+No other module contains key strings. A key is `hil/<lab>/<rig>/<name>` for the topics of a rig and
+`hil/<lab>/<name>/<service>/<instance>` for those of a service. So names of service topics, such as `log` and `health`,
+are not valid rig names, nor are the names of services: an event of a whole service has its name in place of a rig's.
 """
 
 import re
@@ -32,25 +31,25 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 ROOT: Final = "hil"
 NAME_PATTERN: Final = r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}"
-"""What a lab, a rig and an instance may be called: it is a part of a key and of a file name."""
+"""Pattern of the names of labs, rigs and instances, which are parts of keys and file names."""
 
 
 class Traffic(Enum):
-    """How a topic travels: what may be lost, and what must not wait."""
+    """Kind of traffic of a topic: its reliability and priority."""
 
     CONTROL = "control"
-    """Early rather than complete: newest value wins, dropped rather than queued, highest priority."""
+    """Early rather than complete: the newest value wins, dropped rather than queued, highest priority."""
     RECORDING = "recording"
     """Complete rather than early: cached by its publisher, recovered by its subscriber."""
     REPORT = "report"
-    """For people: lowest priority, dropped under load."""
+    """Monitoring: lowest priority, dropped under load."""
     QUERY = "query"
-    """Asked for, not published."""
+    """Replies to queries, not published."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic(Generic[MessageT]):
-    """What is known of one topic; `MessageT` is the protobuf type of its messages."""
+    """One topic; `MessageT` is the protobuf type of its messages."""
 
     name: str
     message: type[MessageT]
@@ -62,7 +61,7 @@ class Topic(Generic[MessageT]):
         """Decode one message.
 
         Raises:
-            google.protobuf.message.DecodeError: the bytes are no such message.
+            google.protobuf.message.DecodeError: the bytes are not a message of this type.
         """
         return self.message.FromString(payload)
 
@@ -95,13 +94,13 @@ IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
-"""What a person asks of a service: sessions by hand of the recorder, rigs more or fewer of simulation and edge."""
+"""Requests to a service: manual sessions (recorder), adding and removing rigs (simulation and edge)."""
 SERVICE_INFO: Final = ServiceTopic("service_info", ServiceInfo, Traffic.QUERY)
-"""Who runs, where, and for which rigs."""
+"""Identity, host and rigs of a running service."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
-"""The states of a tick together, for the edges; a watcher of one rig takes that rig's `STATE`."""
+"""The states of a tick in one batch, for the edges; observers of one rig subscribe to its `STATE`."""
 COMMANDS: Final = ServiceTopic("commands", RigBatch, Traffic.CONTROL)
-"""Commands as they leave an edge, for the simulation; a watcher of one rig takes that rig's `COMMAND`."""
+"""Commands of an edge in batches, for the simulation; observers of one rig subscribe to its `COMMAND`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
 SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, SERVICE_INFO, STATES, COMMANDS)  # type: ignore[assignment]
@@ -109,9 +108,9 @@ RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in 
 
 ALIVE: Final = "alive"
 RESERVED_RIG_NAMES: Final = frozenset({topic.name for topic in SERVICE_TOPICS} | {ALIVE})
-"""What stands in a rig's place in the keys of services."""
+"""Names in place of a rig's name in the keys of services."""
 SERVICES: Final = ("sim", "edge", "recorder")
-"""What a lab is made of; see `Service.emit` for the keys that have one in a rig's place."""
+"""The services of a lab; see `Service.emit` for keys with a service in place of a rig."""
 
 
 def alive_key(lab: str, service: str, instance: str) -> str:
@@ -120,7 +119,7 @@ def alive_key(lab: str, service: str, instance: str) -> str:
 
 
 def source_of_alive_key(key: str) -> str:
-    """Whose liveliness token it is, "<service>/<instance>"."""
+    """Source of a liveliness token, "<service>/<instance>"."""
     return "/".join(key.split("/")[-2:])
 
 
@@ -144,18 +143,18 @@ _NAME: Final = re.compile(NAME_PATTERN)
 
 
 def parse_rig_key(key: str) -> RigKey:
-    """Take a rig topic's key apart.
+    """Split a rig topic's key into its parts.
 
     Raises:
-        ValueError: it is no key of a rig topic.
+        ValueError: the key is not a rig topic's.
     """
     parts = key.split("/")
     if len(parts) == 4 and parts[0] == ROOT and parts[3] in _RIG_TOPIC_BY_NAME and parts[2] not in RESERVED_RIG_NAMES:
         return RigKey(parts[1], parts[2], _RIG_TOPIC_BY_NAME[parts[3]])
     names = ", ".join(_RIG_TOPIC_BY_NAME)
-    raise ValueError(f"{key!r} is no key of a rig: expected {ROOT}/<lab>/<rig>/<one of {names}>")
+    raise ValueError(f"{key!r} is not a rig key: expected {ROOT}/<lab>/<rig>/<one of {names}>")
 
 
 def is_name(text: str) -> bool:
-    """Whether a lab, a rig or an instance may be called so."""
+    """Whether `text` is a valid name of a lab, rig or instance."""
     return _NAME.fullmatch(text) is not None

@@ -1,7 +1,7 @@
-"""A recording of an earlier version, as its recorder wrote it, says today what it said then.
+"""Compatibility with old recordings: a file of an earlier version gives the same results as when it was recorded.
 
-`before-columns-of-requests.mcap`: two seconds of a controller, with one record a Modbus request. It has been read when
-it was made; these figures are of then.
+`before-columns-of-requests.mcap`: two seconds with a controller, one record per Modbus request. The expected values are
+those of the version that recorded it.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from support.labs import hilrig
 OLD = Path(__file__).parents[1] / "data/before-columns-of-requests.mcap"
 
 
-def test_all_of_its_messages_are_read() -> None:
+def test_reads_all_messages() -> None:
     run = open_run(OLD)
     assert (len(run.states), len(run.commands), len(run.events), len(run.traffic)) == (370, 97, 5, 190)
     assert set(run.traffic["function"]) == {3, 16}
@@ -26,7 +26,7 @@ def test_all_of_its_messages_are_read() -> None:
     assert run.names[int(run.traffic["controller"][0])] == run.controller
 
 
-def test_its_latencies_are_those_of_then() -> None:
+def test_measures_the_same_latencies() -> None:
     report = measure(open_run(OLD))
     assert report.samples == 94
     assert report.loop_ms is not None
@@ -35,13 +35,13 @@ def test_its_latencies_are_those_of_then() -> None:
     assert report.reasons == ("only 94 samples: 500 are required for a 99th percentile",)
 
 
-def test_its_steps_are_simulated_again() -> None:
+def test_verifies_the_steps() -> None:
     verification = verify(OLD)
     assert verification.same
     assert (verification.steps, verification.gaps) == (357, 0)
 
 
-def test_it_is_whole_and_every_table_of_it_can_be_exported(tmp_path: Path) -> None:
+def test_is_complete_and_exports_all_tables(tmp_path: Path) -> None:
     assert recover(OLD, tmp_path / "new.mcap").path is None
     exported = hilrig("export", OLD, "--csv", tmp_path / "tables", "--foxglove", tmp_path / "drawn.mcap")
     assert exported.returncode == 0, exported.stderr

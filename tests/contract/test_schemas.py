@@ -72,8 +72,8 @@ def test_every_topics_messages_survive_the_wire(topic: topics.Topic) -> None:  #
 @pytest.mark.parametrize(
     "key", ["hil/lab/rig1/none", "hil/lab/log/sim/1", "other/lab/rig1/state", "hil/lab/health/state", ""]
 )
-def test_what_is_no_rigs_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match="is no key of a rig"):
+def test_invalid_rig_key_is_refused(key: str) -> None:
+    with pytest.raises(ValueError, match="is not a rig key"):
         topics.parse_rig_key(key)
 
 

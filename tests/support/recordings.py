@@ -1,7 +1,7 @@
-"""Recordings with known content: a rig and a controller in virtual time, written with the stock MCAP writer.
+"""Recordings with known content: a scripted rig and controller in simulated time, written with the stock MCAP writer.
 
-The simulation ticks on its own clock and the edge stamps with another one, years apart, as on two machines. What the
-controller does, and when, is scripted; so a test knows every stage of every loop without asking the code under test.
+Simulation and edge use unrelated clocks, as on two machines. The actions of the controller and their times are
+scripted, so a test knows each stage of each loop independently of the code under test.
 """
 
 from collections import deque
@@ -26,38 +26,38 @@ START_WALL_NS = 1_767_225_600_000_000_000
 SIM_FROM_WALL_NS = 9_000_000_000_000 - START_WALL_NS
 EDGE_FROM_WALL_NS = 77_000_000_000_000_000 - START_WALL_NS
 MS = 1_000_000
-SHOWN = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
-"""From rad and m to the registers' degrees and mm."""
+REGISTER_SCALE = np.array([180 / np.pi, 180 / np.pi, 1000.0, 180 / np.pi])
+"""Conversion from rad and m to the units of the registers, degrees and mm."""
 CONTROLLER = "192.0.2.7:40001"
 PARAMETERS = rig_parameters(LabConfig(), RigSettings())
 
 
 @dataclass(frozen=True)
 class Script:
-    """What is recorded; times in ms unless the name says otherwise."""
+    """Script of a recorded run; times in ms unless the name has another unit."""
 
     seconds: float = 4.0
     step_ms: float = 20.0
     poll_ms: float = 5.0
-    """From one cycle of the controller to the next; 0: as fast as it can."""
+    """Cycle time of the controller; 0: as fast as possible."""
     delay_ms: float = 0.0
-    """What the controller takes between reading and writing."""
+    """Computation time of the controller between reading and writing."""
     order: str = "read-compute-write"
-    """Or `write-read`: each cycle writes what it computed from the previous cycle's read, then reads and waits."""
+    """Or `write-read`: each cycle writes the result of the previous cycle's read, then reads and waits."""
     network_ms: float = 0.4
-    """One way, controller to edge, and as much back."""
+    """One-way network delay between controller and edge."""
     injected_state_ms: float = 0.0
     injected_command_ms: float = 0.0
     stalls: Mapping[int, float] = field(default_factory=dict)
-    """Step at whose start the simulation stands still, and for how long."""
+    """Stalls of the simulation: step at whose start it stalls → duration."""
     edge_stalls: Mapping[float, float] = field(default_factory=dict)
-    """Time, s, at which the edge stands still, and for how long."""
+    """Stalls of the edge: start time, s → duration."""
     law: str = "wave"
-    """What the torques are: a `wave`, or `feedback` on the positions read."""
+    """Control law: a `wave`, or `feedback` from the positions that were read."""
     behind: int = 0
-    """With feedback: how many polls ago the positions were read that it uses."""
+    """Age of the positions that the feedback uses, polls."""
     delayed_ack_ms: float = 0.0
-    """What the request that follows a write at once waits for a delayed acknowledgement."""
+    """Delay of a request that directly follows a write, caused by a delayed acknowledgment."""
     lost_transport: int = 0
     lost_recorder: int = 0
     clock_steps: int = 0
@@ -67,14 +67,14 @@ class Script:
 
 
 def position(seconds: float) -> np.ndarray:
-    """Where the arm is: rad, rad, m, rad."""
+    """Position of the arm: rad, rad, m, rad."""
     t = seconds
     return np.array([0.9 * np.sin(0.7 * t), 1.1 * np.sin(0.9 * t + 0.5), 0.1 - 0.1 * np.cos(1.3 * t), 0.8 * np.sin(t)])
 
 
 @dataclass
 class Made:
-    """One message on its way into the file."""
+    """One message of a recording."""
 
     topic: str
     publish_wall_ns: int
@@ -145,9 +145,9 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
 class _Write:
     command: TorqueCommand
     arrives_ns: int
-    """At the simulation."""
+    """Arrival at the simulation."""
     asked_ns: int
-    """Arrival of the read before it at the edge, on the edge's clock."""
+    """Arrival of the preceding read at the edge, on the clock of the edge."""
 
 
 def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int, int, int]]:
@@ -168,7 +168,7 @@ def _ticks(script: Script, step_ns: int, random: Random) -> dict[int, tuple[int,
 
 
 def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Random) -> Iterator[_Write]:
-    """The controller's life on the true time, ns from the start, stamped by the edge's clock."""
+    """Cycles of the controller; true time in ns from the start, timestamps on the clock of the edge."""
     network_ns, delay_ns = round(script.network_ms * MS), round(script.delay_ms * MS)
     steps = list(ticks)
     at_edge = np.array([ticks[step][0] + random.randrange(200_000, 300_000) for step in steps])
@@ -176,7 +176,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
     free_ns = 0
 
     def edge_free(at_ns: int) -> int:
-        """When the edge does what comes in at `at_ns`: later, while it stands still."""
+        """Time at which the edge processes a request that arrives at `at_ns`: later during a stall."""
         for start_s, stall_ms in script.edge_stalls.items():
             start_ns = round(start_s * 1e9)
             if start_ns <= at_ns < start_ns + stall_ms * MS:
@@ -194,7 +194,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
             asked_ns = max(begin_ns + network_ns, free_ns)
             read_ns = edge_free(asked_ns)
             seen = (int(np.searchsorted(release, read_ns, side="right")) - 1, read_ns)
-            # A loop that reads right after it wrote waits for the acknowledgement of its write.
+            # A loop that reads right after writing waits for the acknowledgment of its write.
             write_ns = read_ns + 2 * network_ns + delay_ns + random.randrange(50_000)
         else:
             write_ns = begin_ns + network_ns
@@ -202,7 +202,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
         if seen is not None and seen[0] >= 0:
             seq += 1
             index, served_ns = seen
-            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * SHOWN, 2))
+            seen_before.append(np.round(position(ticks[steps[index]][0] / 1e9) * REGISTER_SCALE, 2))
             effort = _effort(script, seen_before, write_ns / 1e9, seq)
             command = TorqueCommand(
                 seq=seq,
@@ -230,12 +230,12 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
 
 def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int) -> np.ndarray:
-    """Torques by a law: a wave that knows nothing of the arm, or feedback on what was read some polls ago."""
+    """Torques of a control law: a wave that does not depend on the arm, or feedback from an earlier poll."""
     if script.law == "wave" or len(seen) < 2 + script.behind:
         return 3 * np.sin(0.9 * seq / 50 + np.arange(4))
     newest, older = seen[-1 - script.behind], seen[-2 - script.behind]
-    wanted = position(seconds) * SHOWN
-    return np.array([0.5, 0.4, 0.3, 0.2]) * (wanted - newest) - 0.6 * (newest - older)
+    setpoint = position(seconds) * REGISTER_SCALE
+    return np.array([0.5, 0.4, 0.3, 0.2]) * (setpoint - newest) - 0.6 * (newest - older)
 
 
 def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
@@ -272,8 +272,20 @@ def write(
 ) -> Path:
     """Write messages as the recorder does.
 
-    Without `finish` the file has no end, as after a kill; without `configured` the rig did not say what it is.
-    `missing` leaves out messages by topic and sequence; the second half reaches the recorder `arrival_lag_ns` late.
+    Args:
+        path: the file.
+        made: the messages.
+        script: script of the run, for the metadata.
+        metadata: additional or replaced metadata records.
+        schema_version: version of the message schemas in the metadata.
+        compression: compression of the chunks.
+        session: id of the session.
+        rig: name of the rig.
+        finish: without it the file has no footer, as after a crash of the recorder.
+        configured: without it the file has no configuration and no URDF.
+        missing: sequence numbers of messages that are not written, by topic.
+        arrival_lag_ns: additional arrival delay of the second half of the messages.
+        lab_toml: content of the attached lab file.
     """
     if arrival_lag_ns:
         made = list(made)
@@ -341,7 +353,7 @@ def write(
 
 
 def record(path: Path, script: Script = Script()) -> Path:
-    """Make a scripted run and write it."""
+    """Generate a scripted run and write it to a file."""
     return write(path, make(script), script=script)
 
 

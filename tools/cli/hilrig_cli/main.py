@@ -4,6 +4,8 @@ A command imports its implementation inside its function: `hilrig --help` is fas
 of one service only can run that service.
 """
 
+import inspect
+
 import typer
 
 from hilrig_cli.commands import (
@@ -81,6 +83,17 @@ app.command(rich_help_panel=ANALYSIS_PANEL)(figures.figures)
 app.command(rich_help_panel=ANALYSIS_PANEL)(recover.recover)
 app.command(rich_help_panel=ANALYSIS_PANEL)(play.play)
 app.command(rich_help_panel=ANALYSIS_PANEL)(export.export)
+
+
+def _unwrap_help(group: typer.Typer) -> None:
+    """Join the lines of each paragraph of the help texts, so that the terminal's width determines the line breaks."""
+    for command in group.registered_commands:
+        paragraphs = inspect.cleandoc((command.callback and command.callback.__doc__) or "").split("\n\n")
+        command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+for _group in (app, rig.app, record.app):
+    _unwrap_help(_group)
 
 
 def _print_version(requested: bool) -> None:

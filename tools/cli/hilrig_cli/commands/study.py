@@ -87,7 +87,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     columns = (*Progress.get_default_columns(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("sweep", total=1.0)
-        shown = traces(chosen, file.parent)
+        simulated_traces = traces(chosen, file.parent)
         swept = sweep(chosen, file.parent, lambda share: progress.update(task, completed=share))
     measured: list[dict[str, Any]] = []
     if live:
@@ -110,15 +110,15 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
 
         measured = run_live_points(chosen, file.parent, out, start_lab, free_ports, log)
     with console.status("plotting"):
-        pictures = []
+        plot_paths = []
         for number in range(len(chosen.controllers)):
             name = chosen.controllers[number].name
             markers = [Marker(p["x"], p["y"], p["as_predicted"]) for p in measured if p["controller"] == name]
-            figure = plane_figure(chosen, swept, number, shown, markers)
-            pictures += save_plots(figure, out / f"plane-{number + 1}")
-        save_study_rrd(chosen, swept, shown, out / "study.rrd")
-        more = {"pictures": [str(path) for path in pictures], "live": measured}
-        return save_results(chosen, swept, out, more)
+            figure = plane_figure(chosen, swept, number, simulated_traces, markers)
+            plot_paths += save_plots(figure, out / f"plane-{number + 1}")
+        save_study_rrd(chosen, swept, simulated_traces, out / "study.rrd")
+        extra = {"pictures": [str(path) for path in plot_paths], "live": measured}
+        return save_results(chosen, swept, out, extra)
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:
