@@ -285,12 +285,12 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
         for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
             assert word in table.stdout
         for options, complaint in (
-            (("rig1", "--command", "constant:-3"), "delay_ms: expected greater than or equal to 0, found '-3'"),
-            (("rig1", "--preset", "wlan"), "no preset is called 'wlan': expected one of none, wired"),
+            (("rig1", "--command", "constant:-3"), "delay_ms: must be ≥ 0, got '-3'"),
+            (("rig1", "--preset", "wlan"), "unknown preset 'wlan'; must be one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
             (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
             (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
-            (("rig9", "--off"), "no rig is called 'rig9'"),
+            (("rig9", "--off"), "unknown rig 'rig9'"),
             (("--off",), "a rig is required to set an impairment"),
         ):
             said = hilrig("impair", *options, "--config", config)

@@ -139,8 +139,8 @@ def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
         (("add", "rig1"), 2, "rig 'rig1' already exists in the lab"),
         (("add", "no name"), 2, "name: expected"),
         (("add", "late", "--port", str(lab.port)), 3, "rig 'late' was not added: edge/[12] .* can't listen on"),
-        (("remove", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
-        (("reset", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
+        (("remove", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
+        (("reset", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
     ]:
         done = hilrig("rig", *arguments, "--config", lab.config)
         assert done.returncode == code, done.stderr
@@ -157,7 +157,7 @@ def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
 def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tuple[str, ...]) -> None:
     done = hilrig(*words, "rg1", "--config", lab.config)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.endswith("hilrig: error: no rig is called 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
+    assert done.stderr.endswith("hilrig: error: unknown rig 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
 def test_duplicate_rig_is_rejected() -> None:
@@ -169,8 +169,8 @@ def test_duplicate_rig_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("sim", "--instance", "2"), "sim/1 on .* serves rig1, rig2, rig3 and 1 more already; a rig has one sim"),
-        (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* serves rig3 already; a rig has one edge"),
+        (("sim", "--instance", "2"), "sim/1 on .* already serves rig1, rig2, rig3 and 1 more; each rig has one sim"),
+        (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* already serves rig3; each rig has one edge"),
         (("edge", "--instance", "2", "--rigs", "rig3"), "another edge is called '2' already"),
     ],
 )
