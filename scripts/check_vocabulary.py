@@ -27,7 +27,7 @@ FORBIDDEN: Final = {
     r"\b(has|have|had) come\b": "arrived, received",
     r"\btroubles?\b": "alert, error",
     r"\b(go|goes|going|went|gone) on\b": "continue, resume, proceed",
-    r", for (it|they|he|she|there|a|an|the|of|each|every|nobody|nothing)\b(?! (example|instance))": "because",
+    r", for (it|they|he|she|there|nobody|nothing|this|these)\b": "because",
     r"\b(is|are|was|were|be) (told|said)\b|\btold of\b|\btells? of\b|\btell(s|ing)? people\b": "is reported, logged",
     r"\banew\b": "again, re-",
     r"\bby hand\b": "manual, manually",
@@ -39,14 +39,14 @@ FORBIDDEN: Final = {
     r"\b(for|may|so) so long\b|\bso long (before|after|as|that|at)\b|\bfor so\b": "name the number",
     r"\bnothing (taken|stolen)\b": "without CPU steal",
     r"\belders?\b": "older instance",
-    r"\b(he|his|him|she|her)\b": "it",
+    r"(?<!-)\b(he|his|him|she|her)\b": "it",
     r"\bcan't be had\b": "is unavailable",
     r"\bsee the module\b": "one line",
-    r"\bfloors?\b(?! (of|at) (the )?(scene|plant|world))": "layer",
+    r"(?<!Math\.)\bfloors?\b(?!\()(?! (of|at) (the )?(scene|plant|world))": "layer",
     r"\bthe way of\b|\bof the house\b": "data flow",
     r"\b(colour|centre|metre|millimetre|behaviour|neighbour|authoris|quantis|analys(e|es|ed|ing)\b|catalogue|grey\b|"
     r"synchronis|linearis|recognis|organis|initialis|normalis|minimis|maximis|optimis|serialis|discretis|summaris|"
-    r"acknowledgement|favour|honour|labelled|modelled|travelled|signalled|cancelled|towards|whilst|licence)": (
+    r"acknowledgement|favour|honour|labelled\b|modelled|travelled|signalled|cancelled|towards|whilst|licence)": (
         "American spelling"
     ),
 }

@@ -1,7 +1,7 @@
-"""What versions promise each other, one line each, in `schemas/contract.txt`; `make gen` adds what is new.
+"""The compatibility contract between versions, in `schemas/contract.txt`; `make gen` adds new entries.
 
-A promise is what a reader of another version relies on: a field's number, name and type, an enum's values, a topic's
-key and message. Pure functions on descriptors, so that a test can show that each way of breaking one is found.
+An entry is a property on which a reader of another version relies: a field's number, name and type, an enum's values,
+a topic's key and message. Pure functions on descriptors, so that tests can check that each violation is detected.
 """
 
 import importlib
@@ -23,23 +23,23 @@ from hilrig_schemas import topics
 
 PATH = Path(__file__).parents[1] / "schemas/contract.txt"
 HEAD = """\
-# What versions of hilrig promise each other. `make gen` adds what is new; once a release has it, nothing here is
-# changed or taken away (docs/adr/0042-schema-evolution.md). A field that is gone stays here, and reserved.
+# Compatibility contract between versions of hilrig. `make gen` adds new entries; a released entry must not be changed
+# or removed (docs/adr/0042-schema-evolution.md). A removed field stays here and is reserved in its message.
 """
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What holds: the promises, and what is kept from being used again."""
+    """The entries of a set of schemas, and their reserved numbers and names."""
 
     lines: frozenset[str]
     messages: frozenset[str]
     reserved: frozenset[tuple[str, str]]
-    """Message and number, and message and name."""
+    """Pairs of message and number, and of message and name."""
 
 
 def files() -> list[FileDescriptorProto]:
-    """The schemas of this version."""
+    """Return the schemas of this version."""
     found = []
     for module in pkgutil.iter_modules(hilrig_schemas.v1.__path__, "hilrig_schemas.v1."):
         if module.name.endswith("_pb2"):
@@ -50,7 +50,7 @@ def files() -> list[FileDescriptorProto]:
 
 
 def contract(schemas: Iterable[FileDescriptorProto]) -> Contract:
-    """What some schemas promise."""
+    """Return the contract of some schemas."""
     lines: set[str] = set()
     messages: set[str] = set()
     reserved: set[tuple[str, str]] = set()
@@ -68,44 +68,44 @@ def contract(schemas: Iterable[FileDescriptorProto]) -> Contract:
 
 
 def topic_lines() -> Iterator[str]:
-    """What the registry of topics promises."""
+    """Yield the entries of the registry of topics."""
     for topic in topics.all_topics():
-        places = ("<lab>", "<rig>") if isinstance(topic, topics.RigTopic) else ("<lab>", "<service>", "<instance>")
+        parts = ("<lab>", "<rig>") if isinstance(topic, topics.RigTopic) else ("<lab>", "<service>", "<instance>")
         channel = f" in {topic.channel}" if topic.channel else ""
-        key = topic.key(*places)  # type: ignore[attr-defined]
+        key = topic.key(*parts)  # type: ignore[attr-defined]
         yield f"topic {key} {topic.message.DESCRIPTOR.full_name} {topic.traffic.value}{channel}"
     yield f"alive {topics.alive_key('<lab>', '<service>', '<instance>')}"
 
 
-def broken(promised: Iterable[str], now: Contract) -> list[str]:
-    """Promises that do not hold any more, each with what is wrong, for people."""
-    return [f"{line}: {reason}" for line in sorted(promised) if (reason := _broken(line, now))]
+def violations(entries: Iterable[str], now: Contract) -> list[str]:
+    """Return the violated entries, each with a human-readable reason."""
+    return [f"{line}: {reason}" for line in sorted(entries) if (reason := _violation(line, now))]
 
 
-def _broken(line: str, now: Contract) -> str:
+def _violation(line: str, now: Contract) -> str:
     if line in now.lines:
         return ""
     kind, owner, *rest = line.split(" ")
     if kind != "field":
-        return "changed or gone"
+        return "changed or removed"
     if owner not in now.messages:
-        # What is of no message that is sent: topics and fields promise those that are.
+        # Messages that are used are covered by the entries of topics and fields.
         return ""
     number, name, *_ = rest
     changed = [other for other in now.lines if other.split(" ")[:3] == [kind, owner, number]]
     if changed:
         return f"is now {changed[0]}"
     missing = [text for text in (number, f'"{name}"') if (owner, text.strip('"')) not in now.reserved]
-    return f"gone: reserve {' and '.join(missing)}" if missing else ""
+    return f"removed: reserve {' and '.join(missing)}" if missing else ""
 
 
-def promised() -> set[str]:
-    """What stands in the file."""
+def recorded_entries() -> set[str]:
+    """Return the entries of the file."""
     return {line for line in PATH.read_text().splitlines() if line and not line.startswith("#")}
 
 
 def current() -> Contract:
-    """What this version promises, topics included."""
+    """Return the contract of this version, including topics."""
     found = contract(files())
     return Contract(found.lines | frozenset(topic_lines()), found.messages, found.reserved)
 
@@ -134,14 +134,14 @@ def _order(line: str) -> tuple[str, str, int]:
 
 
 def main() -> int:
-    """Add what is new to the file; 1 where a promise is broken."""
-    old, now = promised() if PATH.exists() else set(), current()
-    wrong = broken(old, now)
-    for text in wrong:
+    """Add new entries to the file; exit code 1: an entry is violated."""
+    old, now = recorded_entries() if PATH.exists() else set(), current()
+    violated = violations(old, now)
+    for text in violated:
         print(f"{PATH.name}: {text}", file=sys.stderr)
-    if not wrong:
+    if not violated:
         PATH.write_text(HEAD + "".join(f"{line}\n" for line in sorted(old | now.lines, key=_order)))
-    return 1 if wrong else 0
+    return 1 if violated else 0
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""What every process stands on: clock, rate, lifecycle, configuration, bus, log stream, health, service."""
+"""The common parts of all processes: configuration, bus, messaging, timing, security and service life cycle."""

@@ -1,23 +1,23 @@
-"""The two ways in which a command fails, each with its exit code.
+"""The errors of a command, each with its exit code.
 
-Errors are raised where they are found, say what was wrong, where, and what would be right, and are caught once, at
-the process's edge (`lifecycle.run_main`).
+An error is raised where it is found and states the defect, its place and the accepted value. It is caught once, at the
+top of the process (`process.shutdown.run_main`).
 """
 
 
 class HilrigError(Exception):
-    """Something that a person should read as one clear line, without a traceback."""
+    """An error that is reported as one line, without a traceback."""
 
     exit_code = 3
 
 
 class InputError(HilrigError):
-    """What was given is wrong: an option, a configuration, a file. Exit code 2."""
+    """Invalid input: an option, a configuration, a file. Exit code 2."""
 
     exit_code = 2
 
 
 class OperationError(HilrigError):
-    """What was asked for is right, but could not be done: a port in use, a disk full. Exit code 3."""
+    """A valid request that failed: a port in use, a full disk. Exit code 3."""
 
     exit_code = 3

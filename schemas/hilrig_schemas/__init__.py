@@ -1,4 +1,4 @@
-"""The wire and file contract: messages (`v1/*.proto`) and the one registry of topics (`topics`)."""
+"""Messages on the bus and in files (`v1/*.proto`), and the registry of topics (`topics`)."""
 
 from hilrig_schemas.v1.event_pb2 import Event
 from hilrig_schemas.v1.health_pb2 import Health, RigReport

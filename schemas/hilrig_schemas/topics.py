@@ -1,9 +1,9 @@
-"""The one registry of topics: key on the bus, message type, kind of traffic, channel in a recording.
+"""The registry of topics: key on the bus, message type, kind of traffic, channel in a recording.
 
-No key string stands anywhere else. A key is `hil/<lab>/<rig>/<name>` for what concerns a rig and
-`hil/<lab>/<name>/<service>/<instance>` for what concerns a service; their names, as `log` and
-`health`, are therefore no names for a rig. Nor are the services' own: an event that concerns one of
-them as a whole stands in the rig's place.
+It is the only place of key strings. A key is `hil/<lab>/<rig>/<name>` for a topic of a rig, and
+`hil/<lab>/<name>/<service>/<instance>` for a topic of a service. Names of service topics, as `log` and `health`, are
+therefore reserved and not valid for a rig. The names of services are reserved too, because an event of a service has
+its name in place of the rig.
 """
 
 import re
@@ -32,56 +32,56 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 ROOT: Final = "hil"
 NAME_PATTERN: Final = r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}"
-"""What a lab, a rig and an instance may be called: it is a part of a key and of a file name."""
+"""Valid names of labs, rigs and instances, which are parts of keys and of file names."""
 
 
 class Traffic(Enum):
-    """How a topic travels: what may be lost, and what must not wait."""
+    """Kind of traffic of a topic: delivery guarantee and priority."""
 
     CONTROL = "control"
-    """Early rather than complete: newest value wins, dropped rather than queued, highest priority."""
+    """Low latency before completeness: the newest value wins, messages are dropped, not queued; highest priority."""
     RECORDING = "recording"
-    """Complete rather than early: cached by its publisher, recovered by its subscriber."""
+    """Completeness before low latency: cached by the publisher, recovered by the subscriber."""
     REPORT = "report"
-    """For people: lowest priority, dropped under load."""
+    """Reports: lowest priority, dropped under load."""
     QUERY = "query"
-    """Asked for, not published."""
+    """Queried, not published."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic(Generic[MessageT]):
-    """What is known of one topic; `MessageT` is the protobuf type of its messages."""
+    """A topic; `MessageT` is the protobuf type of its messages."""
 
     name: str
     message: type[MessageT]
     traffic: Traffic
     channel: str | None = None
-    """Channel of a recording that holds it; None: not recorded."""
+    """Channel in a recording; None: not recorded."""
 
     def decode(self, payload: bytes) -> MessageT:
         """Decode one message.
 
         Raises:
-            google.protobuf.message.DecodeError: the bytes are no such message.
+            google.protobuf.message.DecodeError: the payload is not a valid message of this type.
         """
         return self.message.FromString(payload)
 
 
 @dataclass(frozen=True, slots=True)
 class RigTopic(Topic[MessageT]):
-    """A topic with one key a rig."""
+    """A topic with one key per rig."""
 
     def key(self, lab: str, rig: str) -> str:
-        """Key of one rig's topic; `rig` may be `*` to subscribe to every rig of the lab."""
+        """Return the key of a rig; `rig` may be `*` for all rigs of the lab."""
         return f"{ROOT}/{lab}/{rig}/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceTopic(Topic[MessageT]):
-    """A topic with one key a running service."""
+    """A topic with one key per running service."""
 
     def key(self, lab: str, service: str, instance: str) -> str:
-        """Key of one service's topic; `service` and `instance` may be `*` to subscribe to all."""
+        """Return the key of a service; `service` and `instance` may be `*` for all."""
         return f"{ROOT}/{lab}/{self.name}/{service}/{instance}"
 
 
@@ -95,13 +95,13 @@ IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
 CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
-"""What a person asks of a service: sessions by hand of the recorder, rigs more or fewer of simulation and edge."""
+"""Requests of an operator: manual sessions (recorder), adding and removing rigs (simulation and edge)."""
 SERVICE_INFO: Final = ServiceTopic("service_info", ServiceInfo, Traffic.QUERY)
-"""Who runs, where, and for which rigs."""
+"""Identity, host and rigs of a running service."""
 STATES: Final = ServiceTopic("states", RigBatch, Traffic.CONTROL)
-"""The states of a tick together, for the edges; a watcher of one rig takes that rig's `STATE`."""
+"""The states of a tick in one batch, for the edges; monitoring of one rig uses its `STATE`."""
 COMMANDS: Final = ServiceTopic("commands", RigBatch, Traffic.CONTROL)
-"""Commands as they leave an edge, for the simulation; a watcher of one rig takes that rig's `COMMAND`."""
+"""Commands of an edge in batches, for the simulation; monitoring of one rig uses its `COMMAND`."""
 
 RIG_TOPICS: Final[tuple[RigTopic[Message], ...]] = (STATE, COMMAND, EVENT, TRAFFIC, CONFIG, LEASE, IMPAIRMENT)  # type: ignore[assignment]
 SERVICE_TOPICS: Final[tuple[ServiceTopic[Message], ...]] = (LOG, HEALTH, CONTROL, SERVICE_INFO, STATES, COMMANDS)  # type: ignore[assignment]
@@ -109,23 +109,23 @@ RECORDED: Final[dict[str, RigTopic[Message]]] = {topic.name: topic for topic in 
 
 ALIVE: Final = "alive"
 RESERVED_RIG_NAMES: Final = frozenset({topic.name for topic in SERVICE_TOPICS} | {ALIVE})
-"""What stands in a rig's place in the keys of services."""
+"""Names in place of the rig in keys of services."""
 SERVICES: Final = ("sim", "edge", "recorder")
-"""What a lab is made of; see `Service.emit` for the keys that have one in a rig's place."""
+"""The services of a lab; their names are used in place of the rig in keys of events (`Service.emit`)."""
 
 
 def alive_key(lab: str, service: str, instance: str) -> str:
-    """Key of a service's liveliness token; `service` and `instance` may be `*`."""
+    """Return the key of a service's liveliness token; `service` and `instance` may be `*`."""
     return f"{ROOT}/{lab}/{ALIVE}/{service}/{instance}"
 
 
 def source_of_alive_key(key: str) -> str:
-    """Whose liveliness token it is, "<service>/<instance>"."""
+    """Return the service of a liveliness token, "<service>/<instance>"."""
     return "/".join(key.split("/")[-2:])
 
 
 def all_topics() -> Iterator[Topic[Message]]:
-    """Every topic of the registry."""
+    """Yield every topic of the registry."""
     yield from RIG_TOPICS
     yield from SERVICE_TOPICS
 
@@ -144,18 +144,18 @@ _NAME: Final = re.compile(NAME_PATTERN)
 
 
 def parse_rig_key(key: str) -> RigKey:
-    """Take a rig topic's key apart.
+    """Parse the key of a rig topic.
 
     Raises:
-        ValueError: it is no key of a rig topic.
+        ValueError: not a key of a rig topic.
     """
     parts = key.split("/")
     if len(parts) == 4 and parts[0] == ROOT and parts[3] in _RIG_TOPIC_BY_NAME and parts[2] not in RESERVED_RIG_NAMES:
         return RigKey(parts[1], parts[2], _RIG_TOPIC_BY_NAME[parts[3]])
     names = ", ".join(_RIG_TOPIC_BY_NAME)
-    raise ValueError(f"{key!r} is no key of a rig: expected {ROOT}/<lab>/<rig>/<one of {names}>")
+    raise ValueError(f"invalid key of a rig topic: must be {ROOT}/<lab>/<rig>/<one of {names}>, got {key!r}")
 
 
 def is_name(text: str) -> bool:
-    """Whether a lab, a rig or an instance may be called so."""
+    """Return whether a text is a valid name of a lab, a rig or an instance."""
     return _NAME.fullmatch(text) is not None

@@ -1,6 +1,8 @@
 """ARCHITECTURE.md and the tree agree: each subpackage is described, and each described folder exists."""
 
+import ast
 import re
+from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -41,3 +43,41 @@ def test_subpackages_have_about_a_dozen_modules() -> None:
         if folder.name not in ("commands", "v1")
     }
     assert {folder: count for folder, count in counts.items() if count > MAX_MODULES} == {}
+
+
+def modules(package: Path) -> list[Path]:
+    return [path for path in sorted(package.rglob("*.py")) if not path.stem.endswith("_pb2")]
+
+
+def test_public_class_names_are_unique_in_the_product() -> None:
+    defined: dict[str, list[str]] = {}
+    for package in PACKAGES.values():
+        for path in modules(package):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    defined.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: places for name, places in defined.items() if len(places) > 1} == {}
+
+
+def test_module_names_are_unique_within_a_package() -> None:
+    # The command of a library module has its name.
+    exempt = {"__init__", "service", "errors"}
+    found = {
+        name: sorted(
+            stem
+            for stem, count in Counter(path.stem for path in modules(package) if path.parent.name != "commands").items()
+            if count > 1 and stem not in exempt
+        )
+        for name, package in PACKAGES.items()
+    }
+    assert {name: stems for name, stems in found.items() if stems} == {}
+
+
+def test_docstrings_describe_their_class() -> None:
+    vague = [
+        str(path.relative_to(ROOT))
+        for package in PACKAGES.values()
+        for path in modules(package)
+        if "See the module" in path.read_text(encoding="utf-8")
+    ]
+    assert vague == []

@@ -1,4 +1,4 @@
-"""The wire and file contract: generated code is fresh, every field tells its unit, the registry is whole."""
+"""The schemas: generated code is up to date, every field has its unit, the registry of topics is consistent."""
 
 import re
 import subprocess
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PROTOS = sorted((ROOT / "schemas/hilrig_schemas/v1").glob("*.proto"))
 
 
-def test_generated_code_is_what_the_protos_generate(tmp_path: Path) -> None:
+def test_generated_code_is_up_to_date(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
@@ -35,7 +35,7 @@ def test_generated_code_is_what_the_protos_generate(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("proto", PROTOS, ids=lambda path: path.stem)
-def test_every_field_says_what_it_is_and_numbers_their_unit(proto: Path) -> None:
+def test_every_field_has_a_comment_and_numbers_a_unit(proto: Path) -> None:
     field = re.compile(r"^\s*(repeated )?(?P<type>\w+) (?P<name>\w+) = \d+;(?P<comment>.*)$")
     unit = re.compile(r"\b(rad|m|mm|degrees|N|N·m|kg|ns|s|count|bytes|bit|1/s|no unit)\b")
     numeric = {"double", "float", "int32", "int64", "uint32", "uint64"}
@@ -48,7 +48,7 @@ def test_every_field_says_what_it_is_and_numbers_their_unit(proto: Path) -> None
             assert unit.search(match["comment"]), f"{match['name']}: its comment names no unit: {match['comment']}"
 
 
-def test_the_registry_has_one_topic_a_name_and_one_channel_a_recorded_topic() -> None:
+def test_topic_names_and_channels_are_unique() -> None:
     names = [topic.name for topic in topics.all_topics()]
     assert len(names) == len(set(names))
     channels = [topic.channel for topic in topics.all_topics() if topic.channel]
@@ -57,12 +57,12 @@ def test_the_registry_has_one_topic_a_name_and_one_channel_a_recorded_topic() ->
 
 
 @pytest.mark.parametrize("topic", topics.RIG_TOPICS, ids=lambda topic: topic.name)
-def test_a_rig_topics_key_can_be_taken_apart_again(topic: RigTopic) -> None:  # type: ignore[type-arg]
+def test_rig_key_can_be_parsed(topic: RigTopic) -> None:  # type: ignore[type-arg]
     assert topics.parse_rig_key(topic.key("lab", "rig1")) == RigKey("lab", "rig1", topic)
 
 
 @pytest.mark.parametrize("topic", list(topics.all_topics()), ids=lambda topic: topic.name)
-def test_every_topics_messages_survive_the_wire(topic: topics.Topic) -> None:  # type: ignore[type-arg]
+def test_messages_of_every_topic_round_trip(topic: topics.Topic) -> None:  # type: ignore[type-arg]
     message = topic.message()
     first = message.DESCRIPTOR.fields[0]
     setattr(message, first.name, "rig1")
@@ -72,12 +72,12 @@ def test_every_topics_messages_survive_the_wire(topic: topics.Topic) -> None:  #
 @pytest.mark.parametrize(
     "key", ["hil/lab/rig1/none", "hil/lab/log/sim/1", "other/lab/rig1/state", "hil/lab/health/state", ""]
 )
-def test_what_is_no_rigs_key_is_refused(key: str) -> None:
-    with pytest.raises(ValueError, match="is no key of a rig"):
+def test_invalid_rig_key_is_rejected(key: str) -> None:
+    with pytest.raises(ValueError, match="invalid key of a rig topic"):
         topics.parse_rig_key(key)
 
 
-def test_control_is_what_closes_the_loop() -> None:
+def test_control_topics_close_the_loop() -> None:
     assert {topic.name for topic in topics.all_topics() if topic.traffic is Traffic.CONTROL} == {
         "state",
         "states",
@@ -86,7 +86,7 @@ def test_control_is_what_closes_the_loop() -> None:
     }
 
 
-def test_no_key_stands_outside_the_registry() -> None:
+def test_keys_are_only_in_the_registry() -> None:
     sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
     offenders = [str(path) for path in sources if re.search(r"""["']hil/""", path.read_text())]
     assert offenders == []

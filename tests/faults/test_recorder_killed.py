@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_runtime.messaging.recording_stream import LONGEST_KEPT_S
+from hilrig_runtime.messaging.recording_stream import MAX_CACHE_S
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, times, wait_ready
 from support.waiting import Stalls, eventually
 
 KILLS = times("HILRIG_RECORDER_KILLS", 4)
-CACHED_S = LONGEST_KEPT_S - 3
+CACHED_S = MAX_CACHE_S - 3
 """Messages of at most this age are still in the cache of their publisher, with a margin."""
 LAST_S = 1.0
 """Maximum age of the messages that a killed recorder has not written yet."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hilrig_runtime.config.lab import load_lab
-from hilrig_runtime.messaging.recording_stream import LONGEST_KEPT_S
+from hilrig_runtime.messaging.recording_stream import MAX_CACHE_S
 from support.lab_of_hosts import HILRIG, SLACK_NS, STEP_S, TIMEOUT_NS, LabOfHosts, Session, zero_after
 from support.namespaces import Network, require_namespaces
 from support.waiting import PATIENT_S, eventually
@@ -93,7 +93,7 @@ def test_the_simulations_cable_is_pulled_for_a_while(lab: LabOfHosts, cut_s: flo
         assert zero_after(states, cut_ns) <= TIMEOUT_NS + SLACK_NS
         assert missing == session.stated_lost() == 0, "nothing is missing in the recording"
     else:
-        reach_s = LONGEST_KEPT_S - 1.0
+        reach_s = MAX_CACHE_S - 1.0
         assert 0 < missing <= (cut_s - reach_s) / STEP_S, "what was sent in the last half minute of the cut is there"
         assert session.stated_lost() >= missing, "the file says what is missing"
 
@@ -150,6 +150,6 @@ def test_two_labs_on_one_router_do_not_see_each_other(lab: LabOfHosts) -> None:
     assert services(lab.config) == ["edge", "recorder", "sim"]
     second = lab.run("sim", "sim", "-c", str(lab.config), "--instance", "2")
     assert second.returncode == 3
-    assert "serves rig1 already; a rig has one sim" in second.stderr
+    assert "already serves rig1; each rig has one sim" in second.stderr
     simulation.terminate()
     assert simulation.wait(PATIENT_S) == 0

@@ -115,7 +115,7 @@ def test_a_file_that_is_missing_is_named(lab: Lab, missing: str) -> None:
 
 def test_a_host_without_a_key_for_the_service_is_told_which_it_needs(lab: Lab) -> None:
     (lab.folder / "operator.key").unlink()
-    with pytest.raises(InputError, match=r"holds no operator\.key or viewer\.key"):
+    with pytest.raises(InputError, match=r"does not contain operator\.key or viewer\.key"):
         ZenohBus(lab.config(lab.folder), "tool")
 
 

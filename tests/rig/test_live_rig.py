@@ -54,4 +54,4 @@ def test_missing_simulation_is_reported(tmp_path: Path) -> None:
 def test_unknown_rig_is_rejected(tmp_path: Path) -> None:
     result = hilrig("live", "rig9", "--config", write_lab(tmp_path))
     assert result.returncode == 2
-    assert "no rig is called 'rig9'; this lab has rig1" in result.stderr
+    assert "unknown rig 'rig9'; this lab has rig1" in result.stderr

@@ -54,24 +54,24 @@ def test_every_rig_is_served_by_one_of_the_edges(lab: RunningLab) -> None:
         with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
             assert client.connect()
             assert len(client.read_holding_registers(4, count=4).registers) == 4
-    shown = top(lab)
+    report = top(lab)
     assert [
-        (row["service"], row["instance"], row["rigs"]) for row in shown["services"] if row["service"] != "recorder"
+        (row["service"], row["instance"], row["rigs"]) for row in report["services"] if row["service"] != "recorder"
     ] == [
         ("edge", "1", 2),
         ("edge", "2", 2),
         ("sim", "1", 4),
     ]
-    assert all(rig["served"] and rig["simulated"] for rig in shown["rigs"])
+    assert all(rig["served"] and rig["simulated"] for rig in report["rigs"])
 
 
 def test_top_shows_lease_holder_loop_and_recording(lab: RunningLab) -> None:
-    def shown() -> dict[str, Any] | None:
+    def report() -> dict[str, Any] | None:
         rig = rig_of(lab, "rig4")
         return rig if rig["controller"] and rig["recording"] and rig["loop_samples"] else None
 
     with steady_controller(lab.lab.ports["rig4"]):
-        rig = eventually(shown)
+        rig = eventually(report)
         table = hilrig("top", "--once", "--config", lab.config).stdout
     assert rig["controller"].startswith("127.0.0.1:")
     assert rig["loop_p50_ms"] >= 15
@@ -139,8 +139,8 @@ def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
         (("add", "rig1"), 2, "rig 'rig1' already exists in the lab"),
         (("add", "no name"), 2, "name: expected"),
         (("add", "late", "--port", str(lab.port)), 3, "rig 'late' was not added: edge/[12] .* can't listen on"),
-        (("remove", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
-        (("reset", "nobody"), 2, "no rig is called 'nobody'; this lab has rig1"),
+        (("remove", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
+        (("reset", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
     ]:
         done = hilrig("rig", *arguments, "--config", lab.config)
         assert done.returncode == code, done.stderr
@@ -157,7 +157,7 @@ def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
 def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tuple[str, ...]) -> None:
     done = hilrig(*words, "rg1", "--config", lab.config)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.endswith("hilrig: error: no rig is called 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
+    assert done.stderr.endswith("hilrig: error: unknown rig 'rg1'; this lab has rig1, rig2, rig3, rig4\n")
 
 
 def test_duplicate_rig_is_rejected() -> None:
@@ -169,8 +169,8 @@ def test_duplicate_rig_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (("sim", "--instance", "2"), "sim/1 on .* serves rig1, rig2, rig3 and 1 more already; a rig has one sim"),
-        (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* serves rig3 already; a rig has one edge"),
+        (("sim", "--instance", "2"), "sim/1 on .* already serves rig1, rig2, rig3 and 1 more; each rig has one sim"),
+        (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* already serves rig3; each rig has one edge"),
         (("edge", "--instance", "2", "--rigs", "rig3"), "another edge is called '2' already"),
     ],
 )

@@ -73,7 +73,7 @@ def test_manual_session_and_its_refusals(tmp_path: Path) -> None:
         assert f"rig1: manual recording {session} is already running" in again.stderr
         unknown = hilrig("record", "start", "rig9", "--config", config)
         assert unknown.returncode == 2
-        assert unknown.stderr == "hilrig: error: no rig is called 'rig9'; this lab has rig1\n"
+        assert unknown.stderr == "hilrig: error: unknown rig 'rig9'; this lab has rig1\n"
         assert hilrig("record", "stop", "rig9", "--config", config).returncode == 2
         # A manual session continues after a restart of the recorder.
         recorder.kill()
@@ -128,7 +128,7 @@ def test_second_recorder_on_the_same_bus_exits(tmp_path: Path) -> None:
             (other / "lab.toml").write_text(text)
             with RecorderProcess(other / "lab.toml") as second:
                 assert second.process.wait(30) == 3
-            assert "another recorder is called '1' already: recorder/1" in second.log.read_text()
+            assert "has the same instance name; choose another --instance" in second.log.read_text()
             assert recorder.process.poll() is None
 
 
@@ -147,10 +147,10 @@ def test_recorders_partition_the_rigs_of_a_lab(tmp_path: Path) -> None:
             wait_ready(lab, second, "two")
             with RecorderProcess(config, "--instance", "three", "--rigs", "rig2,rig3") as third:
                 assert third.process.wait(30) == 3
-            assert "serves rig2 already; a rig has one recorder" in third.log.read_text()
+            assert "already serves rig2; each rig has one recorder" in third.log.read_text()
             # A rig that is not in the lab file belongs to the recorder of the first rig.
             added = hilrig("record", "start", "rig9", "--config", config)
-            assert "no rig is called 'rig9'; this lab has rig1, rig2, rig3" in added.stderr
+            assert "unknown rig 'rig9'; this lab has rig1, rig2, rig3" in added.stderr
             manual = hilrig("record", "start", "rig3", "--config", config, "--json")
             assert manual.returncode == 0, manual.stderr
             for rig in rigs:

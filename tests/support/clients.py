@@ -38,11 +38,11 @@ def mbpoll_write(port: int, register: int, value: int, kind: str = "holding") ->
 def build_c_client() -> Path:
     """The benchmark's controller in C on libmodbus, compiled."""
     sys.path.insert(0, str(ROOT / "bench"))
-    from harness import MissingPartError, build_c
+    from harness import MissingDependencyError, build_c
 
     try:
         return build_c("loop_client.c")
-    except MissingPartError as error:
+    except MissingDependencyError as error:
         pytest.skip(str(error))
     finally:
         sys.path.pop(0)

@@ -82,10 +82,10 @@ def test_of_an_edges_batch_the_simulation_hears_its_own_rigs_only() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('topology = "router"\nrouter = "tcp/a:7447"\n[bus.tls]', "expected an endpoint that begins with tls/"),
-        ('topology = "router"\nrouter = "tls/a:7447"', r"expected an endpoint that begins with tcp/.*no \[bus.tls\]"),
-        ('[bus.tls]\nedges = {sim = ["rig1"]}', r"edges.sim: that is the name of another certificate"),
-        ('[bus.tls]\nedges = {east = ["rig9"]}', "bus.tls.edges.east: no rig is called 'rig9'"),
+        ('topology = "router"\nrouter = "tcp/a:7447"\n[bus.tls]', "must begin with tls/"),
+        ('topology = "router"\nrouter = "tls/a:7447"', r"must begin with tcp/.*no \[bus.tls\]"),
+        ('[bus.tls]\nedges = {sim = ["rig1"]}', r"edges.sim: name already used by another certificate"),
+        ('[bus.tls]\nedges = {east = ["rig9"]}', "bus.tls.edges.east: unknown rig 'rig9'"),
     ],
 )
 def test_what_does_not_fit_together_is_named(text: str, message: str) -> None:

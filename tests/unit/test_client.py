@@ -57,7 +57,7 @@ def test_added_rig_is_found_at_the_first_service_that_has_it() -> None:
 
 def test_unknown_rig_is_rejected_once_all_services_reply(capsys: pytest.CaptureFixture[str]) -> None:
     bus = CountingBus(SIM, FIRST, SECOND)
-    with pytest.raises(InputError, match=r"^no rig is called 'gest'; this lab has rig1, rig2, rig3, guest$"):
+    with pytest.raises(InputError, match=r"^unknown rig 'gest'; this lab has rig1, rig2, rig3, guest$"):
         check_rig(bus, LAB, "gest")
     assert bus.queries == 1
     assert capsys.readouterr().err == ""
@@ -76,7 +76,7 @@ def test_prints_a_message_while_waiting_for_a_service(
 ) -> None:
     monkeypatch.setattr(client, "QUERY_TIMEOUT_S", 0.2)
     monkeypatch.setattr(client, "WAIT_MESSAGE_AFTER_S", 0.0)
-    with pytest.raises(InputError, match="no rig is called 'gest'; this lab has rig1, rig2, rig3"):
+    with pytest.raises(InputError, match="unknown rig 'gest'; this lab has rig1, rig2, rig3"):
         check_rig(CountingBus(FIRST), LAB, "gest")
     message = capsys.readouterr().err
     assert message.count("\n") == 1

@@ -287,6 +287,6 @@ def test_missing_certificate_of_a_command_is_named(folder: Path) -> None:
     for name in ("operator", "viewer"):
         (folder / f"{name}.key").unlink()
     results, joined = services.check_bus(secured(folder))
-    assert "holds no operator.key or viewer.key" in only_error(results)
+    assert "does not contain operator.key or viewer.key" in only_error(results)
     assert "viewer" in results[0].fix
     assert joined is None

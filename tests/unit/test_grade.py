@@ -260,10 +260,10 @@ def test_ranks_runs_by_grade(tmp_path: Path) -> None:
     [
         ("[task]\ntitle = 'x'", "task: a task needs poses, a path or parts to place"),
         ("[[task.poses]]\nname = 'a'", "task.poses[0].position_mm: is missing"),
-        ("[[task.poses]]\nname = 'a'\nposition_mm = [1, 2, 3]\n" * 2, "two poses are called 'a'"),
+        ("[[task.poses]]\nname = 'a'\nposition_mm = [1, 2, 3]\n" * 2, "duplicate pose name 'a'"),
         ("[task.path]\npoints_mm = [[1, 2, 3]]", "task.path.points_mm"),
         ("[task.path]\npoints_mm = [[1, 2, 3], [1, 2, 3]]", "points 1 and 2 of the path are the same"),
-        ("[task.place]\ntolerance_mm = 0", "task.place.tolerance_mm: expected greater than 0, found 0"),
+        ("[task.place]\ntolerance_mm = 0", "task.place.tolerance_mm: must be > 0, got 0"),
         ("[task]\nlimit = 3\n[task.place]", "task.limit: unknown key"),
         ("[[task.poses]]\nname = 'a'\nposition_mm = [900, 0, 0]", "task: pose 'a' is out of reach: "),
         ("[task.path]\npoints_mm = [[300, 0, 0], [700, 0, 0]]", "point 2 of the path, (700, 0, 0) mm, is out of reach"),

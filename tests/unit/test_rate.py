@@ -68,7 +68,7 @@ def test_sleeping_through_deadlines_counts_too() -> None:
 
 
 def test_a_period_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="a period must be positive, found 0 ns"):
+    with pytest.raises(ValueError, match="the period must be > 0 ns, got 0"):
         Rate(0)
 
 

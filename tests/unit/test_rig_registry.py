@@ -141,7 +141,7 @@ def test_invalid_requests_are_rejected_without_effect() -> None:
             lab.ask(Event.RIG_ADDED, "rig1", RigSettings(name="rig1").model_dump_json())
             == "rig 'rig1' is already simulated here; choose another name"
         )
-        assert "expected greater than 0" in lab.ask(Event.RIG_ADDED, "x", '{"name": "x", "arm": {"l2_m": -1}}')
+        assert "must be > 0" in lab.ask(Event.RIG_ADDED, "x", '{"name": "x", "arm": {"l2_m": -1}}')
         assert (
             lab.ask(Event.RIG_REMOVED, "nobody") == "rig 'nobody' is not simulated here; hilrig rig list shows all rigs"
         )
@@ -154,7 +154,7 @@ def test_invalid_requests_are_rejected_without_effect() -> None:
 
 
 def test_timed_out_call_fails_and_is_not_executed_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilrig_runtime.process.mailbox.TIMEOUT_S", 0.01)
+    monkeypatch.setattr("hilrig_runtime.process.mailbox.CALL_TIMEOUT_S", 0.01)
     turns, done = OwnerThreadExecutor(), []
     with pytest.raises(OperationError, match="too busy"):
         turns.call(lambda: done.append(1))

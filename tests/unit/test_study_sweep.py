@@ -59,7 +59,7 @@ def load(folder: Path, text: str = SMALL) -> StudyConfig:
             r"task: theta1 must start between its stops -133 and 133, got 135 \(pose 132 \+ offset 3\)",
         ),
         (SMALL.replace("duration_s = 3", "compute_ms = 30"), "poll period must be longer"),
-        (SMALL + '[impairment]\ncommand = "uniform:40,10"', "low_ms 40 is above high_ms 10"),
+        (SMALL + '[impairment]\ncommand = "uniform:40,10"', "low_ms must be ≤ high_ms, got 40 and 10"),
         (SMALL + "[task]\noffset = [200, 0, 0, 0]", "theta1"),
         ("x = 3 =", "invalid TOML"),
     ],

@@ -1,1 +1,1 @@
-"""The message bus: its interface, the zenoh and in-memory implementations, access rules and the router."""
+"""The message bus: its interface, the zenoh and in-memory implementations, access rules."""

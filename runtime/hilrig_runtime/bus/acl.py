@@ -1,8 +1,8 @@
-"""Who may do what on the bus: one rule a topic, turned into zenoh's own access control by certificate.
+"""Access control of the bus: one rule per topic, converted to zenoh's access control by certificate.
 
-A certificate's common name is an identity, and each identity has a role. What no rule allows is denied, silently, as
-zenoh does. The rules are seen from the identity at the other end of a link, so that a router and every service of a
-mesh take the same ones: what comes in from it is what it may send, what goes out to it is what it may read.
+A certificate's common name is an identity, and each identity has a role. zenoh silently denies whatever no rule allows.
+The rules describe the identity at the other end of a link, so that a router and every service of a mesh use the same
+ones: ingress rules are what it may publish, egress rules what it may receive.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,15 +14,17 @@ from hilrig_schemas import topics
 from hilrig_schemas.topics import RIG_TOPICS, ROOT, SERVICE_TOPICS, SERVICES, Traffic, alive_key
 
 TOOL_ROLES: Final = ("operator", "viewer")
-"""An operator asks services to do things; a viewer only looks."""
+"""Roles of tools: an operator may send requests to services, a viewer only receives."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Roles that send on a topic, or answer on it where it is asked for, and roles that read or ask."""
+    """Roles that may publish on a topic or serve its queries, and roles that may subscribe to it or query it."""
 
-    senders: tuple[str, ...]
-    readers: tuple[str, ...]
+    publishers: tuple[str, ...]
+    """Publishers, or servers of a query topic."""
+    subscribers: tuple[str, ...]
+    """Subscribers, or clients of a query topic."""
 
 
 RULES: Final[dict[str, Rule]] = {
@@ -35,19 +37,19 @@ RULES: Final[dict[str, Rule]] = {
     topics.IMPAIRMENT.name: Rule(("edge",), ("operator",)),
     topics.LOG.name: Rule(SERVICES, ("recorder",)),
     topics.HEALTH.name: Rule(SERVICES, (*SERVICES, *TOOL_ROLES)),
-    # A service asks whether another one does its work already.
+    # A service checks for another instance with its rigs.
     topics.SERVICE_INFO.name: Rule(SERVICES, (*SERVICES, *TOOL_ROLES)),
     topics.STATES.name: Rule(("sim",), ("edge", *TOOL_ROLES)),
     topics.COMMANDS.name: Rule(("edge",), ("sim", *TOOL_ROLES)),
-    # A recorder asks whether another one records the lab already.
+    # A recorder checks for another recorder of the lab.
     topics.CONTROL.name: Rule(SERVICES, ("recorder", "operator")),
 }
-"""Rule of each topic, by its name."""
+"""Rule of each topic, by the topic's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusIdentity:
-    """A common name, its role, and the rigs that it sends for; `*`: all."""
+    """A common name, its role, and the rigs that it publishes for; `*`: all."""
 
     name: str
     role: str
@@ -55,7 +57,7 @@ class BusIdentity:
 
 
 def identities(tls: BusTlsConfig) -> list[BusIdentity]:
-    """Everyone who is let in, the router apart."""
+    """Return all accepted identities except the router."""
     edges = [BusIdentity(name, "edge", rigs) for name, rigs in tls.edges.items()] or [BusIdentity("edge", "edge")]
     return [
         BusIdentity("sim", "sim"),
@@ -66,7 +68,7 @@ def identities(tls: BusTlsConfig) -> list[BusIdentity]:
 
 
 def access_control(tls: BusTlsConfig, lab: str = "*") -> dict[str, Any]:
-    """The `access_control` section of a zenoh configuration; `lab` `*`: any that this authority serves."""
+    """Return the `access_control` section of a zenoh configuration; `lab` `*`: all labs of this authority."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -85,11 +87,11 @@ def access_control(tls: BusTlsConfig, lab: str = "*") -> dict[str, Any]:
 
 
 def _rules_of(identity: BusIdentity, lab: str) -> Iterable[dict[str, Any]]:
-    sends, serves, reads, asks = _keys(identity, lab)
-    recorded = [key for key in (*sends, *reads) if f"/{topics.LOG.name}/" in key]
-    # The caches of recording streams, their heartbeats and tokens stand under a verbatim part that `**` leaves out.
+    published, served, subscribed, queried = _keys(identity, lab)
+    recorded = [key for key in (*published, *subscribed) if f"/{topics.LOG.name}/" in key]
+    # Caches, heartbeats and tokens of recording streams are under a verbatim chunk, which `**` does not match.
     caches = [f"{key}/@adv/**" for key in recorded]
-    shows = [alive_key(lab, identity.role, "*")] if identity.role in SERVICES else []
+    tokens = [alive_key(lab, identity.role, "*")] if identity.role in SERVICES else []
     everything = [f"{ROOT}/{lab}/**", f"{ROOT}/{lab}/**/@adv/**"]
 
     def rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Iterable[dict[str, Any]]:
@@ -102,55 +104,55 @@ def _rules_of(identity: BusIdentity, lab: str) -> Iterable[dict[str, Any]]:
                 "key_exprs": list(keys),
             }
 
-    own = [key for key in caches if any(key.startswith(f"{sent}/") for sent in sends)]
-    yield from rule("sends", "ingress", ["put"], [*sends, *own])
-    yield from rule("answers", "ingress", ["declare_queryable", "reply"], [*serves, *own])
-    # What is repeated from a cache has the key of the stream itself.
-    yield from rule("repeats", "ingress", ["reply"], [key for key in sends if key in recorded])
-    yield from rule("is asked", "egress", ["query"], [*_widened(serves, lab), *own])
-    yield from rule("subscribes", "ingress", ["declare_subscriber"], [*reads, *caches])
-    yield from rule("receives", "egress", ["put"], [*reads, *caches])
-    yield from rule("asks", "ingress", ["query"], [*asks, *caches])
-    yield from rule("is answered", "egress", ["reply"], [*asks, *reads, *caches])
-    yield from rule("lives", "ingress", ["liveliness_token"], [*shows, *own])
+    own_caches = [key for key in caches if any(key.startswith(f"{key_sent}/") for key_sent in published)]
+    yield from rule("publishes", "ingress", ["put"], [*published, *own_caches])
+    yield from rule("serves", "ingress", ["declare_queryable", "reply"], [*served, *own_caches])
+    # A sample from a cache has the key of its stream.
+    yield from rule("serves cache", "ingress", ["reply"], [key for key in published if key in recorded])
+    yield from rule("receives queries", "egress", ["query"], [*_wildcard(served, lab), *own_caches])
+    yield from rule("subscribes", "ingress", ["declare_subscriber"], [*subscribed, *caches])
+    yield from rule("receives", "egress", ["put"], [*subscribed, *caches])
+    yield from rule("queries", "ingress", ["query"], [*queried, *caches])
+    yield from rule("receives replies", "egress", ["reply"], [*queried, *subscribed, *caches])
+    yield from rule("declares tokens", "ingress", ["liveliness_token"], [*tokens, *own_caches])
     watched = [alive_key(lab, "*", "*"), *caches]
-    yield from rule("watches", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], watched)
-    yield from rule("sees", "egress", ["liveliness_token"], watched)
-    # Who listens to what is no secret in a lab, and without it nobody would send.
-    yield from rule("hears of", "egress", ["declare_subscriber", "declare_queryable"], everything)
+    yield from rule("subscribes to tokens", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], watched)
+    yield from rule("receives tokens", "egress", ["liveliness_token"], watched)
+    # Declarations are not secret in a lab, and without them publishers would not send.
+    yield from rule("receives declarations", "egress", ["declare_subscriber", "declare_queryable"], everything)
 
 
 def _keys(identity: BusIdentity, lab: str) -> tuple[list[str], list[str], list[str], list[str]]:
-    """Keys on which an identity sends, answers, reads and asks."""
-    sends: list[str] = []
-    serves: list[str] = []
-    reads: list[str] = []
-    asks: list[str] = []
+    """Return the keys that an identity publishes, serves, subscribes to and queries."""
+    published: list[str] = []
+    served: list[str] = []
+    subscribed: list[str] = []
+    queried: list[str] = []
     for rig_topic in RIG_TOPICS:
         rule, query = RULES[rig_topic.name], rig_topic.traffic is Traffic.QUERY
-        if identity.role in rule.senders:
-            (serves if query else sends).extend(rig_topic.key(lab, rig) for rig in identity.rigs)
+        if identity.role in rule.publishers:
+            (served if query else published).extend(rig_topic.key(lab, rig) for rig in identity.rigs)
             if rig_topic is topics.EVENT:
-                # Events of a service as a whole stand under its own name.
-                sends.append(rig_topic.key(lab, identity.role))
-        if identity.role in rule.readers:
-            (asks if query else reads).append(rig_topic.key(lab, "*"))
+                # Events without a rig are published under the service's name.
+                published.append(rig_topic.key(lab, identity.role))
+        if identity.role in rule.subscribers:
+            (queried if query else subscribed).append(rig_topic.key(lab, "*"))
     for topic in SERVICE_TOPICS:
         rule, query = RULES[topic.name], topic.traffic is Traffic.QUERY
-        if identity.role in rule.senders:
-            # Whose commands a batch holds is told by its key: an edge with rigs of its own has a key of its own.
+        if identity.role in rule.publishers:
+            # The key of a batch identifies its edge: an edge with its own rigs has its own key.
             own_key = topic is topics.COMMANDS and identity.rigs != ("*",)
-            (serves if query else sends).append(topic.key(lab, identity.role, identity.name if own_key else "*"))
-        if identity.role in rule.readers:
-            (asks if query else reads).append(topic.key(lab, "*", "*"))
-    return sends, serves, reads, asks
+            (served if query else published).append(topic.key(lab, identity.role, identity.name if own_key else "*"))
+        if identity.role in rule.subscribers:
+            (queried if query else subscribed).append(topic.key(lab, "*", "*"))
+    return published, served, subscribed, queried
 
 
-def _widened(keys: Iterable[str], lab: str) -> list[str]:
-    """The keys as questions name them: a question to all rigs reaches each of them."""
-    wide = []
+def _wildcard(keys: Iterable[str], lab: str) -> list[str]:
+    """Return the keys with wildcards, as in a query to all rigs."""
+    wildcards = []
     for key in keys:
         parts = key.split("/")
         reserved = parts[2] in topics.RESERVED_RIG_NAMES
-        wide.append("/".join([ROOT, lab, parts[2], "*", "*"] if reserved else [ROOT, lab, "*", parts[3]]))
-    return sorted(set(wide))
+        wildcards.append("/".join([ROOT, lab, parts[2], "*", "*"] if reserved else [ROOT, lab, "*", parts[3]]))
+    return sorted(set(wildcards))

@@ -1,4 +1,4 @@
-"""The bus within one process: for tests, and for what runs in virtual time. Delivery is synchronous and complete."""
+"""The bus within one process, for tests and simulated time; delivery is synchronous and complete."""
 
 import threading
 from collections.abc import Callable
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def matches(key_expr: str, key: str) -> bool:
-    """Whether a key expression covers a key: `*` stands for one part, `**` for any number of parts."""
+    """Return whether a key expression matches a key: `*` is one chunk, `**` any number of chunks."""
 
     def match(pattern: list[str], parts: list[str]) -> bool:
         if not pattern:
@@ -28,25 +28,25 @@ def matches(key_expr: str, key: str) -> bool:
 
 @dataclass
 class MemoryHub:
-    """What connects the buses of one process; give the same hub to each."""
+    """Connects the buses of one process; pass the same hub to each."""
 
     subscribers: list[tuple[str, OnMessage]] = field(default_factory=list)
-    servers: list[tuple[str, Callable[[bytes], bytes]]] = field(default_factory=list)
+    queryables: list[tuple[str, Callable[[bytes], bytes]]] = field(default_factory=list)
     tokens: list[str] = field(default_factory=list)
-    watchers: list[tuple[str, OnLiveliness]] = field(default_factory=list)
+    liveliness_subscribers: list[tuple[str, OnLiveliness]] = field(default_factory=list)
     history: dict[str, list[bytes]] = field(default_factory=dict)
     lock: threading.RLock = field(default_factory=threading.RLock)
 
     def deliver(self, key: str, payload: bytes) -> None:
-        """Hand a message to everyone who subscribed to its key."""
+        """Deliver a message to all matching subscribers."""
         with self.lock:
             for key_expr, on_message in list(self.subscribers):
                 if matches(key_expr, key):
                     on_message(key, payload)
 
-    def tell(self, key: str, alive: bool) -> None:
-        """Tell the watchers of a token that it appeared or went."""
-        for key_expr, on_alive in list(self.watchers):
+    def notify(self, key: str, alive: bool) -> None:
+        """Notify the liveliness subscribers that a token appeared or disappeared."""
+        for key_expr, on_alive in list(self.liveliness_subscribers):
             if matches(key_expr, key):
                 on_alive(key, alive)
 
@@ -65,19 +65,19 @@ class _MemoryPublisher(Publisher):
     def __init__(self, hub: MemoryHub, key: str, traffic: Traffic) -> None:
         self._hub = hub
         self._key = key
-        self._keeps = traffic is Traffic.RECORDING
+        self._has_cache = traffic is Traffic.RECORDING
 
     def put(self, payload: bytes) -> None:
-        if self._keeps:
+        if self._has_cache:
             self._hub.history.setdefault(self._key, []).append(payload)
         self._hub.deliver(self._key, payload)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there is no resource to release."""
 
 
 class MemoryBus(Bus):
-    """See `hilrig_runtime.bus.api.Bus`."""
+    """Implements `hilrig_runtime.bus.api.Bus` within one process."""
 
     def __init__(self, hub: MemoryHub | None = None) -> None:
         self.hub = MemoryHub() if hub is None else hub
@@ -89,10 +89,10 @@ class MemoryBus(Bus):
 
     def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
         """See `Bus.subscribe`."""
-        return self._keep(self.hub.subscribers, (key_expr, on_message))
+        return self._add(self.hub.subscribers, (key_expr, on_message))
 
-    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:  # noqa: ARG002
-        """See `Bus.subscribe_newest`; delivery is at once, so nothing ever waits."""
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, depth: int) -> Handle:  # noqa: ARG002
+        """See `Bus.subscribe_newest`; delivery is immediate, so nothing is queued."""
         return self.subscribe(key_expr, on_message)
 
     def subscribe_recording(
@@ -102,63 +102,63 @@ class MemoryBus(Bus):
         on_loss: OnLoss,  # noqa: ARG002
         cache_depth: int = CACHE_DEPTH,  # noqa: ARG002
     ) -> Handle:
-        """See `Bus.subscribe_recording`; nothing is ever lost here."""
+        """See `Bus.subscribe_recording`; nothing is lost."""
         with self.hub.lock:
             for key, payloads in self.hub.history.items():
                 if matches(key_expr, key):
                     for payload in payloads:
                         on_message(key, payload)
-            return self._keep(self.hub.subscribers, (key_expr, on_message))
+            return self._add(self.hub.subscribers, (key_expr, on_message))
 
-    def declare_queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+    def declare_queryable(self, key: str, handler: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.declare_queryable`."""
-        return self._keep(self.hub.servers, (key, answer))
+        return self._add(self.hub.queryables, (key, handler))
 
     def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:  # noqa: ARG002
         """See `Bus.query`."""
-        answers = []
-        for key, answer in list(self.hub.servers):
+        replies = []
+        for key, handler in list(self.hub.queryables):
             if matches(key_expr, key):
                 try:
-                    answers.append(Reply(key, answer(payload)))
+                    replies.append(Reply(key, handler(payload)))
                 except HilrigError as error:
-                    answers.append(Reply(key, b"", str(error)))
-        return answers
+                    replies.append(Reply(key, b"", str(error)))
+        return replies
 
     def declare_token(self, key: str) -> Handle:
         """See `Bus.declare_token`."""
         self.hub.tokens.append(key)
-        self.hub.tell(key, True)
+        self.hub.notify(key, True)
 
         def undo() -> None:
             self.hub.tokens.remove(key)
-            self.hub.tell(key, False)
+            self.hub.notify(key, False)
 
-        return self._hold(_Undo(undo))
+        return self._register(_Undo(undo))
 
     def subscribe_liveliness(self, key_expr: str, on_alive: OnLiveliness) -> Handle:
         """See `Bus.subscribe_liveliness`."""
         for key in self.get_liveliness(key_expr):
             on_alive(key, True)
-        return self._keep(self.hub.watchers, (key_expr, on_alive))
+        return self._add(self.hub.liveliness_subscribers, (key_expr, on_alive))
 
     def get_liveliness(self, key_expr: str, *, timeout_s: float = 1.0) -> list[str]:  # noqa: ARG002
         """See `Bus.get_liveliness`."""
         return sorted(key for key in self.hub.tokens if matches(key_expr, key))
 
     def close(self) -> None:
-        """Take back everything, newest first."""
+        """Withdraw all declarations, newest first."""
         while self._handles:
             self._handles.pop().close()
 
-    def _keep(self, where: list[T], what: T) -> Handle:
-        where.append(what)
+    def _add(self, entries: list[T], entry: T) -> Handle:
+        entries.append(entry)
 
         def undo() -> None:
-            where.remove(what)
+            entries.remove(entry)
 
-        return self._hold(_Undo(undo))
+        return self._register(_Undo(undo))
 
-    def _hold(self, handle: Handle) -> Handle:
+    def _register(self, handle: Handle) -> Handle:
         self._handles.append(handle)
         return handle

@@ -1,10 +1,10 @@
-"""A complete stream out of zenoh's advanced publishers: live samples, and what is missing out of their caches.
+"""A reliable subscriber to zenoh's advanced publishers: receives live samples and recovers lost ones from their caches.
 
-zenoh's advanced subscriber would ask for all that is missing at once, and while a cache answers, its publisher's next
-put waits: a recorder that came back to a class of rigs held the simulation up until it had taken in seconds of batches.
-It asks for a gap only once, too, and takes the history of a publisher for old whose first live sample overtakes it. So
-this subscribes to plain samples, and a thread of its own fetches what is missing in small pieces, one after the other,
-until all is there or can't be had any more.
+zenoh's advanced subscriber requests all missing samples at once, and while a cache replies, the publisher's next put
+blocks: a recorder that restarted beside many rigs blocked the simulation until it had received seconds of batches. It
+also requests a gap only once, and ignores the history of a publisher whose first live sample arrives before it. So this
+class subscribes to plain samples, and its own thread fetches missing samples page by page until the gap is closed or
+the samples are no longer available.
 """
 
 import logging
@@ -20,24 +20,24 @@ from hilrig_runtime.bus.api import Handle, OnLoss, OnMessage
 from hilrig_runtime.bus.reorder_buffer import ReorderBuffer
 
 FETCH_PAGE_BYTES: Final = 256 * 1024
-"""Of samples asked for at once: little enough to lie in the buffers between two processes."""
-_PAUSE_S: Final = 0.002
-"""Between two pieces, so that what is live goes on."""
-_OVERTAKEN_S: Final = 0.1
-"""A heartbeat may come before the sample that it tells of."""
-_ASK_TIMEOUT_S: Final = 1.0
-_ASK_AGAIN_S: Final = 0.25
-_GIVE_UP_S: Final = 10.0
-"""Who has not answered for so long is not waited for any more: what came after is to be written."""
+"""Size of a page of samples, bytes: small enough for the buffers between two processes."""
+_PAGE_INTERVAL_S: Final = 0.002
+"""Pause between two pages, so that live samples are not delayed."""
+_HEARTBEAT_GRACE_S: Final = 0.1
+"""Time that a sample may arrive after the heartbeat that announces it."""
+_QUERY_TIMEOUT_S: Final = 1.0
+_RETRY_INTERVAL_S: Final = 0.25
+_RECOVERY_TIMEOUT_S: Final = 10.0
+"""Time without progress after which a gap is declared lost, so that later samples can be written."""
 _HEARTBEAT_S: Final = 0.25
 
 logger = logging.getLogger(__name__)
 
 
 def declare_recording_publisher(session: zenoh.Session, key: str, priority: zenoh.Priority, cache_depth: int) -> Any:
-    """A publisher with a cache of its newest `cache_depth` samples.
+    """Declare a publisher with a cache of its newest `cache_depth` samples.
 
-    It never waits: what a slow reader has no room for is dropped, and can be repeated.
+    It never blocks: samples for a slow subscriber are dropped, and can be recovered from the cache.
     """
     return zenoh.ext.declare_advanced_publisher(
         session,
@@ -46,8 +46,7 @@ def declare_recording_publisher(session: zenoh.Session, key: str, priority: zeno
         priority=priority,
         cache=zenoh.ext.CacheConfig(
             cache_depth,
-            # The cache is locked while it answers: it must not wait for a reader that is held up. Who misses an answer
-            # asks again.
+            # The cache is locked while it replies, so it must not wait for a slow subscriber, which repeats its query.
             replies_config=zenoh.ext.RepliesConfig(
                 congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.BACKGROUND, express=False
             ),
@@ -59,27 +58,27 @@ def declare_recording_publisher(session: zenoh.Session, key: str, priority: zeno
 
 @dataclass(slots=True)
 class _Source:
-    """One publisher."""
+    """State of one publisher."""
 
     cache: str
-    """Where its cache is asked."""
+    """Key expression of its cache."""
     samples: ReorderBuffer[zenoh.Sample]
     size: int = FETCH_PAGE_BYTES
-    """Of its newest sample, bytes."""
+    """Size of its newest sample, bytes."""
     is_new: bool = True
-    """It is not known yet what it sent before."""
-    ask_at_s: float = 0.0
-    """When to ask next, if something is missing; monotonic clock."""
-    since_s: float = 0.0
-    """Since when something is missing and nothing came of it."""
+    """Its earlier samples are still unknown."""
+    next_query_s: float = 0.0
+    """Time of the next query if samples are missing, monotonic clock, s."""
+    last_progress_s: float = 0.0
+    """Time since which samples are missing without progress, monotonic clock, s."""
     has_backlog: bool = False
-    """Something is missing."""
+    """Samples are missing."""
 
 
 class ReliableSubscriber(Handle):
-    """Subscribes to the recording publishers on `key_expr`; messages of each come in order and without a gap.
+    """Subscribes to the recording publishers on `key_expr`; delivers the messages of each in order and without gaps.
 
-    `on_loss` hears how many messages of a publisher could not be recovered; each can repeat its newest `cache_depth`.
+    `on_loss` gets the number of messages of a publisher that could not be recovered; each caches `cache_depth`.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class ReliableSubscriber(Handle):
         self._changed = threading.Condition()
         self._closing = False
         self._sources: dict[str, _Source] = {}
-        self._thread = threading.Thread(target=self._fetch, name="fetching", daemon=True)
+        self._thread = threading.Thread(target=self._fetch, name="recovery", daemon=True)
         self._thread.start()
         publishers = f"{key_expr}/@adv/pub/*/*/*"
         self._declared: list[Any] = [
@@ -102,7 +101,7 @@ class ReliableSubscriber(Handle):
         ]
 
     def close(self) -> None:
-        """See `Handle.close`; what waited behind a gap is delivered."""
+        """See `Handle.close`; delivers the samples that are buffered behind a gap."""
         while self._declared:
             self._declared.pop().undeclare()
         with self._changed:
@@ -112,7 +111,7 @@ class ReliableSubscriber(Handle):
                 for source in self._sources.values():
                     source.samples.flush()
 
-    # -- what comes -------------------------------------------------------------------------------------------------
+    # -- received samples -------------------------------------------------------------------------------------------
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         info = sample.source_info
@@ -125,21 +124,21 @@ class ReliableSubscriber(Handle):
             source.size = max(1, len(sample.payload))
             source.is_new = False
             source.samples.insert(int(info.source_sn), sample)
-            self._look(source)
+            self._update_backlog(source)
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         with self._changed:
             source = self._source(_cache_of(sample))
             source.samples.set_head(int.from_bytes(sample.payload.to_bytes(), "little"))
-            self._look(source, _OVERTAKEN_S)
+            self._update_backlog(source, _HEARTBEAT_GRACE_S)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             with self._changed:
-                # Also after an outage: what was sent last may be what is missing.
+                # Also after an outage: the newest samples may be missing.
                 source = self._source(_cache_of(sample))
                 source.is_new = True
-                self._look(source)
+                self._update_backlog(source)
 
     def _source(self, cache: str) -> _Source:
         source = self._sources.get(cache)
@@ -148,52 +147,52 @@ class ReliableSubscriber(Handle):
             source = self._sources[cache] = _Source(cache, samples)
         return source
 
-    def _look(self, source: _Source, wait_s: float = 0.0) -> None:
-        """See whether something is missing; if so, it is asked for after a while."""
+    def _update_backlog(self, source: _Source, delay_s: float = 0.0) -> None:
+        """Check whether samples are missing; if so, query them after `delay_s`."""
         had_backlog, source.has_backlog = source.has_backlog, source.is_new or bool(source.samples.missing(1))
         if source.has_backlog and not had_backlog:
-            source.since_s = time.monotonic()
-            source.ask_at_s = source.since_s + wait_s
+            source.last_progress_s = time.monotonic()
+            source.next_query_s = source.last_progress_s + delay_s
             self._changed.notify()
 
     def _deliver(self, sample: Any) -> None:
         self._on_message(str(sample.key_expr), sample.payload.to_bytes())
 
-    # -- what is fetched --------------------------------------------------------------------------------------------
+    # -- recovery ---------------------------------------------------------------------------------------------------
 
     def _fetch(self) -> None:
         while True:
             with self._changed:
-                source = self._next()
+                source = self._wait_for_backlog()
                 if source is None:
                     return
-                question = f"{source.cache}?{_wanted(source)}"
-            got = self._ask(source, question)
+                selector = f"{source.cache}?{_query_parameters(source)}"
+            new_samples = self._query(source, selector)
             with self._changed:
-                self._judge(source, got)
-            time.sleep(_PAUSE_S)
+                self._schedule(source, new_samples)
+            time.sleep(_PAGE_INTERVAL_S)
 
-    def _next(self) -> _Source | None:
-        """Wait for the source that is to be asked next, something of which is missing; None: the stream is closed."""
+    def _wait_for_backlog(self) -> _Source | None:
+        """Wait until a source must be queried, and return it; None: the subscriber is closed."""
         while not self._closing:
             behind = [source for source in self._sources.values() if source.has_backlog]
-            first = min(behind, key=lambda source: source.ask_at_s, default=None)
-            wait_s = None if first is None else first.ask_at_s - time.monotonic()
+            first = min(behind, key=lambda source: source.next_query_s, default=None)
+            wait_s = None if first is None else first.next_query_s - time.monotonic()
             if wait_s is not None and wait_s <= 0:
                 return first
             self._changed.wait(wait_s)
         return None
 
-    def _ask(self, source: _Source, question: str) -> int:
-        """Ask a source's cache; gives how many samples it had that are new."""
-        got = 0
+    def _query(self, source: _Source, selector: str) -> int:
+        """Query a source's cache; return the number of new samples."""
+        new_samples = 0
         try:
             replies = self._session.get(
-                question,
+                selector,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
-                timeout=_ASK_TIMEOUT_S,
+                timeout=_QUERY_TIMEOUT_S,
             )
             for reply in replies:
                 sample = reply.ok
@@ -202,30 +201,30 @@ class ReliableSubscriber(Handle):
                 with self._changed:
                     if self._closing:
                         break
-                    got += source.samples.insert(int(sample.source_info.source_sn), sample)
+                    new_samples += source.samples.insert(int(sample.source_info.source_sn), sample)
                     source.size = max(1, len(sample.payload))
                     source.is_new = False
         except zenoh.ZError as error:
-            logger.debug("%s can't be asked: %s", question, error)
-        return got
+            logger.debug("query of %s failed: %s", selector, error)
+        return new_samples
 
-    def _judge(self, source: _Source, got: int) -> None:
-        """Ask on at once where something came of it, after a while where nothing did, and one day not at all."""
+    def _schedule(self, source: _Source, new_samples: int) -> None:
+        """Query again at once after progress, else after an interval; declare the gap lost after the timeout."""
         now_s = time.monotonic()
-        if got:
-            source.since_s = now_s
-            source.ask_at_s = now_s
+        if new_samples:
+            source.last_progress_s = now_s
+            source.next_query_s = now_s
         else:
-            source.ask_at_s = now_s + _ASK_AGAIN_S
-        if now_s - source.since_s > _GIVE_UP_S:
+            source.next_query_s = now_s + _RETRY_INTERVAL_S
+        if now_s - source.last_progress_s > _RECOVERY_TIMEOUT_S:
             source.samples.skip_gap()
             source.is_new = False
-            source.since_s = now_s
-        self._look(source)
+            source.last_progress_s = now_s
+        self._update_backlog(source)
 
 
-def _wanted(source: _Source) -> str:
-    """What to ask a cache for: the next piece, or of a source that is new its newest sample, to know what there is."""
+def _query_parameters(source: _Source) -> str:
+    """Return the parameters of the next query: the next page, or for a new source its newest sample."""
     if source.is_new:
         return "_max=1"
     numbers = source.samples.missing(max(1, FETCH_PAGE_BYTES // source.size))
@@ -233,5 +232,5 @@ def _wanted(source: _Source) -> str:
 
 
 def _cache_of(sample: zenoh.Sample) -> str:
-    """Where the cache of the publisher is asked whose token or heartbeat this is."""
+    """Return the key expression of the cache of the publisher whose token or heartbeat this is."""
     return f"{str(sample.key_expr).rpartition('/')[0]}/*"

@@ -1,7 +1,7 @@
-"""One publisher's numbered messages, put in order: what is missing, what is lost. Pure; no bus and no clock.
+"""A reorder buffer for the numbered messages of one publisher; detects gaps and losses. Pure: no bus and no clock.
 
-Messages come as they come, live or repeated from the publisher's cache; each is delivered once, when all before it
-were, or were given up. The cache repeats the newest `window` messages: what is older and still missing can't be had.
+Messages arrive in any order, live or from the publisher's cache. Each is delivered once, after all earlier messages
+were delivered or skipped. The cache holds the newest `window` messages: an older message that is missing is lost.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,9 @@ MessageT = TypeVar("MessageT")
 
 
 class ReorderBuffer(Generic[MessageT]):
-    """`deliver` gets each message in order; `on_loss` how many were lost before the next that is delivered.
+    """Delivers messages in order; `on_loss` gets the number of messages lost before the next one that is delivered.
 
-    What a publisher sent before its first message that could be had is no loss: it is not known whether anything is
-    missing there.
+    Messages before the first available one don't count as lost, because it is unknown whether there were any.
     """
 
     def __init__(self, deliver: Callable[[MessageT], None], on_loss: Callable[[int], None], window: int) -> None:
@@ -24,50 +23,50 @@ class ReorderBuffer(Generic[MessageT]):
         self._due = 0
         self._newest = -1
         self._has_delivered = False
-        self._held: dict[int, MessageT] = {}
+        self._buffered: dict[int, MessageT] = {}
 
     def insert(self, number: int, message: MessageT) -> bool:
-        """A message came; True: it is new."""
-        if number < self._due or number in self._held:
+        """Add a message; return whether it is new."""
+        if number < self._due or number in self._buffered:
             return False
         self._newest = max(self._newest, number)
-        self._held[number] = message
+        self._buffered[number] = message
         self._deliver_ready()
         return True
 
     def set_head(self, number: int) -> None:
-        """The publisher has sent this number."""
+        """Set the number of the newest message that the publisher has sent."""
         self._newest = max(self._newest, number)
 
     def missing(self, at_most: int) -> range:
-        """The first numbers that are missing and can still be had, in a row, not more than `at_most`; empty: none."""
+        """Return the first range of missing numbers that are still cached, at most `at_most` of them; empty: none."""
         self._skip_to(self._newest + 1 - self._window)
         begin = end = self._due
-        while end <= self._newest and end not in self._held and end - begin < at_most:
+        while end <= self._newest and end not in self._buffered and end - begin < at_most:
             end += 1
         return range(begin, end)
 
     def skip_gap(self) -> None:
-        """What is missing before the first message that is held, or at the end, is lost."""
-        self._skip_to(min(self._held, default=self._newest + 1))
+        """Declare the first gap lost: all missing messages before the first buffered one, or before the head."""
+        self._skip_to(min(self._buffered, default=self._newest + 1))
 
     def flush(self) -> None:
-        """Deliver all that is held: nothing more will come, and what is missing is lost."""
+        """Deliver all buffered messages and declare all gaps lost; no more messages will be added."""
         while self._due <= self._newest:
             self.skip_gap()
 
     def _skip_to(self, end: int) -> None:
-        """Wait no longer for what comes before `end`."""
+        """Declare the missing messages before `end` lost."""
         while self._due < end:
-            gap_end = min(end, min(self._held, default=end))
+            gap_end = min(end, min(self._buffered, default=end))
             if self._has_delivered and gap_end > self._due:
                 self._on_loss(gap_end - self._due)
             self._due = gap_end
             self._deliver_ready()
 
     def _deliver_ready(self) -> None:
-        while self._due in self._held:
-            message = self._held.pop(self._due)
+        while self._due in self._buffered:
+            message = self._buffered.pop(self._due)
             self._due += 1
             self._has_delivered = True
             self._deliver(message)

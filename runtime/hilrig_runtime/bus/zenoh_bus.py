@@ -24,7 +24,7 @@ from hilrig_runtime.timing.realtime import raise_priority
 from hilrig_schemas.topics import Traffic
 
 _GOSSIP_S: Final = 1.0
-"""Ample: gossip takes some 50 ms where nothing else runs."""
+"""Time for discovery by gossip, s; it takes about 50 ms on an idle machine."""
 _PRIORITIES: Final = {
     Traffic.CONTROL: zenoh.Priority.REAL_TIME,
     Traffic.RECORDING: zenoh.Priority.DATA_LOW,
@@ -44,15 +44,15 @@ class _Declared(Handle):
 
 
 class _NewestReader(Handle):
-    """Reads a ring of the newest samples on a thread of its own.
+    """Reads a ring buffer of the newest samples on a thread of its own.
 
-    A callback would stand behind a queue of 256 samples: a process that was held up for a moment would then work
-    through what is over, at a step of 1 ms for a quarter of a second.
+    A callback is behind a queue of 256 samples: a process that was delayed for a moment would first process outdated
+    samples, at a step of 1 ms for a quarter of a second.
     """
 
-    def __init__(self, session: zenoh.Session, key_expr: str, on_message: OnMessage, waiting: int) -> None:
-        self._subscriber: Any = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(waiting))
-        # The thread waits in the ring, not in the subscriber: that could not be undeclared meanwhile.
+    def __init__(self, session: zenoh.Session, key_expr: str, on_message: OnMessage, depth: int) -> None:
+        self._subscriber: Any = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(depth))
+        # The thread waits in the ring buffer, not in the subscriber, which could not be undeclared meanwhile.
         self._ring = self._subscriber.handler
         self._on_sample = _deliver(on_message)
         self._closing = False
@@ -84,7 +84,7 @@ class _NewestReader(Handle):
 class _ZenohPublisher(Publisher):
     def __init__(self, publisher: Any) -> None:
         self._publisher = publisher
-        # The instance's put is zenoh's own: no frame of ours on the control path.
+        # The instance's put is zenoh's own method, which saves a Python call on the control path.
         self.put = publisher.put  # type: ignore[method-assign]
 
     def put(self, payload: bytes) -> None:
@@ -98,7 +98,7 @@ class _ZenohPublisher(Publisher):
 
 
 class ZenohBus(Bus):
-    """See `hilrig_runtime.bus.api.Bus`. Raises `OperationError` where the session can't be opened."""
+    """Implements `hilrig_runtime.bus.api.Bus` over zenoh; raises `OperationError` if the session can't be opened."""
 
     def __init__(self, bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> None:
         self._express = bus.express
@@ -108,11 +108,11 @@ class ZenohBus(Bus):
             with raise_priority():
                 self._session: zenoh.Session | None = zenoh.open(zenoh_config(bus, service, instance))
         except zenoh.ZError as error:
-            raise OperationError(_why_not_open(bus, service, error)) from error
+            raise OperationError(_open_error(bus, service, error)) from error
 
     @property
     def session(self) -> zenoh.Session:
-        """The zenoh session underneath."""
+        """The zenoh session."""
         if self._session is None:
             raise OperationError("the bus is closed")
         return self._session
@@ -134,9 +134,9 @@ class ZenohBus(Bus):
         """See `Bus.subscribe`."""
         return _Declared(self.session.declare_subscriber(key_expr, _deliver(on_message)))
 
-    def subscribe_newest(self, key_expr: str, on_message: OnMessage, waiting: int) -> Handle:
+    def subscribe_newest(self, key_expr: str, on_message: OnMessage, depth: int) -> Handle:
         """See `Bus.subscribe_newest`."""
-        return _NewestReader(self.session, key_expr, on_message, waiting)
+        return _NewestReader(self.session, key_expr, on_message, depth)
 
     def subscribe_recording(
         self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
@@ -144,33 +144,33 @@ class ZenohBus(Bus):
         """See `Bus.subscribe_recording`."""
         return ReliableSubscriber(self.session, key_expr, on_message, on_loss, cache_depth)
 
-    def declare_queryable(self, key: str, answer: Callable[[bytes], bytes]) -> Handle:
+    def declare_queryable(self, key: str, handler: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.declare_queryable`."""
 
         def reply(query: zenoh.Query) -> None:
             with query:
                 try:
-                    query.reply(key, answer(b"" if query.payload is None else query.payload.to_bytes()))
+                    query.reply(key, handler(b"" if query.payload is None else query.payload.to_bytes()))
                 except HilrigError as error:
                     query.reply_err(str(error).encode())
                 except Exception:
-                    logger.exception("answering a question on %s failed", key)
-                    query.reply_err(b"the service failed to answer; its log says why")
+                    logger.exception("query handler of %s failed", key)
+                    query.reply_err(b"internal error of the service; see its log")
 
         return _Declared(self.session.declare_queryable(key, reply))
 
     def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         """See `Bus.query`."""
-        answers = []
+        replies = []
         for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
             if reply.ok is not None:
-                answers.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+                replies.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes().decode(errors="replace")
-                # zenoh answers a question that nobody answered in time with an error of its own.
+                # zenoh reports a query without a reply as an error of its own.
                 if text.lower() != "timeout":
-                    answers.append(Reply(key_expr, b"", text))
-        return answers
+                    replies.append(Reply(key_expr, b"", text))
+        return replies
 
     def declare_token(self, key: str) -> Handle:
         """See `Bus.declare_token`."""
@@ -190,7 +190,7 @@ class ZenohBus(Bus):
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def close(self) -> None:
-        """Close the session: a process that ends with one open can hang."""
+        """Close the session; a process that exits with an open session can hang."""
         session, self._session = self._session, None
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -203,18 +203,16 @@ def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
     return on_sample
 
 
-def _why_not_open(bus: BusConfig, service: str, error: Exception) -> str:
+def _open_error(bus: BusConfig, service: str, error: Exception) -> str:
     if bus.topology == "router":
         host = unknown_host(bus.router)
         if host:
-            return (
-                f"no zenoh router answers at {bus.router} (bus.router in lab.toml): the name {host!r} is not known here"
-            )
-        certificate = "" if bus.tls is None else ", or it and our certificate do not trust each other: hilrig doctor"
+            return f"no zenoh router answers at {bus.router} (bus.router in lab.toml): unknown host name {host!r}"
+        certificate = "" if bus.tls is None else ", or the certificates do not match: run hilrig doctor"
         return f"no zenoh router answers at {bus.router} (bus.router in lab.toml){certificate}"
     if service not in MESH_ORDER:
-        return f"can't join the bus: {error}"
+        return f"can't connect to the bus: {error}"
     return (
         f"can't listen on {mesh_endpoint(bus, service)} for the bus ({system_reason(error)}): "
-        "is another hilrig running here? End it, or choose another bus.first_port in lab.toml"
+        "is another hilrig running here? Stop it, or choose another bus.first_port in lab.toml"
     )

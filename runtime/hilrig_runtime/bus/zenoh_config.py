@@ -1,10 +1,10 @@
-"""zenoh's configuration out of a lab's: who listens, who connects, with which certificate.
+"""Builds zenoh's configuration from the lab's: listening and connecting endpoints, and certificates.
 
-Scouting is off and endpoints explicit, so that who talks to whom is what the configuration says. In the mesh the first
-instance of each service listens on a port of its own and connects to those before it in `MESH_ORDER`, tools to all of
-them. Further instances listen where the system lets them and connect to those three, through whose gossip the others
-find them: every reader is linked to every writer, with no hop between and no other program needed. With a router
-everyone is its client, and there is no gossip, for it would lead past the router's access control.
+Scouting is off and endpoints are explicit, so that only configured peers communicate. In the mesh the first instance of
+each service listens on its own port and connects to those before it in `MESH_ORDER`; tools connect to all of them.
+Further instances listen on any free port and connect to these three, and the others find them by gossip: every
+subscriber is linked to every publisher directly, without another program. With a router every process is its client,
+without gossip, which would bypass the router's access control.
 """
 
 import json
@@ -21,25 +21,25 @@ from hilrig_runtime.errors import InputError
 MESH_ORDER: Final = ("sim", "edge", "recorder")
 ROUTER: Final = "router"
 FIRST_INSTANCE: Final = "1"
-"""The instance that has a port of its own in the mesh."""
-_WHERE_MADE: Final = "hilrig certs makes certificates, on the host that has ca.key"
+"""The instance that has a fixed port in the mesh."""
+_CERTS_HINT: Final = "create certificates with hilrig certs on the host that has ca.key"
 
 
 def mesh_endpoint(bus: BusConfig, service: str) -> str:
-    """Where a service listens for the others in the mesh."""
+    """Return the endpoint on which a service listens in the mesh."""
     return f"{_protocol(bus)}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
 
 
 def finds_others_by_gossip(bus: BusConfig, service: str, instance: str) -> bool:
-    """Whether an instance of `service` is linked with some of its neighbours only when others have told of them."""
+    """Return whether an instance of `service` discovers some of its peers by gossip only."""
     return bus.topology == "mesh" and service in MESH_ORDER and instance != FIRST_INSTANCE
 
 
 def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -> zenoh.Config:
-    """The zenoh configuration of an instance of `service`: one of `MESH_ORDER`, or any other name for a tool.
+    """Return the zenoh configuration of an instance of `service`: one of `MESH_ORDER`, or another name for a tool.
 
     Raises:
-        InputError: a certificate that the service needs is not there.
+        InputError: a certificate of the service is missing.
     """
     listen: list[str] = []
     if bus.topology == "router":
@@ -56,39 +56,39 @@ def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -
         "listen/endpoints": listen,
         "connect/endpoints": connect,
         "scouting/gossip/enabled": mode == "peer",
-        # A client without its router fails after a while, so that whoever opens it can say so, and hear signals
-        # between tries; a peer opens at once and connects whenever the others come up, also for the second time.
+        # Opening a client without a reachable router fails after a timeout, so that the caller can report it and handle
+        # signals between attempts. A peer opens at once and connects, and reconnects, when the others appear.
         "connect/timeout_ms": 500 if mode == "client" else -1,
         "connect/exit_on_failure": mode == "client",
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 400, "period_increase_factor": 1.5},
     }
     if bus.tls is not None:
-        settings |= _secured(bus.tls, own_identity(bus.tls, service, instance))
+        settings |= _tls_settings(bus.tls, own_identity(bus.tls, service, instance))
         if mode == "peer":
             settings["access_control"] = access_control(bus.tls)
-    return _made(settings)
+    return _build(settings)
 
 
 def router_config(bus: BusConfig, lab: str, listen: str) -> zenoh.Config:
-    """The zenoh configuration of a lab's router that listens at the endpoint `listen`.
+    """Return the zenoh configuration of a lab's router that listens on the endpoint `listen`.
 
     Raises:
-        InputError: a certificate that it needs is not there.
+        InputError: a certificate of the router is missing.
     """
     settings = _common() | {"mode": "router", "listen/endpoints": [listen]}
     if bus.tls is not None:
-        settings |= _secured(bus.tls, ROUTER)
+        settings |= _tls_settings(bus.tls, ROUTER)
         settings["access_control"] = access_control(bus.tls, lab)
-    return _made(settings)
+    return _build(settings)
 
 
 def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE) -> str:
-    """Whose certificate an instance of `service` takes.
+    """Return the common name of the certificate that an instance of `service` uses.
 
-    Of the names that its role has: the one that the instance is called, else the first whose key is on this host.
+    Of the names with its role: the name of the instance if it exists, else the first name whose key is on this host.
 
     Raises:
-        InputError: there is none.
+        InputError: no such key is on this host.
     """
     roles = (service,) if service in MESH_ORDER else TOOL_ROLES
     names = [identity.name for role in roles for identity in identities(tls) if identity.role == role]
@@ -98,7 +98,7 @@ def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE
         if (tls.folder / f"{name}.key").exists():
             return name
     wanted = " or ".join(f"{name}.key" for name in names)
-    raise InputError(f"bus.tls.folder: {tls.folder} holds no {wanted}; {_WHERE_MADE}")
+    raise InputError(f"bus.tls.folder: {tls.folder} does not contain {wanted}; {_CERTS_HINT}")
 
 
 def _protocol(bus: BusConfig) -> str:
@@ -115,10 +115,10 @@ def _common() -> dict[str, Any]:
     }
 
 
-def _secured(tls: BusTlsConfig, name: str) -> dict[str, Any]:
+def _tls_settings(tls: BusTlsConfig, name: str) -> dict[str, Any]:
     certificate, key = _file(tls, f"{name}.pem"), _file(tls, f"{name}.key")
     return {
-        # Nothing else is spoken, whatever an endpoint says.
+        # No other protocol is accepted, whatever an endpoint specifies.
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": _file(tls, "ca.pem"),
@@ -138,11 +138,11 @@ def _file(tls: BusTlsConfig, name: str) -> str:
     try:
         path.read_bytes()
     except OSError as error:
-        raise InputError(f"bus.tls.folder: {path} can't be read: {error.strerror}; {_WHERE_MADE}") from error
+        raise InputError(f"bus.tls.folder: {path} can't be read: {error.strerror}; {_CERTS_HINT}") from error
     return str(path)
 
 
-def _made(settings: dict[str, Any]) -> zenoh.Config:
+def _build(settings: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -150,7 +150,7 @@ def _made(settings: dict[str, Any]) -> zenoh.Config:
 
 
 def unknown_host(endpoint: str) -> str:
-    """The host of an endpoint ("tcp/host:port"), if this machine can't tell its address; empty: it can."""
+    """Return the host of an endpoint ("tcp/host:port") if it can't be resolved; empty: it can."""
     host = endpoint.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
     try:
         socket.getaddrinfo(host, None)
@@ -160,8 +160,8 @@ def unknown_host(endpoint: str) -> str:
 
 
 def system_reason(error: Exception) -> str:
-    """Why the system refused what zenoh asked of it, in its own words.
+    """Return the operating system's reason in one of zenoh's errors.
 
-    zenoh's text holds paths of its own sources; the system's reason stands before its error number.
+    zenoh's text contains paths of its source files; the system's reason is before the error number.
     """
     return str(error).partition(" (os error")[0].rpartition(": ")[2].lstrip("[")

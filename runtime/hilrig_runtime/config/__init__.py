@@ -1,1 +1,1 @@
-"""The lab's configuration: the models behind `lab.toml`, their validation and the template."""
+"""The lab's configuration: the schema of `lab.toml`, its validation and its template."""

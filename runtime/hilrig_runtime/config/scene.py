@@ -1,7 +1,7 @@
-"""The `[scene]` of a lab: the table, the trays and the parts that the magnet picks.
+"""The `[scene]` section of `lab.toml`: the table, the trays and the parts that the magnet picks.
 
-Lengths are millimetres and angles degrees, world frame, seen from above: x forwards, y to the left. Footprints are
-taken as discs (docs/model.md), so that what overlaps here is what carries there.
+Lengths are in millimeters and angles in degrees, in the world frame seen from above: x forward, y to the left.
+Footprints are approximated by discs (docs/model.md): parts overlap here exactly if they support each other there.
 """
 
 import math
@@ -13,27 +13,27 @@ from hilrig_runtime.config.types import Color, Flag, Name, Number, Positive, Sec
 
 
 class TableConfig(Section):
-    """The table that the arm's pedestal and all else stands on."""
+    """The table that carries the arm's pedestal, the trays and the parts."""
 
     height_mm: Annotated[float, Field(strict=True, lt=0, ge=-1000, allow_inf_nan=False)] = -60.0
-    """World z of its top; negative, for the arm's base plane lies above it."""
+    """World z of its top; negative, because the arm's base plane is above it."""
     centre_mm: Vector2 = (0.0, 0.0)
-    """Middle of its top: x, y."""
+    """Center of its top: x, y."""
     size_mm: tuple[Positive, Positive] = (1300.0, 1300.0)
-    """Its extent along x and y; by default all that the arm can reach is above it."""
+    """Its extent along x and y; by default it covers the whole workspace of the arm."""
 
 
 class MagnetConfig(Section):
-    """What the magnet at the tool's tip can take hold of."""
+    """The magnet at the tool's tip."""
 
     reach_mm: Positive = 15.0
-    """Largest sideways distance from the tip to the middle of a part's top."""
+    """Largest horizontal distance between the tip and the center of a part's top for picking."""
     gap_mm: Positive = 5.0
-    """Largest difference in height between the tip and a part's top."""
+    """Largest difference in height between the tip and a part's top for picking."""
 
 
 class PartConfig(Section):
-    """A part that lies in the scene when it starts."""
+    """A part of the scene at its start."""
 
     name: Name
     shape: Literal["cylinder", "box"] = "cylinder"
@@ -41,17 +41,18 @@ class PartConfig(Section):
     """Length, width, height; a cylinder's length and width are both its diameter."""
     mass_kg: Positive = 0.2
     ferromagnetic: Flag = True
-    """Whether the magnet holds it."""
+    """Whether the magnet can hold it."""
     colour: Color = "#c8ccd0"
     position_mm: Vector2
-    """Where its middle is: x, y. It stands on what is below: a tray or the table."""
+    """Its center: x, y. It rests on the tray or the table below it."""
     yaw_deg: Number = 0.0
 
     @model_validator(mode="after")
-    def _a_cylinder_is_round(self) -> "PartConfig":
+    def _cylinder_is_round(self) -> "PartConfig":
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
             raise ValueError(
-                f"the cylinder {self.name!r} has two diameters, {self.size_mm[0]:g} and {self.size_mm[1]:g}"
+                f"cylinder {self.name!r}: length and width must be equal, "
+                f"got {self.size_mm[0]:g} and {self.size_mm[1]:g} mm"
             )
         return self
 
@@ -62,11 +63,11 @@ class PartConfig(Section):
 
 
 class TrayConfig(Section):
-    """A flat tray with places for parts, in rows and columns about its middle."""
+    """A flat tray with places for parts, in rows and columns around its center."""
 
     name: Name
     position_mm: Vector2
-    """Where its middle is: x, y."""
+    """Its center: x, y."""
     yaw_deg: Number = 0.0
     size_mm: tuple[Positive, Positive, Positive] = (150.0, 150.0, 8.0)
     """Length, width, height above the table."""
@@ -75,15 +76,15 @@ class TrayConfig(Section):
     columns: Annotated[int, Field(strict=True, ge=1, le=20)] = 2
     """Places along its width."""
     pitch_mm: Positive = 70.0
-    """Distance between neighbouring places."""
+    """Distance between neighboring places."""
     colour: Color = "#4a5560"
 
     @model_validator(mode="after")
-    def _places_are_on_it(self) -> "TrayConfig":
+    def _places_fit(self) -> "TrayConfig":
         for count, length, along in ((self.rows, self.size_mm[0], "long"), (self.columns, self.size_mm[1], "wide")):
             span = (count - 1) * self.pitch_mm
             if span > length:
-                raise ValueError(f"tray {self.name!r} is {length:g} mm {along}, its places need {span:g} mm")
+                raise ValueError(f"tray {self.name!r} is {length:g} mm {along}, but its places need {span:g} mm")
         return self
 
     @property
@@ -125,7 +126,7 @@ DEFAULT_TRAYS = (TrayConfig(name="tray", position_mm=(320.0, -220.0), yaw_deg=-3
 
 
 class SceneConfig(Section):
-    """Everything around the arm; four parts and a tray with four places by default."""
+    """The surroundings of the arm; by default four parts and a tray with four places."""
 
     table: TableConfig = TableConfig()
     magnet: MagnetConfig = MagnetConfig()
@@ -133,18 +134,18 @@ class SceneConfig(Section):
     parts: Annotated[tuple[PartConfig, ...], Field(max_length=64)] = DEFAULT_PARTS
 
     @model_validator(mode="after")
-    def _everything_has_its_place(self) -> "SceneConfig":
-        things: tuple[TrayConfig | PartConfig, ...] = (*self.trays, *self.parts)
-        names = [thing.name for thing in things]
+    def _objects_are_distinct_and_on_the_table(self) -> "SceneConfig":
+        objects: tuple[TrayConfig | PartConfig, ...] = (*self.trays, *self.parts)
+        names = [item.name for item in objects]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"two things are called {name!r}: names must be distinct")
+                raise ValueError(f"duplicate name {name!r} of a part or tray")
         half = [length / 2 for length in self.table.size_mm]
-        for thing in things:
-            x, y = (at - centre for at, centre in zip(thing.position_mm, self.table.centre_mm, strict=True))
+        for item in objects:
+            x, y = (at - center for at, center in zip(item.position_mm, self.table.centre_mm, strict=True))
             if abs(x) > half[0] or abs(y) > half[1]:
                 raise ValueError(
-                    f"{thing.name!r} at {_place(thing.position_mm)} is outside the table, which is "
+                    f"{item.name!r} at {_place(item.position_mm)} is outside the table, which is "
                     f"{self.table.size_mm[0]:g} mm by {self.table.size_mm[1]:g} mm about {_place(self.table.centre_mm)}"
                 )
         for index, one in enumerate(self.parts):
@@ -153,8 +154,8 @@ class SceneConfig(Section):
                 distance = math.dist(one.position_mm, other.position_mm)
                 if distance < needed:
                     raise ValueError(
-                        f"parts {one.name!r} and {other.name!r} overlap: their middles are {distance:.1f} mm apart "
-                        f"and need {needed:.1f} mm"
+                        f"parts {one.name!r} and {other.name!r} overlap: their centers are {distance:.1f} mm apart "
+                        f"and must be {needed:.1f} mm apart"
                     )
         return self
 

@@ -1,7 +1,7 @@
-"""The `[task]` of a lab: what the arm is to do, so that a recording can be graded.
+"""The `[task]` section of `lab.toml`: the task by which recordings are graded.
 
 Poses are reached one after the other, a path is followed from its first point to its last, parts are placed in trays;
-a task is any of these together. Lengths are millimetres and angles degrees, world frame.
+a task has at least one of these. Lengths are in millimeters and angles in degrees, in the world frame.
 """
 
 import math
@@ -15,30 +15,30 @@ Vector3 = tuple[Number, Number, Number]
 
 
 class PoseConfig(Section):
-    """A pose that the tool is to reach and hold."""
+    """A pose that the tool must reach and hold."""
 
     name: Name
     position_mm: Vector3
-    """Where the tool's tip is to be: x, y, z."""
+    """Target of the tool's tip: x, y, z."""
     yaw_deg: Number | None = None
-    """About world z; left out: any will do."""
+    """Angle about world z; default: any."""
     tolerance_mm: Positive = 2.0
-    """Largest distance that counts as there."""
+    """Largest distance from the target."""
     yaw_tolerance_deg: Positive = 2.0
     hold_s: Positive = 0.5
-    """Reached is what was held for so long."""
+    """Time that the pose must be held."""
 
 
 class PathConfig(Section):
-    """A path that the tool is to follow: straight from point to point."""
+    """A path that the tool must follow: straight from point to point."""
 
     points_mm: Annotated[tuple[Vector3, ...], Field(min_length=2, max_length=200)]
-    """Its corners: x, y, z each."""
+    """Its points: x, y, z each."""
     tolerance_mm: Positive = 5.0
-    """Largest distance from the path that counts as on it."""
+    """Largest distance from the path."""
 
     @model_validator(mode="after")
-    def _points_are_apart(self) -> "PathConfig":
+    def _points_are_distinct(self) -> "PathConfig":
         for number, (one, following) in enumerate(zip(self.points_mm, self.points_mm[1:], strict=False), start=1):
             if math.dist(one, following) < 0.1:
                 raise ValueError(f"points {number} and {number + 1} of the path are the same")
@@ -46,34 +46,34 @@ class PathConfig(Section):
 
 
 class PlaceConfig(Section):
-    """Parts that are to stand in the trays at the end."""
+    """Parts that must be in the trays at the end."""
 
     parts: tuple[Name, ...] = ()
-    """Which of the scene's parts; none named: all that the magnet holds."""
+    """Names of parts of the scene; default: all that the magnet can hold."""
     tolerance_mm: Positive = 2.0
-    """Largest distance of a part's middle from its place's."""
+    """Largest distance between the centers of a part and its place."""
 
 
 class TaskConfig(Section):
-    """What a run is graded by."""
+    """Task by which a run is graded."""
 
     title: Annotated[str, Field(max_length=200)] = ""
-    """What people call it."""
+    """Title in reports."""
     time_limit_s: NotNegative = 0.0
-    """From the controller's first torque on; 0: none."""
+    """Time limit from the controller's first torque on; 0: none."""
     poses: Annotated[tuple[PoseConfig, ...], Field(max_length=100)] = ()
-    """Reached in this order."""
+    """Poses to reach, in this order."""
     path: PathConfig | None = None
-    """Followed from its first point to its last; where there are poses too, the two may be done in any order."""
+    """Path to follow from its first point to its last, before or after the poses."""
     place: PlaceConfig | None = None
     """Parts to place."""
 
     @model_validator(mode="after")
-    def _there_is_something_to_do(self) -> "TaskConfig":
+    def _task_is_not_empty(self) -> "TaskConfig":
         if not self.poses and self.path is None and self.place is None:
             raise ValueError("a task needs poses, a path or parts to place: [[task.poses]], [task.path], [task.place]")
         names = [pose.name for pose in self.poses]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"two poses are called {name!r}: names must be distinct")
+                raise ValueError(f"duplicate pose name {name!r}")
         return self

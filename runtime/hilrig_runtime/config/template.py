@@ -1,6 +1,6 @@
-"""A `lab.toml` with every key, its meaning and its default: what `hilrig check --template` prints.
+"""The `lab.toml` template with every key, its description and its default; `hilrig check --template` prints it.
 
-Made from the models of `config`, so that it can't say anything else than they do.
+Generated from the models of `config`, so that the two can't differ.
 """
 
 import ast
@@ -18,29 +18,29 @@ from pydantic.fields import FieldInfo
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.config.types import Section
 
-WIDTH: Final = 110
+COMMENT_WIDTH: Final = 110
 
 
 def lab_template() -> str:
-    """The text of a lab's file in which every value is the default, explained; optional keys are commented out."""
+    """Return a lab's file in which every key has its default and a description; optional keys are commented out."""
     return "\n".join(_lines(LabConfig(), ())).strip() + "\n"
 
 
-def _lines(section: Section, path: tuple[str, ...], *, explained: bool = True) -> Iterator[str]:
-    meanings = _meanings(type(section))
+def _lines(section: Section, path: tuple[str, ...], *, with_comments: bool = True) -> Iterator[str]:
+    descriptions = _descriptions(type(section))
     tables: list[tuple[str, Any]] = []
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
         if isinstance(value, Section) or (isinstance(value, tuple) and value and isinstance(value[0], Section)):
             tables.append((name, value))
             continue
-        if explained:
-            yield from _explanation(field, meanings.get(name, ""))
+        if with_comments:
+            yield from _explanation(field, descriptions.get(name, ""))
         yield f"# {name} =" if value is None else f"{name} = {_literal(value)}"
     for name, value in tables:
         field = type(section).model_fields[name]
         yield ""
-        yield from _explanation(field, meanings.get(name, ""))
+        yield from _explanation(field, descriptions.get(name, ""))
         here = (*path, name)
         if isinstance(value, Section):
             yield from _about(type(value))
@@ -48,19 +48,19 @@ def _lines(section: Section, path: tuple[str, ...], *, explained: bool = True) -
             yield from _lines(value, here)
         else:
             for number, item in enumerate(value):
-                # The keys of an array's tables are explained once.
+                # The keys of an array's tables are described once.
                 first = number == 0
                 yield from _about(type(item)) if first else [""]
                 yield f"[[{'.'.join(here)}]]"
-                yield from _lines(item, here, explained=first)
+                yield from _lines(item, here, with_comments=first)
 
 
 def _about(model: type[Section]) -> Iterator[str]:
     yield from _comment((model.__doc__ or "").strip().split("\n\n")[0])
 
 
-def _meanings(model: type[Section]) -> dict[str, str]:
-    """What stands below each key in the model's source; read here, for every process of a lab imports the models."""
+def _descriptions(model: type[Section]) -> dict[str, str]:
+    """Return the docstring below each key of a model; read from the source only when the template is made."""
     found = {}
     for one in (one for one in reversed(model.__mro__) if issubclass(one, Section)):
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
@@ -80,7 +80,7 @@ def _explanation(field: FieldInfo, text: str) -> Iterator[str]:
 
 
 def _comment(text: str) -> Iterator[str]:
-    for line in textwrap.wrap(" ".join(text.replace("`", "").split()), WIDTH):
+    for line in textwrap.wrap(" ".join(text.replace("`", "").split()), COMMENT_WIDTH):
         yield f"# {line}"
 
 

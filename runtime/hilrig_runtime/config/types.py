@@ -1,5 +1,6 @@
-"""What the tables of `lab.toml` are made of: a strict base class, and the kinds of numbers that stand in them."""
+"""Base class and value types of the tables in `lab.toml`."""
 
+from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Annotated, Final
 
@@ -8,31 +9,38 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from hilrig_schemas.topics import NAME_PATTERN
 
 _NAME: Final = rf"^{NAME_PATTERN}$"
-_COLOUR: Final = r"^#[0-9a-fA-F]{6}$"
+_COLOR: Final = r"^#[0-9a-fA-F]{6}$"
 PATTERN_DESCRIPTIONS: Final = {
     _NAME: "1 to 63 letters, digits, - and _, beginning with a letter or digit",
-    _COLOUR: "a colour as #2f6fc4",
+    _COLOR: "a color such as #2f6fc4",
 }
-"""What a text that follows a pattern is called to people."""
+"""Human-readable description of each regular expression."""
 
-# TOML has types of its own: a number in quotes is a mistake.
+# Strict: TOML has types of its own, so a number in quotes is an error.
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=_NAME)]
-Color = Annotated[str, Field(pattern=_COLOUR)]
+Color = Annotated[str, Field(pattern=_COLOR)]
 Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-# pydantic's own of that kind takes as long to import as all of ours.
+# pydantic's own network type takes as long to import as all of this package.
 Network = Annotated[IPv4Network | IPv6Network, BeforeValidator(ip_network)]
 Vector2 = tuple[Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
 
 
-class Section(BaseModel):
-    """Base of every table of the file: unknown keys are mistakes, values are fixed once read.
+@dataclass(frozen=True)
+class TableForm:
+    """Marks a list of tables that may also be written as one table of this type."""
 
-    What stands below a key is its meaning, for `template`.
+    section: type["Section"]
+
+
+class Section(BaseModel):
+    """Base of every table of the file: unknown keys are errors, values are immutable.
+
+    The docstring below a key is its description in the template.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,51 +1,137 @@
-"""What a person wrote wrong in a file or a request, as sentences: pydantic's findings, each with its place."""
+"""Formats pydantic's validation errors as plain sentences, each with the place of the value."""
 
+import difflib
+import reprlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final, get_args
 
 from pydantic import ValidationError
 
-from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS
+from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS, Section, TableForm
+
+_BOUNDS: Final = {"greater_than_equal": "≥", "greater_than": ">", "less_than_equal": "≤", "less_than": "<"}
+_CONTEXT_KEYS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
+_EXPECTED: Final = {
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "int_type": "an integer",
+    "int_parsing": "an integer",
+    "int_from_float": "an integer",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "string_type": "a string",
+    "path_type": "a path",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+}
+"""pydantic's type of error → the value that is accepted."""
+_REPR: Final = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 80
 
 
 def format_validation_error(error: ValidationError) -> list[str]:
-    """A sentence for each mistake that a person made, with its place."""
-    return [_sentence(mistake) for mistake in _causes(error)]
+    """Return one sentence for each invalid value, with its place."""
+    return [_sentence(detail) for detail in _causes(error)]
 
 
 def _causes(error: ValidationError) -> list[Any]:
-    """The mistakes, without the complaint that a list is too short for lack of an item that is itself mistaken."""
-    mistakes = list(_flat(error, ()))
+    """Return the details of all errors, except of a list that is too short only because an item of it is invalid."""
+    details = list(_flatten(error, ()))
 
-    def follows_from_another(mistake: Any) -> bool:
-        place = mistake["loc"]
-        inner = (other["loc"] for other in mistakes if other is not mistake)
-        return mistake["type"] == "too_short" and any(loc[: len(place)] == place for loc in inner)
+    def is_consequence(detail: Any) -> bool:
+        place = detail["loc"]
+        others = (other["loc"] for other in details if other is not detail)
+        return detail["type"] == "too_short" and any(loc[: len(place)] == place for loc in others)
 
-    return [mistake for mistake in mistakes if not follows_from_another(mistake)]
+    return [detail for detail in details if not is_consequence(detail)]
 
 
-def _flat(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[Any]:
-    """Every mistake with its whole place; what a table's own validation found stands inside one of the lab's."""
-    for mistake in error.errors():
-        here: dict[str, Any] = {**mistake, "loc": (*place, *mistake["loc"])}
-        cause = mistake.get("ctx", {}).get("error")
+def _flatten(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[Any]:
+    """Yield the details of each error with its full place; errors of a nested validation are inside one of these."""
+    for detail in error.errors():
+        here: dict[str, Any] = {**detail, "loc": (*place, *detail["loc"])}
+        cause = detail.get("ctx", {}).get("error")
         if isinstance(cause, ValidationError):
-            yield from _flat(cause, here["loc"])
+            yield from _flatten(cause, here["loc"])
         else:
+            if detail["type"] == "extra_forbidden":
+                here["keys"] = _known_keys(error.title, detail["loc"][:-1])
             yield here
 
 
-def _sentence(mistake: Any) -> str:
-    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"]).lstrip(".")
-    if mistake["type"] == "extra_forbidden":
-        return f"{place}: unknown key"
-    if mistake["type"] == "missing":
-        return f"{place}: is missing"
-    if mistake["type"] == "value_error":
-        return f"{place}: {mistake['ctx']['error']}" if place else str(mistake["ctx"]["error"])
-    if mistake["type"] == "string_pattern_mismatch":
-        expected = PATTERN_DESCRIPTIONS[mistake["ctx"]["pattern"]]
-    else:
-        expected = mistake["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-    return f"{place}: expected {expected}, found {mistake['input']!r}"
+def _known_keys(model: str, place: tuple[str | int, ...]) -> list[str]:
+    """Return the keys of the table at a place inside the model of that name."""
+    tables = [one for one in _all_subclasses(Section) if one.__name__ == model]
+    for part, following in zip(place, (*place[1:], None), strict=True):
+        fields = [one.model_fields[part] for one in tables if part in one.model_fields]
+        forms = [mark.section for field in fields for mark in field.metadata if isinstance(mark, TableForm)]
+        if forms and not isinstance(following, int):
+            tables = forms
+        elif fields:
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
+        else:
+            # The place of a union's member names its kind; an index names the item of a list.
+            chosen = [one for one in tables if "kind" in one.model_fields and one.model_fields["kind"].default == part]
+            tables = chosen or tables
+    return sorted({key for one in tables for key in one.model_fields})
+
+
+def _all_subclasses(base: type[Section]) -> Iterator[type[Section]]:
+    for one in base.__subclasses__():
+        yield one
+        yield from _all_subclasses(one)
+
+
+def _tables_in(annotation: Any) -> Iterator[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _tables_in(argument)
+
+
+def _sentence(detail: Any) -> str:
+    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in detail["loc"]).lstrip(".")
+    text = _text(detail)
+    return f"{place}: {text}" if place else text
+
+
+def _text(detail: Any) -> str:
+    kind, context = detail["type"], detail.get("ctx", {})
+    got = _REPR.repr(detail["input"])
+    match kind:
+        case "extra_forbidden":
+            return _unknown_key(str(detail["loc"][-1]), detail["keys"])
+        case "missing":
+            return "is missing"
+        case "value_error":
+            return str(context["error"])
+        case "string_pattern_mismatch":
+            return f"must be {PATTERN_DESCRIPTIONS[context['pattern']]}, got {got}"
+        case "literal_error":
+            return f"must be {context['expected']}, got {got}"
+        case "union_tag_invalid":
+            return f"kind must be one of {context['expected_tags']}, got {context['tag']!r}"
+        case "union_tag_not_found":
+            return "the key kind is missing"
+        case "too_short" | "too_long":
+            bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
+            return f"must have {bound} items, got {context['actual_length']}"
+        case "string_too_long":
+            return f"must have at most {context['max_length']} characters, got {len(detail['input'])}"
+    if kind in _BOUNDS:
+        bound = context[_CONTEXT_KEYS[kind]]
+        return f"must be {_BOUNDS[kind]} {f'{bound:g}' if isinstance(bound, float) else bound}, got {got}"
+    if kind in _EXPECTED:
+        return f"must be {_EXPECTED[kind]}, got {got}"
+    return f"{detail['msg']}, got {got}"
+
+
+def _unknown_key(key: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(key, known, n=1)
+    if near:
+        return f"unknown key, did you mean {near[0]}?"
+    return f"unknown key; known keys are {', '.join(known)}" if known else "unknown key"

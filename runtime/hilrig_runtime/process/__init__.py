@@ -1,1 +1,1 @@
-"""The life of a service process: startup, discovery, health reports, logging and shutdown."""
+"""Service processes: startup, discovery, health reports, logging and shutdown."""

@@ -1,10 +1,10 @@
-"""Who else runs in the lab: each service says what it is and for which rigs, and gives way to an elder.
+"""Discovery of the running services of a lab, and detection of duplicate instances.
 
-Two simulations of one rig, or two edges, would each tell the controller something else. So a service asks the others
-of its kind before it begins, and again whenever one appears and every few seconds: a network that was in two halves
-may have let both in. Of two that have a rig in common, or a name, the one that started later ends and says why. The
-same answers tell how far the hosts' wall clocks are apart; nothing depends on that, people want to know. Nor does
-anything depend on who is gone: it stands in the log, so that an operator finds the moment at which a link broke.
+Two simulations or two edges of one rig would contradict each other. So a service queries the others of its kind before
+it starts, again whenever one appears, and every few seconds: during a network partition both may have started. Of two
+services with a common rig or the same name, the one that started later stops and reports why. The same replies give
+the offsets between the hosts' wall clocks, which are only reported. Lost peers are only logged, so that an operator
+finds the time at which a link failed.
 """
 
 import logging
@@ -27,50 +27,51 @@ from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_alive_key
 
-ASK_PERIOD_NS: Final = 10_000_000_000
-ASK_AGAIN_S: Final = 0.1
-ASK_TIMEOUT_S: Final = 0.5
+RECHECK_PERIOD_NS: Final = 10_000_000_000
+RETRY_INTERVAL_S: Final = 0.1
+QUERY_TIMEOUT_S: Final = 0.5
 CLAIM_TIMEOUT_S: Final = 3.0
-"""For one that is there and slow to answer; who has answered is not waited for."""
-NAMED: Final = 3
-"""Rigs that a refusal names before it says "and … more"."""
+"""Query timeout for the check of conflicts, s; it ends early when all services have replied."""
+MAX_NAMES_IN_MESSAGE: Final = 3
+"""Number of rigs that an error message names before "and … more"."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How far another service's wall clock is ahead of ours."""
+    """How far another service's wall clock is ahead of this one's."""
 
     peer: str = ""
-    """The service, "<service>/<instance>"; empty: nobody was heard."""
+    """The service, "<service>/<instance>"; empty: no service replied."""
     offset_ns: int = 0
     uncertainty_ns: int = 0
-    """Half of the round trip of the question."""
+    """Half of the round-trip time of the query."""
 
 
 def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
-    """Why a service must give way, for people; empty: it need not.
+    """Return why a service must stop, human-readable; empty: it may run.
 
-    It does to an elder of its kind that has its instance name or one of its rigs; of two that started in the same
-    nanosecond the name decides, so that exactly one goes on.
+    It must stop if an older service of its kind has its instance name or one of its rigs. If both started in the same
+    nanosecond, the name decides, so that exactly one keeps running.
     """
     for other in others:
         if other.service != own.service or (other.incarnation, other.instance) >= (own.incarnation, own.instance):
             continue
         where = f"{other.service}/{other.instance} on {other.host}"
         if other.instance == own.instance:
-            return f"another {own.service} is called {own.instance!r} already: {where}; choose another --instance"
+            return f"{where} has the same instance name; choose another --instance"
         shared = sorted(set(own.rigs) & set(other.rigs))
         if shared:
-            more = f" and {len(shared) - NAMED} more" if len(shared) > NAMED else ""
-            return f"{where} serves {', '.join(shared[:NAMED])}{more} already; a rig has one {own.service} (--rigs)"
+            rest = len(shared) - MAX_NAMES_IN_MESSAGE
+            rigs = ", ".join(shared[:MAX_NAMES_IN_MESSAGE]) + (f" and {rest} more" if rest > 0 else "")
+            return f"{where} already serves {rigs}; each rig has one {own.service} (--rigs)"
     return ""
 
 
-def worst_offset(others: Iterable[ServiceInfo], own_incarnation: int, asked_ns: int, heard_ns: int) -> ClockOffset:
-    """The clock that differs most from ours; the question left at `asked_ns`, all had answered at `heard_ns`, wall."""
-    middle_ns, half_ns = (asked_ns + heard_ns) // 2, (heard_ns - asked_ns) // 2
+def worst_offset(others: Iterable[ServiceInfo], own_incarnation: int, sent_ns: int, received_ns: int) -> ClockOffset:
+    """Return the largest clock offset; query sent at `sent_ns`, last reply received at `received_ns`, wall clock."""
+    middle_ns, half_ns = (sent_ns + received_ns) // 2, (received_ns - sent_ns) // 2
     offsets = [
         ClockOffset(f"{other.service}/{other.instance}", other.wall_ns - middle_ns, half_ns)
         for other in others
@@ -79,22 +80,22 @@ def worst_offset(others: Iterable[ServiceInfo], own_incarnation: int, asked_ns: 
     return max(offsets, key=lambda offset: abs(offset.offset_ns), default=ClockOffset())
 
 
-def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = ASK_TIMEOUT_S) -> list[ServiceInfo]:
-    """What the services of a lab that answer say of themselves, by service and instance."""
+def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = QUERY_TIMEOUT_S) -> list[ServiceInfo]:
+    """Query the running services of a lab; sorted by service and instance."""
     found = []
-    for answer in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
+    for reply in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
         try:
-            if not answer.error:
-                found.append(ServiceInfo.FromString(answer.payload))
+            if not reply.error:
+                found.append(ServiceInfo.FromString(reply.payload))
         except DecodeError:
             continue
     return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
 
 
 class PeerRegistry:
-    """Answers for one service, and watches for others of its kind.
+    """Announces one service, and detects conflicting instances and lost peers.
 
-    `rigs` gives the name of each of its rigs and where it is reached; `on_conflict` gets the reason to end.
+    `rigs` returns the name and address of each of its rigs; `on_conflict` gets the reason why the service must stop.
     """
 
     def __init__(
@@ -118,17 +119,17 @@ class PeerRegistry:
         self._claimed = False
         self._closing = False
         self._peers_down = PeerDownTracker()
-        self._seen: SimpleQueue[tuple[str, bool]] = SimpleQueue()
-        """Who came (True) or went, "<service>/<instance>"; what ends the watch has no name."""
+        self._changes: SimpleQueue[tuple[str, bool]] = SimpleQueue()
+        """Peers that appeared (True) or disappeared, "<service>/<instance>"; an empty name ends the thread."""
         self._declared: list[Handle] = [
-            bus.declare_queryable(SERVICE_INFO.key(lab, own.service, own.instance), self._answer)
+            bus.declare_queryable(SERVICE_INFO.key(lab, own.service, own.instance), self._handle_query)
         ]
 
     def claim(self) -> None:
-        """Make sure that nobody has these rigs, and keep an eye on it from now on; a second call does nothing.
+        """Check that no other service has these rigs, and keep monitoring; a second call does nothing.
 
         Raises:
-            OperationError: an elder has one of them.
+            OperationError: an older service has one of them.
         """
         if self._claimed:
             return
@@ -137,34 +138,34 @@ class PeerRegistry:
         watched = alive_key(self._lab, "*", "*")
         self._declared.append(
             self._bus.subscribe_liveliness(
-                watched, lambda key, alive: self._seen.put((source_of_alive_key(key), alive))
+                watched, lambda key, alive: self._changes.put((source_of_alive_key(key), alive))
             )
         )
-        threading.Thread(target=self._watch, name="presence", daemon=True).start()
+        threading.Thread(target=self._watch, name="discovery", daemon=True).start()
 
     def recheck(self) -> None:
-        """Look for an elder, for as long as the bus may take to be linked with everyone who is there.
+        """Check for older instances, until the bus has had time to link all peers.
 
         Raises:
-            OperationError: one has one of these rigs, or the name.
+            OperationError: an older service has one of these rigs, or the name.
         """
-        reason = self._look()
-        asked_s = 0.0
-        while not reason and asked_s < self._bus.settle_timeout_s:
-            time.sleep(ASK_AGAIN_S)
-            asked_s += ASK_AGAIN_S
-            reason = self._look()
+        reason = self._find_conflict()
+        waited_s = 0.0
+        while not reason and waited_s < self._bus.settle_timeout_s:
+            time.sleep(RETRY_INTERVAL_S)
+            waited_s += RETRY_INTERVAL_S
+            reason = self._find_conflict()
         if reason:
             raise OperationError(reason)
 
     def close(self) -> None:
-        """Stop answering and watching."""
+        """Stop the announcement and the monitoring."""
         self._closing = True
-        self._seen.put(("", False))
+        self._changes.put(("", False))
         while self._declared:
             self._declared.pop().close()
 
-    def _roster(self) -> ServiceInfo:
+    def _info(self) -> ServiceInfo:
         own = ServiceInfo()
         own.CopyFrom(self._own)
         for rig, address in self._rigs():
@@ -173,35 +174,35 @@ class PeerRegistry:
         own.wall_ns = self._clock.wall_ns()
         return own
 
-    def _answer(self, question: bytes) -> bytes:
-        del question
-        return self._roster().SerializeToString()
+    def _handle_query(self, payload: bytes) -> bytes:
+        del payload
+        return self._info().SerializeToString()
 
-    def _look(self) -> str:
-        asked_ns = self._clock.wall_ns()
+    def _find_conflict(self) -> str:
+        sent_ns = self._clock.wall_ns()
         others = list_services(self._bus, self._lab, timeout_s=CLAIM_TIMEOUT_S)
-        self.clock_offset = worst_offset(others, self._own.incarnation, asked_ns, self._clock.wall_ns())
-        return conflict(self._roster(), others)
+        self.clock_offset = worst_offset(others, self._own.incarnation, sent_ns, self._clock.wall_ns())
+        return conflict(self._info(), others)
 
     def _watch(self) -> None:
         monotonic_ns = self._clock.monotonic_ns
-        look_ns = monotonic_ns() + ASK_PERIOD_NS
+        recheck_ns = monotonic_ns() + RECHECK_PERIOD_NS
         while not self._closing:
             due_ns = self._peers_down.due_ns
-            next_ns = look_ns if due_ns is None else min(look_ns, due_ns)
+            next_ns = recheck_ns if due_ns is None else min(recheck_ns, due_ns)
             with suppress(Empty):
-                who, is_there = self._seen.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
+                peer, is_up = self._changes.get(timeout=max(0, next_ns - monotonic_ns()) * 1e-9)
                 if self._closing:
                     return
-                if is_there and who.startswith(f"{self._own.service}/"):
-                    look_ns = monotonic_ns()
-                self._note(who, is_there, monotonic_ns())
-            self._tell_of_absences(monotonic_ns())
-            if monotonic_ns() < look_ns:
+                if is_up and peer.startswith(f"{self._own.service}/"):
+                    recheck_ns = monotonic_ns()
+                self._track(peer, is_up, monotonic_ns())
+            self._log_lost_peers(monotonic_ns())
+            if monotonic_ns() < recheck_ns:
                 continue
-            look_ns = monotonic_ns() + ASK_PERIOD_NS
+            recheck_ns = monotonic_ns() + RECHECK_PERIOD_NS
             try:
-                reason = self._look()
+                reason = self._find_conflict()
             except OperationError:
                 # The bus is being closed.
                 return
@@ -209,16 +210,16 @@ class PeerRegistry:
                 self._on_conflict(reason)
                 return
 
-    def _note(self, who: str, is_there: bool, now_ns: int) -> None:
-        # Without a router a service does not see itself either.
-        if who == f"{self._own.service}/{self._own.instance}":
+    def _track(self, peer: str, is_up: bool, now_ns: int) -> None:
+        # With a router a service also receives its own token.
+        if peer == f"{self._own.service}/{self._own.instance}":
             return
-        if not is_there:
-            self._peers_down.mark_down(who, now_ns)
-        elif self._peers_down.mark_up(who):
-            logger.info("%s is on the bus again", who)
+        if not is_up:
+            self._peers_down.mark_down(peer, now_ns)
+        elif self._peers_down.mark_up(peer):
+            logger.info("contact with %s restored", peer)
 
-    def _tell_of_absences(self, now_ns: int) -> None:
-        gone = self._peers_down.overdue(now_ns)
-        if gone:
-            logger.warning("not on the bus any more: %s; ended, or the way there is broken", ", ".join(gone))
+    def _log_lost_peers(self, now_ns: int) -> None:
+        lost = self._peers_down.overdue(now_ns)
+        if lost:
+            logger.warning("lost contact with %s (stopped, or network failure)", ", ".join(lost))

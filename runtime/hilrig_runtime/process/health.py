@@ -1,4 +1,4 @@
-"""How a service is: counters that it keeps, and a report of them once a second."""
+"""Publishes a health report of a service once a second."""
 
 import os
 import platform
@@ -20,12 +20,12 @@ REPORT_PERIOD_NS: Final = 1_000_000_000
 
 
 class HealthReporter:
-    """Sends `Health` from `counters` once a second."""
+    """Publishes `Health` messages from the service's counters, once a second."""
 
     def __init__(self, publisher: Publisher, service: str, instance: str, incarnation: int, clock: Clock) -> None:
         self.counters = Counters()
         self.rig_reports: Callable[[], Iterable[RigReport]] = tuple
-        """Asked at each report for what the service knows of its rigs."""
+        """Called at each report for the reports of the service's rigs."""
         self.clock_offset: Callable[[], ClockOffset] = ClockOffset
         self._publisher = publisher
         self._identity = {
@@ -42,12 +42,12 @@ class HealthReporter:
         self._last = (0, 0)
 
     def report_if_due(self, now_ns: int) -> None:
-        """Send a report when the last one is a second old; `now_ns` is of the monotonic clock."""
+        """Publish a report if the last one is a second old; `now_ns`: monotonic clock."""
         if now_ns - self._last_ns >= REPORT_PERIOD_NS:
             self.report(now_ns)
 
     def report(self, now_ns: int) -> None:
-        """Send a report now."""
+        """Publish a report now."""
         counters = self.counters
         seconds = max(1, now_ns - self._last_ns) * 1e-9
         received, published = self._last
@@ -79,14 +79,14 @@ class HealthReporter:
 _COPIED: Final = tuple(name for name in Counters.__slots__ if name in Health.DESCRIPTOR.fields_by_name)
 
 
-def _percentile(ordered: list[int], share: float) -> int:
-    return ordered[round(share * (len(ordered) - 1))] if ordered else 0
+def _percentile(ordered: list[int], fraction: float) -> int:
+    return ordered[round(fraction * (len(ordered) - 1))] if ordered else 0
 
 
 def resident_bytes() -> int:
-    """Memory of this process that is resident, bytes; 0 where the system does not tell."""
+    """Resident memory of this process, bytes; 0: unknown on this system."""
     if sys.platform == "linux":
-        # A process that may open no more files, for all of them are connections, works on.
+        # A process that has reached its limit of open files, all of them connections, must keep running.
         with suppress(OSError), open("/proc/self/statm", "rb") as statm:  # noqa: PTH123  # once a second on a real-time loop
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0

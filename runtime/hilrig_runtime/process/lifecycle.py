@@ -1,4 +1,4 @@
-"""The life of a service's process: its share of the processor, the bus, the service, and the end."""
+"""Runs a service as a process: scheduling policy, signals, bus connection, shutdown."""
 
 import contextlib
 import logging
@@ -30,12 +30,12 @@ def run_service(
     stop_with_parent: bool = False,
     close_timeout_s: float = CLOSE_TIMEOUT_S,
 ) -> None:
-    """Open the bus, run a service until it is told to stop, and close everything.
+    """Open the bus, run a service until it is stopped, and close everything.
 
     Raises:
-        HilrigError: the service can't start or can't go on; what it opened is closed.
+        HilrigError: the service can't start or can't continue; everything it opened is closed.
     """
-    _ask_for_time(name, lab)
+    _set_scheduling(name, lab)
     allow_open_files()
     stopping = threading.Event()
     stop_on_signals(stopping)
@@ -47,54 +47,54 @@ def run_service(
         return
     with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
         logger.debug("running as %s", service.source)
-        with _no_thread_missing(service):
+        with _stop_on_thread_crash(service):
             run(service)
         service.check()
 
 
 @contextlib.contextmanager
-def _no_thread_missing(service: Service) -> Iterator[None]:
-    """Where a mistake ends a thread the service would run on with half of its work: it ends, to be started anew."""
-    before = threading.excepthook
+def _stop_on_thread_crash(service: Service) -> Iterator[None]:
+    """Stop the service if a thread crashes, so that it is restarted instead of running on incompletely."""
+    previous = threading.excepthook
 
-    def on_mistake(ended: threading.ExceptHookArgs) -> None:
-        before(ended)
+    def on_crash(crashed: threading.ExceptHookArgs) -> None:
+        previous(crashed)
         if not service.stopping.is_set():
-            name = ended.thread.name if ended.thread is not None else "unknown"
-            service.fail(f"{service.source}: its thread {name!r} was ended by a mistake in the program (see above)")
+            name = crashed.thread.name if crashed.thread is not None else "unknown"
+            service.fail(f"{service.source}: thread {name!r} crashed (see traceback above)")
 
-    threading.excepthook = on_mistake
+    threading.excepthook = on_crash
     try:
         yield
     finally:
-        threading.excepthook = before
+        threading.excepthook = previous
 
 
-def _ask_for_time(name: str, lab: LabConfig) -> None:
-    """Services whose punctuality is the product go first, the others may wait for their turn."""
+def _set_scheduling(name: str, lab: LabConfig) -> None:
+    """Give the services that close the loop a higher priority than all others."""
     priority = REALTIME_PRIORITIES.get(name)
     if priority is None:
         lower_priority()
         return
-    # Before the bus is opened: its threads inherit both.
+    # Before the bus is opened, because its threads inherit both.
     set_short_slice()
     if lab.realtime and not go_realtime(priority):
-        logger.debug("the system grants no real-time policy: other programs may hold up this one")
+        logger.debug("no permission for a real-time scheduling policy: other programs may delay this one")
 
 
 def allow_open_files() -> None:
-    """Have as many files open as the system lets this user: each connection is one, and 1,024 is a usual beginning."""
+    """Raise the limit of open files to the hard limit: each connection needs one, and the usual soft limit is 1,024."""
     if sys.platform != "win32":
         import resource
 
-        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        # Some systems call it unlimited and take less.
+        _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+        # Some systems report no limit, but accept less.
         with contextlib.suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
 
 
 def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:
-    """Join the bus; a service waits for its router, for the two may start in any order. None: told to stop first."""
+    """Open the bus; wait for the router, because the two may start in any order. None: stopped while waiting."""
     waiting = False
     while not stopping.is_set():
         try:

@@ -1,42 +1,44 @@
-"""Who of the others was there and is gone: worth a word when it lasts, and another when he is back.
+"""Tracks peers that are unreachable for longer than a grace time, and their return.
 
-A link that is down for a moment is not, nor is the end of a whole lab, in which one service goes after the other.
-Pure: time is passed in.
+A link that is down for a moment is not reported, nor is the shutdown of a whole lab, in which the services stop one
+after the other. Pure: time is passed in.
 """
 
 from typing import Final
 
 PEER_DOWN_GRACE_NS: Final = 2_000_000_000
+"""Time that a peer must be down before it is reported, ns."""
 
 
 class PeerDownTracker:
-    """See the module."""
+    """Decides which peers to report as lost, and which of these came back."""
 
     def __init__(self) -> None:
-        self._gone_ns: dict[str, int] = {}
-        """By who is gone and not told of yet, when he went, ns, monotonic clock."""
-        self._told: set[str] = set()
+        self._down_since_ns: dict[str, int] = {}
+        """Peers that are down and not reported yet: when each went down, ns, monotonic clock."""
+        self._reported: set[str] = set()
 
-    def mark_down(self, who: str, now_ns: int) -> None:
-        """He is not there any more."""
-        self._gone_ns.setdefault(who, now_ns)
+    def mark_down(self, peer: str, now_ns: int) -> None:
+        """Record that a peer is down."""
+        self._down_since_ns.setdefault(peer, now_ns)
 
-    def mark_up(self, who: str) -> bool:
-        """He is there; whether it was told that he was gone."""
-        self._gone_ns.pop(who, None)
-        told = who in self._told
-        self._told.discard(who)
-        return told
+    def mark_up(self, peer: str) -> bool:
+        """Record that a peer is up; return whether it was reported as lost."""
+        self._down_since_ns.pop(peer, None)
+        was_reported = peer in self._reported
+        self._reported.discard(peer)
+        return was_reported
 
     @property
     def due_ns(self) -> int | None:
-        """When there is something to tell, if nobody comes back before; None: nobody is gone untold."""
-        return min(self._gone_ns.values()) + PEER_DOWN_GRACE_NS if self._gone_ns else None
+        """Time of the next report, ns, monotonic clock; None: no report is pending."""
+        return min(self._down_since_ns.values()) + PEER_DOWN_GRACE_NS if self._down_since_ns else None
 
     def overdue(self, now_ns: int) -> list[str]:
-        """Who is gone for long enough to be told, sorted; each once."""
-        found = sorted(who for who, since_ns in self._gone_ns.items() if now_ns - since_ns >= PEER_DOWN_GRACE_NS)
-        for who in found:
-            del self._gone_ns[who]
-            self._told.add(who)
+        """Return the peers that are down for longer than the grace time, sorted; each is returned once."""
+        down = self._down_since_ns.items()
+        found = sorted(peer for peer, since_ns in down if now_ns - since_ns >= PEER_DOWN_GRACE_NS)
+        for peer in found:
+            del self._down_since_ns[peer]
+            self._reported.add(peer)
         return found

@@ -1,4 +1,4 @@
-"""What a service logs, on standard error: lines for people, or one JSON object a line for a log collector."""
+"""Logging of a service to standard error: plain text, or one JSON object per line for a log collector."""
 
 import json
 import logging
@@ -10,7 +10,7 @@ from hilrig_runtime.errors import InputError
 
 
 class JsonFormatter(logging.Formatter):
-    """One record as one JSON object: time (UTC), level, service, instance, where from, and what."""
+    """Formats a record as a JSON object: time (UTC), level, service, instance, logger and message."""
 
     def __init__(self, service: str, instance: str) -> None:
         super().__init__()
@@ -18,7 +18,7 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """See `logging.Formatter.format`."""
-        said: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname,
             **self._identity,
@@ -26,22 +26,22 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
         }
         if record.exc_info:
-            said["exception"] = self.formatException(record.exc_info)
-        return json.dumps(said, ensure_ascii=False)
+            entry["exception"] = self.formatException(record.exc_info)
+        return json.dumps(entry, ensure_ascii=False)
 
 
 def start_logging(service: str, instance: str, log_format: str) -> None:
-    """Log to standard error as `log_format` says, "text" or "json".
+    """Start logging to standard error in `log_format`, "text" or "json".
 
     Raises:
-        InputError: another format.
+        InputError: unknown format.
     """
     if log_format not in ("text", "json"):
-        raise InputError(f"--log-format {log_format!r}: expected text or json")
+        raise InputError(f"--log-format: must be text or json, got {log_format!r}")
     handler = logging.StreamHandler(sys.stderr)
     if log_format == "json":
         handler.setFormatter(JsonFormatter(service, instance))
     else:
-        who = service if instance == "1" else f"{service} {instance}"
-        handler.setFormatter(logging.Formatter(f"{who}: %(levelname)s: %(message)s"))
+        source = service if instance == "1" else f"{service} {instance}"
+        handler.setFormatter(logging.Formatter(f"{source}: %(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])

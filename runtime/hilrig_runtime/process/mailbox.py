@@ -1,4 +1,4 @@
-"""Work that other threads hand to a service's own, which does it between two ticks."""
+"""Runs calls of other threads on the thread that owns a service's state, between two ticks."""
 
 import threading
 from collections.abc import Callable
@@ -9,37 +9,37 @@ from typing import Any, Final, TypeVar
 from hilrig_runtime.errors import OperationError
 
 T = TypeVar("T")
-TIMEOUT_S: Final = 1.0
+CALL_TIMEOUT_S: Final = 1.0
 
 
 class OwnerThreadExecutor:
-    """`call` is for other threads, `run_pending` for the service's own."""
+    """A queue of calls: other threads use `call`, the owner thread uses `run_pending`."""
 
     def __init__(self) -> None:
         self.exclusive = threading.Lock()
-        """For whoever prepares on another thread what only one may change at a time."""
-        self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        """Serializes other threads whose changes take more than one call."""
+        self._pending: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def call(self, work: Callable[[], T]) -> T:
-        """Have `work` done by the service's thread; what it gives or raises.
+        """Run `work` on the owner thread; return its result or raise its exception.
 
         Raises:
-            OperationError: the service did not come to it in time.
+            OperationError: the owner thread did not run it within `CALL_TIMEOUT_S`.
         """
         done: Future[T] = Future()
-        self._waiting.put((work, done))
+        self._pending.put((work, done))
         try:
-            return done.result(TIMEOUT_S)
+            return done.result(CALL_TIMEOUT_S)
         except TimeoutError as error:
-            # Not done later, when nobody waits for it any more.
+            # Must not run later, when no thread waits for the result.
             done.cancel()
             raise OperationError("the service is too busy to answer") from error
 
     def run_pending(self) -> None:
-        """Do what waits."""
-        while not self._waiting.empty():
+        """Run all pending calls."""
+        while not self._pending.empty():
             try:
-                work, done = self._waiting.get_nowait()
+                work, done = self._pending.get_nowait()
             except Empty:
                 return
             if not done.set_running_or_notify_cancel():

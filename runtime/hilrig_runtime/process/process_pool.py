@@ -1,4 +1,4 @@
-"""Processes for work that is worth all cores: one a core, each with its share of the tasks."""
+"""A pool of worker processes for long computations, by default one per processor core."""
 
 import multiprocessing
 import os
@@ -14,42 +14,42 @@ from hilrig_runtime.errors import OperationError
 
 @contextmanager
 def process_pool(tasks: int, workers: int | None = None) -> Iterator[Executor]:
-    """Give an executor; whoever leaves the context by an exception waits for no task that has not begun.
+    """Provide an executor; an exception that leaves the context cancels the tasks that have not started.
 
     Args:
-        tasks: that there are; there are no more processes than that.
-        workers: processes; default: one a core. Of one alone, the work is done in this process.
+        tasks: number of tasks, the largest number of processes.
+        workers: number of processes; default: one per core. With one, the work is done in this process.
 
     Raises:
-        OperationError: a process ended before its task.
+        OperationError: a worker process died.
     """
     count = min(workers or os.cpu_count() or 1, tasks)
     if count <= 1:
-        yield _Here()
+        yield _InlineExecutor()
         return
-    # Spawned, never forked: a process of threads that is forked may hang.
+    # Spawned, never forked: a process with threads may hang after a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_ignore_interrupts) as executor:
         try:
             yield executor
         except BrokenProcessPool as error:
-            raise OperationError("a process that did a part of the work ended; memory may be short") from error
+            raise OperationError("a worker process died, possibly out of memory") from error
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-class _Here(Executor):
-    """Does each task where and when it is submitted."""
+class _InlineExecutor(Executor):
+    """Runs each task at once, in the calling thread."""
 
-    def submit(self, task: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+    def submit(self, task: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
         try:
-            future.set_result(task(*given, **named))
+            future.set_result(task(*args, **kwargs))
         except Exception as error:
             future.set_exception(error)
         return future
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""The zenoh router of a lab, as a process of ours: the router that zenoh embeds, with the lab's rules of access."""
+"""Runs the zenoh router of a lab: the router embedded in the zenoh library, with the lab's access rules."""
 
 import threading
 from contextlib import closing
@@ -19,26 +19,26 @@ from hilrig_schemas.topics import alive_key
 
 
 def router_endpoint(lab: LabConfig, listen: str) -> str:
-    """Where the lab's router listens: at `listen`, or, where that is empty, where the lab says that its router is.
+    """Return the endpoint on which the lab's router listens: `listen`, or if that is empty, `bus.router` of the lab.
 
     Raises:
-        InputError: the lab has no router, or `listen` is no endpoint of its kind.
+        InputError: the lab has no router, or `listen` is not a valid endpoint.
     """
     if lab.bus.topology != "router":
-        raise InputError('this lab has no router: bus.topology in lab.toml is "mesh"; write "router" there')
+        raise InputError('this lab has no router: bus.topology in lab.toml is "mesh"; set it to "router"')
     endpoint = listen or lab.bus.router
     kind = "tcp/" if lab.bus.tls is None else "tls/"
     if not endpoint.startswith(kind):
-        raise InputError(f"--listen {endpoint}: expected {kind}<address>:<port>, as bus.router in lab.toml")
+        raise InputError(f"--listen: must be {kind}<address>:<port>, as bus.router in lab.toml, got {endpoint!r}")
     return endpoint
 
 
 def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -> None:
-    """Route for a lab until told to stop; `listen` as in `router_endpoint`.
+    """Run the lab's router until it is stopped; `listen` as in `router_endpoint`.
 
     Raises:
-        InputError: as `router_endpoint`, or a certificate is not there.
-        OperationError: the endpoint can't be had.
+        InputError: as `router_endpoint`, or a certificate is missing.
+        OperationError: the endpoint is not available.
     """
     endpoint = router_endpoint(lab, listen)
     stopping = threading.Event()
@@ -51,7 +51,7 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
         session = zenoh.open(config)
     except zenoh.ZError as error:
         raise OperationError(
-            f"the router can't listen on {endpoint} ({system_reason(error)}): end what listens there, "
+            f"the router can't listen on {endpoint} ({system_reason(error)}): stop the program that uses the port, "
             "or choose another --listen"
         ) from error
     with closing(session), session.liveliness().declare_token(alive_key(lab.name, ROUTER, "1")):

@@ -1,8 +1,8 @@
-"""One object that owns a process's life: its bus, log stream, health and the wish to stop.
+"""The service object: owns a process's bus connection, recording stream, health reports and stop request.
 
-A service is a function `run(service)` that calls `service.ready()` once it does its work, and returns when
-`service.stopping` is set; everything that it declared is closed afterwards, in reverse order. It sends and receives
-through the typed ends of `messaging`, which are made here.
+A service is a function `run(service)` that calls `service.ready()` once it works, and returns when `service.stopping`
+is set; everything that it declared is closed afterwards, in reverse order. The service object also creates the
+publishers and caches of `messaging`.
 """
 
 import threading
@@ -27,12 +27,12 @@ from hilrig_schemas import Event, RigBatch, ServiceInfo
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
 
 MessageT = TypeVar("MessageT", bound=Message)
-BATCHES_WAITING: Final = 64
-"""Batches that may wait beyond one of each rig."""
+EXTRA_QUEUED_BATCHES: Final = 64
+"""Capacity of the queue of received batches beyond one batch per rig."""
 
 
 class Service:
-    """What a running service has; use it as a context manager."""
+    """The resources of a running service; a context manager."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Service:
         self.source = f"{name}/{instance}"
         self.lab = lab
         self.rigs: tuple[RigSettings, ...] = lab.rigs if rigs is None else tuple(lab.rig(rig) for rig in rigs)
-        """Those that this instance serves."""
+        """Rigs that this instance serves."""
         self.bus = bus
         self.clock = clock
         self.incarnation = clock.wall_ns()
@@ -59,7 +59,7 @@ class Service:
         self._closing.callback(bus.close)
         self._event_publishers: dict[str, RigPublisher[Event]] = {}
         self.batch_cache_depth = batch_cache_depth(len(lab.rigs), lab.sim.step_ms)
-        """How far back each recording stream of the lab can be repeated."""
+        """Cache depth of each recording stream of the lab, batches."""
         log_publisher = self._closing.enter_context(
             bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batch_cache_depth)
         )
@@ -71,23 +71,23 @@ class Service:
         self.counters = self.health.counters
         self._token: Handle | None = None
         self._failure = ""
-        roster = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
+        info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
         self.addresses: Callable[[str], str] = lambda _: ""
-        """Where a rig is reached, for the roster; the edge sets it."""
-        self._registry = PeerRegistry(bus, lab.name, roster, self._rigs_reached, clock, self.fail)
+        """Returns the address of a rig for the service info; set by the edge."""
+        self._registry = PeerRegistry(bus, lab.name, info, self._rigs_reached, clock, self.fail)
         self._closing.callback(self._registry.close)
         self.health.clock_offset = lambda: self._registry.clock_offset
 
     def claim(self) -> None:
-        """Make sure that no other service of its kind has one of its rigs, or its name; before a word is sent.
+        """Check, before anything is published, that no other service of its kind has one of its rigs or its name.
 
         Raises:
-            OperationError: one has.
+            OperationError: another service has one of its rigs or its name.
         """
         self._registry.claim()
 
     def check_instance_conflict(self) -> None:
-        """Look once more whether another service of its kind was there before; one that was may be found late.
+        """Check again for an older service of its kind, which may have been discovered late.
 
         Raises:
             OperationError: as `claim`.
@@ -95,10 +95,10 @@ class Service:
         self._registry.recheck()
 
     def ready(self) -> None:
-        """Say that the service does its work now: its liveliness token appears; a second call does nothing.
+        """Declare the liveliness token: the service works now; a second call does nothing.
 
         Raises:
-            OperationError: as `claim`, if that was not called before.
+            OperationError: as `claim`, if it was not called before.
         """
         if self._token is None:
             self.claim()
@@ -112,7 +112,7 @@ class Service:
         *,
         control_path: CommandSink | None = None,
     ) -> RigPublisher[MessageT]:
-        """An end that sends on a rig's topic; `control_path` gets each encoded message before that."""
+        """Create a publisher of a rig's topic; `control_path` gets each encoded message before it is published."""
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
         return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters, control_path)
@@ -120,33 +120,33 @@ class Service:
     def latest_value_cache(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})
     ) -> LatestValueCache:
-        """The newest messages of each rig, out of the batches of everyone who sends them; see `LatestValueCache`."""
-        values = LatestValueCache(self.clock, self.counters, permitted)
+        """Create a cache of each rig's newest message, from the batches of all publishers; see `LatestValueCache`."""
+        cache = LatestValueCache(self.clock, self.counters, permitted)
         key = topic.key(self.lab.name, "*", "*")
-        # A batch may hold one message only: there is room for one of each rig, and some for rigs that are added.
-        waiting = len(self.rigs) + BATCHES_WAITING
-        self._closing.enter_context(self.bus.subscribe_newest(key, values.on_message, waiting))
-        return values
+        # A batch may contain one message only: room for one batch per rig, and for rigs that are added later.
+        depth = len(self.rigs) + EXTRA_QUEUED_BATCHES
+        self._closing.enter_context(self.bus.subscribe_newest(key, cache.on_message, depth))
+        return cache
 
     def publisher(self, topic: ServiceTopic[MessageT]) -> Publisher:
-        """An end that sends encoded messages on a topic of this service; nothing of them is recorded."""
+        """Create a publisher of encoded messages on a topic of this service; they are not recorded."""
         key = topic.key(self.lab.name, self.name, self.instance)
         return self._closing.enter_context(self.bus.publisher(key, topic.traffic))
 
     def batch_publisher(self, topic: ServiceTopic[RigBatch]) -> BatchPublisher:
-        """An end that sends messages of many rigs together; give it the rigs with `add_to_batch`."""
+        """Create a publisher of batches of messages of many rigs; add the rigs with `add_to_batch`."""
         return BatchPublisher(self.source, self.publisher(topic), self.recording_stream, self.clock, self.counters)
 
     def add_to_batch(self, batch: BatchPublisher, topic: RigTopic[MessageT], rig: str) -> None:
-        """Let a batch sender send for one more rig, whose own messages go on `topic` too."""
+        """Add a rig to a batch publisher; its messages are also published on the rig's key of `topic`."""
         key = topic.key(self.lab.name, rig)
         batch.add(rig, key, self._closing.enter_context(self.bus.publisher(key, topic.traffic)))
 
     def emit(self, event: Event) -> None:
-        """Send and record an event; source and time are filled in."""
+        """Publish and record an event; sets its source and time."""
         event.source = self.source
         event.wall_ns = self.clock.wall_ns()
-        # Of the service as a whole: under its own name.
+        # An event without a rig concerns the service and is published under its name.
         rig = event.rig or self.name
         publisher = self._event_publishers.get(rig)
         if publisher is None:
@@ -154,24 +154,24 @@ class Service:
         publisher.publish(event)
 
     def beat(self, now_ns: int) -> None:
-        """Once a tick: send the log batch and the health report when they are due; monotonic clock, ns."""
+        """Once per tick: publish the recording batch and the health report if due; `now_ns`: monotonic clock."""
         self.recording_stream.flush_if_due(now_ns)
         self.health.report_if_due(now_ns)
 
     def stop(self) -> None:
-        """Wish the service to end; safe from any thread and from a signal handler."""
+        """Request a stop; safe from any thread and from a signal handler."""
         self.stopping.set()
 
     def fail(self, reason: str) -> None:
-        """Wish the service to end because it can't go on; safe from any thread. See `check`."""
+        """Request a stop because of a failure; safe from any thread. See `check`."""
         self._failure = reason
         self.stopping.set()
 
     def check(self) -> None:
-        """Nothing, if the service ended because it was told to.
+        """Raise the error of a service that failed.
 
         Raises:
-            OperationError: it could not go on; says why.
+            OperationError: the service could not continue; contains the reason.
         """
         if self._failure:
             raise OperationError(self._failure)
@@ -188,7 +188,7 @@ class Service:
         self.close()
 
     def close(self) -> None:
-        """Send what is left on the log stream, then close everything in reverse order; a second call does nothing."""
+        """Flush the recording stream, then close everything in reverse order; a second call does nothing."""
         with self._closing.pop_all():
             now_ns = self.clock.monotonic_ns()
             self.recording_stream.flush(now_ns)

@@ -1,8 +1,8 @@
-"""How a process ends: signals, the parent's death, exit codes, and a way out when closing hangs.
+"""Shutdown of a process: signals, end of the parent process, exit codes, and a forced exit if closing hangs.
 
-The first signal sets the wish to stop and the loop ends itself; a second one forces. A service started by
-`hilrig up` also ends when its parent is gone, which it learns from the end of its standard input. Every command ends
-this way, so that this module imports nothing that takes time.
+The first signal requests a shutdown and the loop ends itself; a second signal ends the process at once. A service
+started by `hilrig up` also stops when its parent ends, which closes its standard input. Every command uses this
+module, so it imports nothing that is slow to import.
 """
 
 import errno
@@ -21,36 +21,36 @@ from typing import Final
 from hilrig_runtime.errors import HilrigError, OperationError
 
 CLOSE_TIMEOUT_S: Final = 2.0
-"""A process that has not closed by then ends all the same."""
+"""Time after which a process that has not closed is ended, s."""
 EXIT_SIGPIPE: Final = 141
-"""Exit code where whoever read the output has seen enough: what a shell says of a program that SIGPIPE ended."""
-TURN_S: Final = 0.5
-"""Of waiting for a signal."""
-_NO_ROOM: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
-"""What a full or broken disk says to whoever writes."""
-_NO_HANDLES: Final = (errno.EMFILE, errno.ENFILE)
-_NO_THREAD: Final = "can't start new thread"
-"""What Python says where the system gives it none."""
+"""Exit code if the reader of the output has closed it: 128 + SIGPIPE, as in a shell."""
+SIGNAL_POLL_S: Final = 0.5
+"""Interval at which the main thread wakes up to handle signals, s."""
+_DISK_ERRORS: Final = (errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""Errors of a full or broken disk."""
+_FILE_LIMIT_ERRORS: Final = (errno.EMFILE, errno.ENFILE)
+_THREAD_LIMIT_MESSAGE: Final = "can't start new thread"
+"""Text of Python's RuntimeError when the system refuses a new thread."""
 
 
 def stop_on_signals(stopping: threading.Event) -> None:
     """Set `stopping` on the first SIGINT or SIGTERM; end the process on the second."""
     count = itertools.count()
-    heard: SimpleQueue[int] = SimpleQueue()
+    received: SimpleQueue[int] = SimpleQueue()
 
     def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        # Counted too, for a second one may come while the first is being handled.
+        # Counted too, because a second signal may arrive while the first one is handled.
         if next(count) or stopping.is_set():
             os._exit(128 + number)
-        # A signal may come while this very thread holds the event's lock: to set it here could wait without end. This
-        # kind of queue has no such lock.
-        heard.put(number)
+        # The signal may interrupt this thread while it holds the event's lock, so setting the event here could block
+        # forever. SimpleQueue has no such lock.
+        received.put(number)
 
-    def tell() -> None:
-        heard.get()
+    def set_event() -> None:
+        received.get()
         stopping.set()
 
-    threading.Thread(target=tell, name="signals", daemon=True).start()
+    threading.Thread(target=set_event, name="signals", daemon=True).start()
     for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", None)):
         if number is not None:
             signal.signal(number, on_signal)
@@ -59,15 +59,15 @@ def stop_on_signals(stopping: threading.Event) -> None:
 def wait_for(stopping: threading.Event) -> None:
     """Wait until `stopping` is set by a signal.
 
-    In turns: Python hears of a signal between two instructions, and one that comes just as the main thread begins to
-    wait would only be heard of when it wakes.
+    Waits in short intervals: Python runs signal handlers between two instructions, so a signal that arrives just
+    before the main thread blocks would only be handled when it wakes up.
     """
-    while not stopping.wait(TURN_S):
+    while not stopping.wait(SIGNAL_POLL_S):
         pass
 
 
 def stop_with_stdin(stopping: threading.Event) -> None:
-    """Set `stopping` when standard input ends: the parent held its other end, and is gone."""
+    """Set `stopping` when standard input is closed, because the parent process has ended."""
 
     def watch() -> None:
         try:
@@ -81,39 +81,39 @@ def stop_with_stdin(stopping: threading.Event) -> None:
 
 
 def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
-    """End the process `timeout_s` after `stopping` was set, if it is still there: a hung session ignores signals."""
+    """End the process `timeout_s` after `stopping` was set, if it still runs: a hung zenoh session ignores signals."""
 
     def watch() -> None:
         stopping.wait()
-        # A daemon thread: it ends with the process when closing goes well.
+        # A daemon thread: it ends with the process if closing succeeds.
         threading.Event().wait(timeout_s)
-        print("hilrig: closing took too long; ended without", file=sys.stderr)
+        print("hilrig: shutdown timed out; exiting anyway", file=sys.stderr)
         os._exit(3)
 
     threading.Thread(target=watch, name="close-guard", daemon=True).start()
 
 
 def run_main(main: Callable[[], int | None]) -> int:
-    """Run a command; turn what a person should read into one line on standard error, and an exit code."""
+    """Run a command; print its errors as single lines on standard error, and return its exit code."""
     _open_output()
     try:
-        return _run_and_tell(main)
+        return _run_and_report(main)
     except BrokenPipeError:
         pass
     except SystemExit as end:
-        # What parses and what prints tables both make 1 of a closed pipe, which is an answer here.
+        # typer and rich turn a closed pipe into exit code 1, which means "check failed" here.
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     _drop_output()
     return EXIT_SIGPIPE
 
 
-def _run_and_tell(main: Callable[[], int | None]) -> int:
+def _run_and_report(main: Callable[[], int | None]) -> int:
     try:
         try:
             return main() or 0
         finally:
-            # While its failure can still be told.
+            # Here a failure can still be reported.
             sys.stdout.flush()
     except HilrigError as error:
         for line in str(error).splitlines():
@@ -122,32 +122,31 @@ def _run_and_tell(main: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         return 130
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and str(error) != _NO_THREAD:
+        if isinstance(error, RuntimeError) and str(error) != _THREAD_LIMIT_MESSAGE:
             raise
         print(
-            "hilrig: error: the system gives this process no more memory or threads: see its limits (ulimit -v, "
-            "ulimit -u; mem_limit and pids_limit of a container), or end what else runs here",
+            "hilrig: error: out of memory or threads: raise the limits (ulimit -v, ulimit -u; mem_limit and pids_limit "
+            "of a container), or stop other programs",
             file=sys.stderr,
         )
         return OperationError.exit_code
     except OSError as error:
-        if error.errno in _NO_HANDLES:
+        if error.errno in _FILE_LIMIT_ERRORS:
             print(
-                "hilrig: error: the system gives this process no more open files: allow it more (ulimit -n, or "
-                "LimitNOFILE of a service)",
+                "hilrig: error: too many open files: raise the limit (ulimit -n, or LimitNOFILE of a service)",
                 file=sys.stderr,
             )
             return OperationError.exit_code
-        if error.errno not in _NO_ROOM:
+        if error.errno not in _DISK_ERRORS:
             raise
         _drop_output()
-        where = error.filename or "the output"
-        print(f"hilrig: error: {where}: can't be written: {error.strerror}", file=sys.stderr)
+        target = error.filename or "standard output"
+        print(f"hilrig: error: {target}: can't be written: {error.strerror}", file=sys.stderr)
         return OperationError.exit_code
 
 
 def _open_output() -> None:
-    """Have somewhere to write, whatever the shell closed, and a sign for what its encoding can't say."""
+    """Make standard output and error writable, even if the shell closed them or their encoding lacks a character."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -157,5 +156,5 @@ def _open_output() -> None:
 
 
 def _drop_output() -> None:
-    """What is still buffered goes nowhere, so that the end of the process is quiet."""
+    """Discard buffered output, so that the process ends without another error."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

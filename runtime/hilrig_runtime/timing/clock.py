@@ -1,7 +1,7 @@
-"""The two clocks of a process: a monotonic one to measure with, and the wall clock to tell people when.
+"""The two clocks of a process: the monotonic clock for measurements, and the wall clock for dates.
 
-No figure of this project subtracts stamps of two clocks (docs/timing.md). Whatever reads time takes a `Clock`, so
-that a test can own it.
+No measurement subtracts timestamps of two clocks (docs/timing.md). Code that reads the time gets a `Clock`, so that
+tests can control it.
 """
 
 import time
@@ -12,22 +12,22 @@ class Clock(Protocol):
     """A source of time in integer nanoseconds."""
 
     def monotonic_ns(self) -> int:
-        """Time that never steps, ns; its zero means nothing outside this process's host."""
+        """Return the time of the monotonic clock, ns; it never steps, and its zero is only valid on this host."""
         ...
 
     def wall_ns(self) -> int:
-        """Time since 1970-01-01 UTC, ns; it may step."""
+        """Return the time since 1970-01-01 UTC, ns; it may step."""
         ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at `deadline_ns` of the monotonic clock, or at once when it has passed."""
+        """Sleep until `deadline_ns` of the monotonic clock; return at once if it has passed."""
         ...
 
 
 class SystemClock:
-    """The machine's clocks."""
+    """The clocks of the operating system."""
 
-    # Bound to the C functions: a stamp costs one call.
+    # Bound to the C functions: a timestamp costs one call.
     monotonic_ns = staticmethod(time.monotonic_ns)
     wall_ns = staticmethod(time.time_ns)
 
@@ -43,7 +43,7 @@ SYSTEM_CLOCK: Final[Clock] = SystemClock()
 
 
 class ManualClock:
-    """A clock that moves when it is told to: for tests and for simulation in virtual time."""
+    """A clock that is advanced by the caller, for tests and for simulated time."""
 
     def __init__(self, monotonic_ns: int = 1_000_000_000, wall_ns: int = 1_700_000_000_000_000_000) -> None:
         self._monotonic_ns = monotonic_ns
@@ -58,10 +58,10 @@ class ManualClock:
         return self._wall_ns
 
     def advance(self, duration_ns: int) -> None:
-        """Let `duration_ns` pass on both clocks."""
+        """Advance both clocks by `duration_ns`."""
         self._monotonic_ns += duration_ns
         self._wall_ns += duration_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Move on to the deadline."""
+        """Advance to the deadline."""
         self.advance(max(0, deadline_ns - self._monotonic_ns))

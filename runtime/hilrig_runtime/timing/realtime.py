@@ -1,11 +1,11 @@
-"""What a process asks of the kernel and of the interpreter so that it wakes in time.
+"""Scheduling settings of the kernel and of the interpreter for punctual wake-ups.
 
-Where the system grants it, what closes the loop runs under the real-time policy: it goes before every ordinary
-program, as soon as it has something to do. That takes a right (root, CAP_SYS_NICE or a limit `rtprio`), and without it
-the rest still helps, which takes none. Linux rounds a sleep up by 50 µs by default (`timer slack`), and lets a woken
-thread wait for the running one's slice, some milliseconds; a thread that asks for short slices gets its turn sooner
-and keeps it for less long. On two cores with three busy processes beside it, a loop's lateness fell from 1.6 ms to 30
-µs at the 95th percentile. Elsewhere nothing happens: the loop is as punctual as the system makes it.
+If the system permits it, the services that close the loop run with the real-time policy SCHED_FIFO and preempt every
+ordinary program. This needs a privilege (root, CAP_SYS_NICE or a limit `rtprio`); the other settings need none. By
+default Linux rounds a sleep up by 50 µs (timer slack), and a thread that wakes up waits for the running thread's time
+slice, some milliseconds; a thread with a short slice is scheduled earlier and runs for a shorter time. On two cores
+with three busy processes, these settings reduced the lateness of a loop from 1.6 ms to 30 µs at the 95th percentile. On
+other systems than Linux they do nothing.
 """
 
 import contextlib
@@ -20,22 +20,22 @@ from pathlib import Path
 from typing import Final
 
 REALTIME_PRIORITIES: Final = {"sim": 2, "edge": 1}
-"""Of the services that close the loop, from 1 to 99: a tick goes before a request, and all else of the system that is
-real-time before both."""
+"""Priorities of the services that close the loop, 1 to 99: a tick preempts a request, and other real-time threads of
+the system preempt both."""
 SLICE_NS: Final = 100_000
-"""The shortest slice that Linux grants."""
+"""Shortest time slice of Linux, ns."""
 BACKGROUND_NICE: Final = 5
 
 _PR_SET_TIMERSLACK: Final = 29
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 _SCHED_ATTR: Final = struct.Struct("=IIQiIQQQ")
-"""size, policy, flags, nice, priority, runtime, deadline, period: `struct sched_attr` of sched_setattr(2)."""
+"""`struct sched_attr` of sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period."""
 
 
 def go_realtime(priority: int) -> bool:
-    """Ask for the real-time policy (first in, first out) for this thread and those that it starts from now on.
+    """Set the real-time policy SCHED_FIFO for this thread and the threads that it starts from now on.
 
-    Returns whether the system grants it. Linux keeps a share of each processor for ordinary programs all the same.
+    Return whether the system permits it. Linux still reserves a share of each processor for ordinary programs.
     """
     if sys.platform != "linux":
         return False
@@ -47,19 +47,19 @@ def go_realtime(priority: int) -> bool:
 
 
 def realtime_priority() -> int:
-    """Priority of this thread under the real-time policy; 0: it is under the ordinary one."""
+    """Return the real-time priority of this thread; 0: it has the ordinary policy."""
     if sys.platform != "linux":
         return 0
-    # Under the ordinary policies it is 0.
+    # 0 for the ordinary policies.
     return os.sched_getparam(0).sched_priority
 
 
 @contextlib.contextmanager
 def raise_priority() -> Iterator[None]:
-    """Let this thread, and those that it starts meanwhile, go one priority before what it was: for who receives.
+    """Raise the real-time priority of this thread, and of the threads that it starts, by one: for receiver threads.
 
-    Among threads of one priority none makes way: a loop that is busy would keep its own news waiting. Under the
-    ordinary policy nothing happens.
+    SCHED_FIFO threads of equal priority do not preempt each other, so a busy loop would delay its own receiver thread.
+    Does nothing under the ordinary policy.
     """
     priority = realtime_priority()
     if not priority:
@@ -73,33 +73,33 @@ def raise_priority() -> Iterator[None]:
 
 
 def set_short_slice() -> None:
-    """Ask for punctual wake-ups for this thread and for those that it starts from now on; no right is needed."""
-    # A callback thread shares the interpreter with the loop: hand over ten times as often as by default.
+    """Request punctual wake-ups for this thread and the threads that it starts from now on; needs no privilege."""
+    # Callback threads share the interpreter with the loop: switch ten times as often as by default.
     sys.setswitchinterval(0.0005)
     if sys.platform != "linux":
         return
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     number = _SCHED_SETATTR.get(platform.machine())
-    # Under a real-time policy the slice means something else; then whoever chose that policy knows better.
+    # Under a real-time policy this field has another meaning, and the policy was set explicitly.
     if number is not None and os.sched_getscheduler(0) == os.SCHED_OTHER:
         nice = os.getpriority(os.PRIO_PROCESS, 0)
         attributes = _SCHED_ATTR.pack(_SCHED_ATTR.size, os.SCHED_OTHER, 0, nice, 0, SLICE_NS, 0, 0)
-        # Before Linux 6.12 the slice is ignored, or refused: both leave things as they are.
+        # Before Linux 6.12 the slice is ignored or refused, without other effects.
         libc.syscall(number, 0, attributes, 0)
 
 
 def lower_priority() -> None:
-    """Step back behind whatever closes a loop on this machine: what is recorded may wait, it is queued."""
+    """Lower the priority of this process below the services that close a loop; its input is queued."""
     if sys.platform == "win32":
         return
     os.nice(BACKGROUND_NICE)
-    # Linux groups processes by session, and weighs the groups against each other: each has a nice value of its own.
+    # Linux schedules processes in groups, one per session, each with its own nice value (autogroup).
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(BACKGROUND_NICE))
 
 
 def freeze_gc() -> None:
-    """Collect once and leave what lives now alone: later collections look at what is new, and pause less long."""
+    """Collect garbage once and exclude the existing objects from later collections, so that these are shorter."""
     gc.collect()
     gc.freeze()

@@ -12,7 +12,7 @@ import numpy as np
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
-from hilrig_runtime.config.impairment import LONGEST_MS, TraceDelay
+from hilrig_runtime.config.impairment import MAX_DELAY_MS, TraceDelay
 from hilrig_runtime.errors import InputError
 
 MIN_SAMPLES: Final = 100
@@ -46,7 +46,7 @@ def delay_trace(run: Run) -> TraceDelay:
     if (delays_ms < 0).any():
         raise InputError(f"{run.path}: unusable as a delay trace: inconsistent time stamps, a delay is negative")
     longest = int(np.argmax(delays_ms))
-    if delays_ms[longest] > LONGEST_MS:
+    if delays_ms[longest] > MAX_DELAY_MS:
         raise InputError(
             f"{run.path}: unusable as a delay trace: gaps, the controller was silent for "
             f"{delays_ms[longest] / 1e3:.0f} s before sample {longest + 1} of {report.samples}"
