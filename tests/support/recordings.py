@@ -276,7 +276,7 @@ def write(
     Args:
         path: the file.
         made: the messages.
-        script: script of the run, for the metadata.
+        script: script of the run (used for its metadata).
         metadata: additional or replaced metadata records.
         schema_version: version of the message schemas in the metadata.
         compression: compression of the chunks.

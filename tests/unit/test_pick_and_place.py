@@ -36,10 +36,10 @@ def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch
     with VirtualRig() as rig:
         remote = RemoteRig(rig, one_way_ms, seed=1)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
+        outcome = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
-    assert said["placed"] == result.placed == 4
+    assert outcome["placed"] == result.placed == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
 
@@ -53,11 +53,11 @@ def test_stalls_delay_the_task_but_do_not_spoil_it(
     with VirtualRig() as rig:
         remote = RemoteRig(rig, one_way_ms, seed, stalls=0.004)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
+        outcome = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
-    assert said["placed"] == result.placed == 4
-    assert said["missing"] == []
+    assert outcome["placed"] == result.placed == 4
+    assert outcome["missing"] == []
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
 
@@ -82,15 +82,15 @@ def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPa
     with VirtualRig() as rig:
         remote = RemoteRig(rig, 0.0, seed=1)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 8.0)
-    assert said["done_s"] is None
-    assert 0 < said["placed"] < 4
-    assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
-    told = example.sentence({"parts": 4, **said})
-    assert told.startswith(
-        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
+        outcome = example.control(remote, example.Controller(example.task_of({})), 8.0)
+    assert outcome["done_s"] is None
+    assert 0 < outcome["placed"] < 4
+    assert outcome["missing"] == ["red", "blue", "green", "yellow"][outcome["placed"] :]
+    sentence = example.sentence({"parts": 4, **outcome})
+    assert sentence.startswith(
+        f"{outcome['placed']} of 4 parts placed, missing {', '.join(outcome['missing'])}: the time ended during"
     )
-    assert repr(said["doing"]) in told
+    assert repr(outcome["doing"]) in sentence
 
 
 def test_model_of_the_controller_equals_the_arm() -> None:

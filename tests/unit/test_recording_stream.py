@@ -2,12 +2,16 @@
 
 import random
 
+import pytest
+from google.protobuf.message import DecodeError
+
 from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.messaging.recording_stream import (
     FLUSH_PERIOD_NS,
     SESSIONS_PERIOD_NS,
     RecordingStream,
     batch_cache_depth,
+    decode_batch,
     entries_of,
 )
 from hilrig_schemas import LogBatch, OpenSession
@@ -18,7 +22,7 @@ class Collecting(Publisher):
         self.batches: list[LogBatch] = []
 
     def put(self, payload: bytes) -> None:
-        self.batches.append(LogBatch.FromString(payload))
+        self.batches.append(decode_batch(payload))
 
     def close(self) -> None:
         pass
@@ -37,6 +41,21 @@ def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
         ("hil/lab/rig1/state", 2, 101, b"\x01\xff"),
         ("hil/lab/rig1/state", 3, 102, b"\x02\xff"),
     ]
+
+
+def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
+    sent: list[bytes] = []
+    out = Collecting()
+    out.put = sent.append  # type: ignore[method-assign]
+    log = RecordingStream(out, "sim/1", incarnation=7)
+    log.append("hil/lab/rig1/state", 1, 100, b"payload")
+    log.flush(0)
+    (payload,) = sent
+    batch = decode_batch(payload)
+    assert batch.HasField("checksum")
+    for at in range(5, len(payload)):
+        with pytest.raises(DecodeError):
+            decode_batch(payload[:at] + bytes([payload[at] ^ 1]) + payload[at + 1 :])
 
 
 def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
