@@ -180,7 +180,7 @@ class Sample:
 
     at_s: float
     resident_mib: float
-    handles: int
+    descriptors: int
     threads: int
 
 
@@ -206,9 +206,9 @@ class Observation:
 def sample(pid: int) -> Sample:
     """Read the resources of a process from /proc."""
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
-    handles = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+    descriptors = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
     resident_mib = int(status["VmRSS"].split()[0]) / 1024
-    return Sample(time.monotonic(), resident_mib, handles, int(status["Threads"].split()[0]))
+    return Sample(time.monotonic(), resident_mib, descriptors, int(status["Threads"].split()[0]))
 
 
 def measure(minutes: float, report: Report, quick: bool) -> None:
@@ -308,7 +308,7 @@ def watch(supervisor: Supervisor, port: int, seconds: float, interrupted: thread
                 log(
                     f"{(now_s - begin_s) / 60:.0f} min: "
                     + ", ".join(
-                        f"{n} {s.resident_mib:.1f} MiB, {s.handles} file descriptors" for n, s in newest.items()
+                        f"{n} {s.resident_mib:.1f} MiB, {s.descriptors} file descriptors" for n, s in newest.items()
                     )
                 )
             time.sleep(POLL_S)
@@ -325,9 +325,9 @@ def check_service(
     settled = [one for one in samples if one.at_s >= warm_s]
     report.add(case, f"{name}: memory after the warm-up", settled[0].resident_mib, "MiB")
     report.add(case, f"{name}: memory at the end", settled[-1].resident_mib, "MiB")
-    report.add(case, f"{name}: file descriptors before", before.handles, "count")
-    report.add(case, f"{name}: file descriptors p95", percentile([one.handles for one in samples], 0.95), "count")
-    report.add(case, f"{name}: file descriptors after", after.handles, "count")
+    report.add(case, f"{name}: file descriptors before", before.descriptors, "count")
+    report.add(case, f"{name}: file descriptors p95", percentile([one.descriptors for one in samples], 0.95), "count")
+    report.add(case, f"{name}: file descriptors after", after.descriptors, "count")
     report.add(case, f"{name}: threads before", before.threads, "count")
     report.add(case, f"{name}: threads after", after.threads, "count")
     growth = report.add(case, f"{name}: memory growth", growth_mib_h(settled), "MiB/h")
@@ -335,7 +335,7 @@ def check_service(
         report.require(f"{name}: memory growth", growth, "<=", MAX_GROWTH_MIB_H, "MiB/h")
     else:
         report.add_note(f"{name}: memory growth not checked; it needs {MIN_GROWTH_RUN_S / 60:g} min after the warm-up")
-    report.require(f"{name}: additional file descriptors", after.handles - before.handles, "<=", 2)
+    report.require(f"{name}: additional file descriptors", after.descriptors - before.descriptors, "<=", 2)
     report.require(f"{name}: additional threads", after.threads - before.threads, "<=", 2)
 
 

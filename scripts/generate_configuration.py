@@ -1,4 +1,4 @@
-"""Generates docs/configuration.md from the schema of `lab.toml` (`make gen`)."""
+"""Writes docs/configuration.md from the configuration models of `lab.toml`; run by `make gen`."""
 
 import sys
 from pathlib import Path
@@ -8,9 +8,9 @@ from hilrig_runtime.config.template import lab_template
 PAGE = Path(__file__).parents[1] / "docs/configuration.md"
 TEXT = """# lab.toml
 
-A lab is configured by one file, which every service reads; without a file there is one rig with the defaults.
-`hilrig check lab.toml` reports each error with its place, the accepted value and the value found. The template below is
-the output of `hilrig check --template`: every key, its description and its default. Omit keys that you do not change.
+One file describes a lab; every service reads it. Without a file, a lab has one rig with the default settings.
+`hilrig check lab.toml` reports each error with its place, the value found and the accepted values. The following is the
+output of `hilrig check --template`: every key, its meaning and its default. Omit the keys that you do not change.
 
 ```toml
 {template}```
@@ -31,8 +31,8 @@ name = "right"
 arm.masses_kg = [1.0, 1.0, 0.8]
 ```
 
-A group of 64 rigs, `rig1` to `rig64` on ports 5020 to 5083, all with a shorter second link; one additional rig for the
-teacher, and the seventh on its own port (so the eighth gets 5026):
+64 rigs for a class, `rig1` to `rig64` at ports 5020 to 5083, all with a shorter second link; an additional rig for the
+teacher, and rig7 at another port (so that rig8 gets port 5026):
 
 ```toml
 name = "robotics"
@@ -50,8 +50,8 @@ name = "teacher"
 allow = ["192.168.7.2/32"]
 ```
 
-A task by which `hilrig report` grades the lab's runs (see [review.md](review.md)): two poses, then a triangle, and two
-parts in the tray, all within a minute. A task may also consist of one of the three kinds only.
+A task that `hilrig report` uses to grade the runs of the lab (see [review.md](review.md)): two poses, then a triangle,
+and two parts in the tray, all within one minute. A task needs at least one of these three kinds of goals.
 
 ```toml
 [task]
@@ -81,7 +81,7 @@ tolerance_mm = 2
 
 
 def page() -> str:
-    """Return the page's text."""
+    """Return the text of the page."""
     return TEXT.format(template=lab_template())
 
 

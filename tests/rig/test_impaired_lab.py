@@ -115,7 +115,7 @@ def lab_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def shown(lab_folder: Path) -> dict[str, Any]:
+def statuses(lab_folder: Path) -> dict[str, Any]:
     """Run the lab, which makes the recordings; return the output of `hilrig impair --json`."""
     config = write_impaired_lab(lab_folder)
     with RunningLab(config) as lab:
@@ -129,14 +129,14 @@ def shown(lab_folder: Path) -> dict[str, Any]:
             thread.start()
         for thread in threads:
             thread.join()
-        said = hilrig("impair", "--json", "--config", config)
-        assert said.returncode == 0, said.stderr
+        done = hilrig("impair", "--json", "--config", config)
+        assert done.returncode == 0, done.stderr
         eventually(lambda: len(lab.recordings) == len(RIGS))
-    return {row["rig"]: row for row in json.loads(said.stdout)}
+    return {row["rig"]: row for row in json.loads(done.stdout)}
 
 
 @pytest.fixture(scope="module")
-def sessions(shown: dict[str, Any], lab_folder: Path) -> dict[str, Session]:
+def sessions(statuses: dict[str, Any], lab_folder: Path) -> dict[str, Session]:
     runs = [open_run(path) for path in (lab_folder / "recordings").rglob("*.mcap")]
     return {run.rig: Session(run, measure(run)) for run in runs}
 
@@ -218,8 +218,8 @@ def test_loop_latency_grows_by_the_injected_delay(sessions: dict[str, Session], 
     assert np.median(rest) == pytest.approx(np.median(free_rest), abs=0.5 * STEP_MS)
 
 
-def test_lost_commands_leave_gaps_in_the_numbers(sessions: dict[str, Session], shown: dict[str, Any]) -> None:
-    counts = shown["lossy"]["commands"]
+def test_lost_commands_leave_gaps_in_the_numbers(sessions: dict[str, Session], statuses: dict[str, Any]) -> None:
+    counts = statuses["lossy"]["commands"]
     commands = sessions["lossy"].run.commands
     written = commands[commands["write_arrived_ns"] > 0]
     assert counts["lost"] > 0.04 * counts["count"]
@@ -267,9 +267,9 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
         client.write(0, 1)
 
         def row(*options: str | Path) -> dict[str, Any]:
-            said = hilrig("impair", "rig1", *options, "--json", "--config", config)
-            assert said.returncode == 0, said.stderr
-            decoded: dict[str, Any] = json.loads(said.stdout)
+            done = hilrig("impair", "rig1", *options, "--json", "--config", config)
+            assert done.returncode == 0, done.stderr
+            decoded: dict[str, Any] = json.loads(done.stdout)
             return decoded
 
         assert row()["impairment"] == "none"
@@ -284,7 +284,7 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
         table = hilrig("impair", "rig1", "--preset", "mobile", "--seed", "3", "--config", config)
         for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
             assert word in table.stdout
-        for options, complaint in (
+        for options, message in (
             (("rig1", "--command", "constant:-3"), "delay_ms: must be ≥ 0, got '-3'"),
             (("rig1", "--preset", "wlan"), "unknown preset 'wlan'; must be one of none, wired"),
             (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
@@ -293,12 +293,12 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict
             (("rig9", "--off"), "unknown rig 'rig9'"),
             (("--off",), "a rig is required to set an impairment"),
         ):
-            said = hilrig("impair", *options, "--config", config)
-            assert (said.returncode, len(said.stderr.splitlines())) == (2, 1), said.stderr
-            assert complaint in said.stderr
+            done = hilrig("impair", *options, "--config", config)
+            assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+            assert message in done.stderr
 
 
 def test_missing_edge_is_reported(tmp_path: Path) -> None:
-    said = hilrig("impair", "--config", write_lab(tmp_path))
-    assert said.returncode == 3
-    assert "no edge answers for lab 'lab'" in said.stderr
+    done = hilrig("impair", "--config", write_lab(tmp_path))
+    assert done.returncode == 3
+    assert "no edge answers for lab 'lab'" in done.stderr

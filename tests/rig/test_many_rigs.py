@@ -16,7 +16,7 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from support.labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -54,24 +54,24 @@ def test_every_rig_is_served_by_one_of_the_edges(lab: RunningLab) -> None:
         with closing(ModbusTcpClient("127.0.0.1", port=port, timeout=2)) as client:
             assert client.connect()
             assert len(client.read_holding_registers(4, count=4).registers) == 4
-    shown = top(lab)
+    report = top(lab)
     assert [
-        (row["service"], row["instance"], row["rigs"]) for row in shown["services"] if row["service"] != "recorder"
+        (row["service"], row["instance"], row["rigs"]) for row in report["services"] if row["service"] != "recorder"
     ] == [
         ("edge", "1", 2),
         ("edge", "2", 2),
         ("sim", "1", 4),
     ]
-    assert all(rig["served"] and rig["simulated"] for rig in shown["rigs"])
+    assert all(rig["served"] and rig["simulated"] for rig in report["rigs"])
 
 
 def test_top_shows_lease_holder_loop_and_recording(lab: RunningLab) -> None:
-    def shown() -> dict[str, Any] | None:
+    def report() -> dict[str, Any] | None:
         rig = rig_of(lab, "rig4")
         return rig if rig["controller"] and rig["recording"] and rig["loop_samples"] else None
 
     with steady_controller(lab.lab.ports["rig4"]):
-        rig = eventually(shown)
+        rig = eventually(report)
         table = hilrig("top", "--once", "--config", lab.config).stdout
     assert rig["controller"].startswith("127.0.0.1:")
     assert rig["loop_p50_ms"] >= 15
@@ -96,7 +96,7 @@ def test_prometheus_metrics_are_served(lab: RunningLab) -> None:
             assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
         finally:
             process.terminate()
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(LONG_TIMEOUT_S) == 0
     taken = hilrig("metrics", "--config", lab.config, "--listen", f"127.0.0.1:{lab.port}")
     assert taken.returncode == 3
     assert "choose another address with --listen" in taken.stderr
@@ -161,7 +161,7 @@ def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tup
 
 
 def test_duplicate_rig_is_rejected() -> None:
-    done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=PATIENT_S)
+    done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=LONG_TIMEOUT_S)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.endswith("hilrig: error: --rigs: duplicate rig 'rig1'\n")
 

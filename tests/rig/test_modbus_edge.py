@@ -68,17 +68,17 @@ def test_every_request_is_in_the_request_log() -> None:
         client.write(0, 7)
         client.read(4, 4)
         client.write(8, 1)
-        asked = eventually(lambda: sum(len(t.arrived_ns) for t in rig.traffic) == 3 and rig.traffic)
-        kinds = [traffic.kinds[index] for traffic in asked for index in traffic.kind_indexes]
+        logged = eventually(lambda: sum(len(t.arrived_ns) for t in rig.traffic) == 3 and rig.traffic)
+        kinds = [traffic.kinds[index] for traffic in logged for index in traffic.kind_indexes]
         assert [(kind.function, kind.address, kind.count, kind.exception) for kind in kinds] == [
             (16, 0, 1, 0),
             (3, 4, 4, 0),
             (16, 8, 1, 2),
         ]
         assert all(kind.controller == client.address for kind in kinds)
-        arrived_ns = [arrived_ns for traffic in asked for arrived_ns in traffic.arrived_ns]
+        arrived_ns = [arrived_ns for traffic in logged for arrived_ns in traffic.arrived_ns]
         assert arrived_ns == sorted(arrived_ns)
-        assert all(0 <= after_ns < 1_000_000_000 for traffic in asked for after_ns in traffic.answered_after_ns)
+        assert all(0 <= after_ns < 1_000_000_000 for traffic in logged for after_ns in traffic.answered_after_ns)
 
 
 def test_busy_polling_client_sends_few_messages_a_step() -> None:

@@ -159,12 +159,12 @@ def test_random_frames_do_not_affect_other_clients(tmp_path: Path) -> None:
         try:
             for frames, stream in streams:
                 answers = talk(fuzzed, stream)
-                asked, answered = requests_in(stream), requests_in(answers)
-                assert len(answered) <= len(asked)
-                for (transaction, unit, function), (t, u, f) in zip(asked, answered, strict=False):
+                requests, responses = requests_in(stream), requests_in(answers)
+                assert len(responses) <= len(requests)
+                for (transaction, unit, function), (t, u, f) in zip(requests, responses, strict=False):
                     assert (t, u, f & 0x7F) == (transaction, unit, function & 0x7F)
-                if not has_garbage(stream, asked):
-                    assert len(answered) == len(asked), f"{len(asked)} requests, {len(answered)} answers"
+                if not has_malformed_data(stream, requests):
+                    assert len(responses) == len(requests), f"{len(requests)} requests, {len(responses)} answers"
                 sent += frames
                 if before_mib is None and sent > FRAMES / 4:
                     before_mib = resident_mib(edge)
@@ -189,9 +189,9 @@ def test_random_frames_do_not_affect_other_clients(tmp_path: Path) -> None:
         eventually(lambda: lab.stop() == 0)
 
 
-def has_garbage(stream: bytes, asked: list[tuple[int, int, int]]) -> bool:
+def has_malformed_data(stream: bytes, requests: list[tuple[int, int, int]]) -> bool:
     """Return whether malformed data follows the requests: it may reset the connection and discard responses."""
     used = 0
-    for _ in asked:
+    for _ in requests:
         used += 6 + struct.unpack_from(">H", stream, used + 4)[0]
     return used < len(stream)

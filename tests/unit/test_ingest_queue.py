@@ -5,6 +5,7 @@ import threading
 from test_sessions import TrackerBench
 
 from hilrig_recorder.ingest.queue import IngestQueue, ReceivedBatch
+from hilrig_runtime.messaging.recording_stream import encode_batch
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import OpenSession
 from hilrig_schemas.topics import STATE
@@ -114,6 +115,24 @@ def test_malformed_batches_are_counted_and_ignored() -> None:
     batch.keys.append("hil/lab/rig2/state")
     queue.put("key", batch.SerializeToString())
     assert (queue.malformed, queue.get(0)) == (2, None)
+
+
+def test_batch_whose_end_is_overwritten_in_transport_is_not_recorded() -> None:
+    source = FakeSource()
+    for _ in range(3):
+        source.state("rig1", 1)
+    sent = encode_batch(source.batch())
+    # What a zenoh session that is closed writes after the part of a batch: a length and frames of its own.
+    following = bytes.fromhex("c009a5b7f08c3b31009e21088585025f0200") * len(sent)
+    for length in range(1, len(sent)):
+        queue = IngestQueue(10, ManualClock())
+        queue.put("key", sent[:length] + following[: len(sent) - length])
+        queue.put("key", sent[:length])
+        assert (queue.malformed, queue.get(0)) == (2, None), f"{length} bytes are as they were sent"
+    queue = IngestQueue(10, ManualClock())
+    queue.put("key", sent)
+    queue.put("key", b"")
+    assert (queue.malformed, queue.depth) == (1, 3)
 
 
 def test_queue_of_a_blocked_recorder_is_bounded() -> None:

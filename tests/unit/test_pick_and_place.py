@@ -8,7 +8,7 @@ from hilrig_schemas import JointState, PartState
 from hilrig_sim.arm.dynamics import forward_dynamics
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from support.recordings import PARAMETERS
-from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, work
+from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, run_controller
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
@@ -19,7 +19,7 @@ def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
 @pytest.mark.parametrize("extra_ms", [0, 20, 40, 60])
 def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     with VirtualRig() as rig:
-        done_s = work(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
+        done_s = run_controller(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert result.placed == len(PARAMETERS.scene.parts) == 4
@@ -36,10 +36,10 @@ def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch
     with VirtualRig() as rig:
         remote = RemoteRig(rig, one_way_ms, seed=1)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
+        outcome = example.control(remote, example.Controller(example.task_of({})), 40.0, once=True)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
-    assert said["placed"] == result.placed == 4
+    assert outcome["placed"] == result.placed == 4
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
 
@@ -53,11 +53,11 @@ def test_stalls_delay_the_task_but_do_not_spoil_it(
     with VirtualRig() as rig:
         remote = RemoteRig(rig, one_way_ms, seed, stalls=0.004)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
+        outcome = example.control(remote, example.Controller(example.task_of({})), 20.0, 20.0, once=True)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
-    assert said["placed"] == result.placed == 4
-    assert said["missing"] == []
+    assert outcome["placed"] == result.placed == 4
+    assert outcome["missing"] == []
     assert result.largest_error_mm is not None
     assert result.largest_error_mm < 2.0
 
@@ -82,15 +82,15 @@ def test_timeout_is_reported_with_the_missing_parts(monkeypatch: pytest.MonkeyPa
     with VirtualRig() as rig:
         remote = RemoteRig(rig, 0.0, seed=1)
         monkeypatch.setattr(example, "time", remote)
-        said = example.control(remote, example.Controller(example.task_of({})), 8.0)
-    assert said["done_s"] is None
-    assert 0 < said["placed"] < 4
-    assert said["missing"] == ["red", "blue", "green", "yellow"][said["placed"] :]
-    told = example.sentence({"parts": 4, **said})
-    assert told.startswith(
-        f"{said['placed']} of 4 parts placed, missing {', '.join(said['missing'])}: the time ended during"
+        outcome = example.control(remote, example.Controller(example.task_of({})), 8.0)
+    assert outcome["done_s"] is None
+    assert 0 < outcome["placed"] < 4
+    assert outcome["missing"] == ["red", "blue", "green", "yellow"][outcome["placed"] :]
+    sentence = example.sentence({"parts": 4, **outcome})
+    assert sentence.startswith(
+        f"{outcome['placed']} of 4 parts placed, missing {', '.join(outcome['missing'])}: the time ended during"
     )
-    assert repr(said["doing"]) in told
+    assert repr(outcome["doing"]) in sentence
 
 
 def test_model_of_the_controller_equals_the_arm() -> None:

@@ -2,12 +2,16 @@
 
 import random
 
+import pytest
+from google.protobuf.message import DecodeError
+
 from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.messaging.recording_stream import (
     FLUSH_PERIOD_NS,
     SESSIONS_PERIOD_NS,
     RecordingStream,
     batch_cache_depth,
+    decode_batch,
     entries_of,
 )
 from hilrig_schemas import LogBatch, OpenSession
@@ -18,13 +22,13 @@ class Collecting(Publisher):
         self.batches: list[LogBatch] = []
 
     def put(self, payload: bytes) -> None:
-        self.batches.append(LogBatch.FromString(payload))
+        self.batches.append(decode_batch(payload))
 
     def close(self) -> None:
         pass
 
 
-def test_entries_are_published_in_order_and_unchanged() -> None:
+def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     for number in range(3):
@@ -39,7 +43,22 @@ def test_entries_are_published_in_order_and_unchanged() -> None:
     ]
 
 
-def test_batches_are_numbered_and_empty_ones_omitted() -> None:
+def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
+    sent: list[bytes] = []
+    out = Collecting()
+    out.put = sent.append  # type: ignore[method-assign]
+    log = RecordingStream(out, "sim/1", incarnation=7)
+    log.append("hil/lab/rig1/state", 1, 100, b"payload")
+    log.flush(0)
+    (payload,) = sent
+    batch = decode_batch(payload)
+    assert batch.HasField("checksum")
+    for at in range(5, len(payload)):
+        with pytest.raises(DecodeError):
+            decode_batch(payload[:at] + bytes([payload[at] ^ 1]) + payload[at + 1 :])
+
+
+def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     log.flush(0)
@@ -49,7 +68,7 @@ def test_batches_are_numbered_and_empty_ones_omitted() -> None:
     assert [batch.sequence for batch in out.batches] == [1, 2]
 
 
-def test_flush_is_due_once_per_period() -> None:
+def test_a_flush_is_due_once_a_period() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     for now in (1_000, 2_000, FLUSH_PERIOD_NS - 1_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
@@ -58,7 +77,7 @@ def test_flush_is_due_once_per_period() -> None:
     assert [len(batch.keys) for batch in out.batches] == [1, 3]
 
 
-def test_sessions_are_announced_at_once_and_repeated() -> None:
+def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_none() -> None:
     out = Collecting()
     log = RecordingStream(out, "edge/1", incarnation=7)
     log.set_sessions([OpenSession(rig="rig1", session="s1")])
@@ -71,7 +90,7 @@ def test_sessions_are_announced_at_once_and_repeated() -> None:
     assert all(batch.complete_sessions for batch in out.batches)
 
 
-def test_jittering_loop_flushes_every_period() -> None:
+def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     jitter = random.Random(1)
@@ -86,7 +105,7 @@ def test_jittering_loop_flushes_every_period() -> None:
     assert len(out.batches) <= 402
 
 
-def test_cache_duration_depends_on_number_of_rigs() -> None:
+def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:
     kept_ns = {rigs: batch_cache_depth(rigs, 20.0) * FLUSH_PERIOD_NS for rigs in (1, 30, 50, 100, 500)}
     assert {rigs: ns / 1e9 for rigs, ns in kept_ns.items()} == {1: 30, 30: 30, 50: 20, 100: 10, 500: 10}
     # At a step of 1 ms a rig says twenty times as much.

@@ -3,10 +3,17 @@
 Recording favors completeness over latency: entries are collected and published together, at most `FLUSH_PERIOD_NS`
 later, on the service's own log topic, to which only the recorder subscribes. On the control path this costs one list
 entry per message.
+
+A batch has a checksum. A zenoh session that is closed while a peer reads too slowly cancels a write in the middle of a
+batch and then writes the rest of its queue: the peer receives the first part of the batch, followed by other bytes.
 """
 
+import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from typing import Final
+
+from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Publisher
 from hilrig_schemas import LogBatch, OpenSession
@@ -19,6 +26,10 @@ MAX_CACHED_MESSAGES: Final = 50_000
 """Number of messages that a service caches for a recorder that restarts, within the limits below: about 15 MB."""
 MIN_CACHE_S: Final = 10.0
 MAX_CACHE_S: Final = 30.0
+
+_CHECKSUM: Final = struct.Struct("<BI")
+_CHECKSUM_TAG: Final = LogBatch.CHECKSUM_FIELD_NUMBER << 3 | 5
+"""Number and wire type (fixed32) of the field `checksum`."""
 
 Entry = tuple[str, int, int, bytes]
 """Key, sequence number of the publisher on that key, time of publication (ns, wall clock), encoded message."""
@@ -42,6 +53,28 @@ def entries_of(batch: LogBatch) -> Iterable[Entry]:
         ValueError: during the iteration, if the columns have different lengths.
     """
     return zip(batch.keys, batch.sequences, batch.publish_wall_ns, batch.payloads, strict=True)
+
+
+def encode_batch(batch: LogBatch) -> bytes:
+    """Encode a batch, with its checksum first: transport overwrites the end of a batch."""
+    body = batch.SerializeToString()
+    return _CHECKSUM.pack(_CHECKSUM_TAG, zlib.crc32(body)) + body
+
+
+def decode_batch(payload: bytes) -> LogBatch:
+    """Decode a batch.
+
+    Raises:
+        DecodeError: not a batch, or corrupted in transport.
+    """
+    batch = LogBatch.FromString(payload)
+    if batch.HasField("checksum"):
+        body = memoryview(payload)[_CHECKSUM.size :]
+        if payload[: _CHECKSUM.size] != _CHECKSUM.pack(_CHECKSUM_TAG, zlib.crc32(body)):
+            raise DecodeError("the checksum of the batch is wrong")
+    if not batch.source:
+        raise DecodeError("the batch has no source")
+    return batch
 
 
 def batch_cache_depth(rigs: int, step_ms: float) -> int:
@@ -102,4 +135,4 @@ class RecordingStream:
             self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS
             batch.sessions.extend(self._sessions)
             batch.complete_sessions = True
-        self._publisher.put(batch.SerializeToString())
+        self._publisher.put(encode_batch(batch))

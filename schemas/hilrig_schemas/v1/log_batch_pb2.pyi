@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class LogBatch(_message.Message):
-    __slots__ = ("source", "incarnation", "sequence", "sessions", "complete_sessions", "keys", "sequences", "publish_wall_ns", "payloads")
+    __slots__ = ("source", "incarnation", "sequence", "sessions", "complete_sessions", "keys", "sequences", "publish_wall_ns", "payloads", "checksum")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -17,6 +17,7 @@ class LogBatch(_message.Message):
     SEQUENCES_FIELD_NUMBER: _ClassVar[int]
     PUBLISH_WALL_NS_FIELD_NUMBER: _ClassVar[int]
     PAYLOADS_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUM_FIELD_NUMBER: _ClassVar[int]
     source: str
     incarnation: int
     sequence: int
@@ -26,7 +27,8 @@ class LogBatch(_message.Message):
     sequences: _containers.RepeatedScalarFieldContainer[int]
     publish_wall_ns: _containers.RepeatedScalarFieldContainer[int]
     payloads: _containers.RepeatedScalarFieldContainer[bytes]
-    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ...) -> None: ...
+    checksum: int
+    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ..., checksum: _Optional[int] = ...) -> None: ...
 
 class OpenSession(_message.Message):
     __slots__ = ("rig", "session", "controller", "start_wall_ns")

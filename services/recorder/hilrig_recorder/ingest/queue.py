@@ -12,7 +12,7 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_runtime.messaging.recording_stream import Entry, entries_of, put_entries
+from hilrig_runtime.messaging.recording_stream import Entry, decode_batch, entries_of, put_entries
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import LogBatch
 from hilrig_schemas.topics import EVENT
@@ -55,7 +55,7 @@ class IngestQueue:
         self.dropped = 0
         """Messages dropped because the queue was full."""
         self.malformed = 0
-        """Batches that could not be decoded."""
+        """Batches that could not be decoded, or whose checksum is wrong."""
         self._wall_ns = clock.wall_ns
         self._queue: SimpleQueue[ReceivedBatch] = SimpleQueue()
         self._removed = 0
@@ -73,7 +73,7 @@ class IngestQueue:
         """Enqueue a batch from the bus; never blocks."""
         wall_ns = self._wall_ns()
         try:
-            batch = LogBatch.FromString(payload)
+            batch = decode_batch(payload)
         except DecodeError:
             self.malformed += 1
             return
