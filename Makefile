@@ -1,41 +1,41 @@
-# Every target makes the .venv that it needs; system parts come by apt where that is possible (root on Debian).
+# Every target creates the .venv that it needs; system packages are installed with apt if possible (root on Debian).
 PYTHON ?= python3
 BIN := .venv/bin
-# Compiled sources are kept whatever the environment says: a lab is four processes, and tests start hundreds.
+# Bytecode files are always written: a lab has four processes, and tests start hundreds of processes.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test together alone check gen bench system clean
 .DEFAULT_GOAL := help
 
-help: ## what there is
+help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1|/' | awk -F'|' '{printf "  make %-8s %s\n", $$1, $$2}'
 
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-# Debian keeps ensurepip in a package of its own.
+# On Debian, ensurepip is in the package python3-venv.
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo 'hilrig needs Python 3.11 or newer: make PYTHON=python3.11' >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install --yes -qq python3-venv; } \
-		|| { echo '$(PYTHON) can make no environments: install python3-venv (as root), or make PYTHON=another' >&2; exit 1; }
+		|| { echo '$(PYTHON) has no module ensurepip: install python3-venv (as root), or use another interpreter: make PYTHON=python3.12' >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 
 .venv/ready: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP_INSTALL) '.[all]'
 	@touch $@
 
-# To compile all of what is installed takes longer than what tests import of it, which is compiled then.
+# Without --no-compile pip compiles all installed modules; tests import, and so compile, only a part of them.
 .venv/dev: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP_INSTALL) '.[dev]' --no-compile
 	@touch .venv/ready $@
 
-system: ## the system parts that tests and benchmarks use (apt, as root)
+system: ## install the system packages of tests and benchmarks (apt, as root)
 	@sh scripts/system_packages.sh
 
-demo: .venv/ready ## the whole rig for 20 s with a controller over real Modbus TCP; results in demo-out/
+demo: .venv/ready ## run the complete rig for 20 s with a Modbus TCP controller; results in demo-out/
 	$(BIN)/hilrig demo
 
-test: .venv/bin/python ## everything that CI runs
+test: .venv/bin/python ## run all tests and checks of CI
 	@$(MAKE) --no-print-directory --jobs=2 system .venv/dev
 	@$(MAKE) --no-print-directory --jobs=2 check together
 	@$(MAKE) --no-print-directory alone
@@ -51,21 +51,21 @@ together: .venv/dev
 alone: .venv/dev
 	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
 
-check: .venv/dev ## format, lint, types, floors
+check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
 
-gen: .venv/dev ## generated code and tables, from their sources
+gen: .venv/dev ## generate code and documentation tables from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto
 	$(BIN)/python scripts/wire_contract.py
 	$(BIN)/python scripts/generate_configuration.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python scripts/generate_conformance.py > docs/modbus-conformance.md
 
-bench: .venv/dev system ## every benchmark (most of an hour); writes docs/performance.md
+bench: .venv/dev system ## run all benchmarks (up to one hour); writes docs/performance.md
 	$(BIN)/python bench/run_all.py
 
-clean: ## everything that was built or installed here
+clean: ## remove everything that was built or installed here
 	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis dist

@@ -1,4 +1,4 @@
-"""Write docs/configuration.md from the models that read `lab.toml`: `make gen`."""
+"""Writes docs/configuration.md from the configuration models of `lab.toml`; run by `make gen`."""
 
 import sys
 from pathlib import Path
@@ -8,9 +8,9 @@ from hilrig_runtime.config.template import lab_template
 PAGE = Path(__file__).parents[1] / "docs/configuration.md"
 TEXT = """# lab.toml
 
-A lab is described by one file, which every service reads; with no file there is one rig with the defaults. A mistake
-is named with its place, what was expected and what was found: `hilrig check lab.toml`. What follows is what
-`hilrig check --template` prints: every key, its meaning and its default. Leave out what you do not change.
+One file describes a lab; every service reads it. Without a file, a lab has one rig with the default settings.
+`hilrig check lab.toml` reports each error with its place, the value found and the accepted values. The following is the
+output of `hilrig check --template`: every key, its meaning and its default. Omit the keys that you do not change.
 
 ```toml
 {template}```
@@ -31,8 +31,8 @@ name = "right"
 arm.masses_kg = [1.0, 1.0, 0.8]
 ```
 
-A class of 64 rigs, `rig1` to `rig64` at ports 5020 to 5083, all with a shorter second link; the teacher's own beside
-them, and the seventh at a port of its own (which frees 5026 for the eighth):
+64 rigs for a class, `rig1` to `rig64` at ports 5020 to 5083, all with a shorter second link; an additional rig for the
+teacher, and rig7 at another port (so that rig8 gets port 5026):
 
 ```toml
 name = "robotics"
@@ -50,8 +50,8 @@ name = "teacher"
 allow = ["192.168.7.2/32"]
 ```
 
-A task, by which `hilrig report` grades the lab's runs ([review.md](review.md) says how): two poses, then a triangle,
-and two parts in the tray, all within a minute. Any one of the three kinds is a task too.
+A task that `hilrig report` uses to grade the runs of the lab (see [review.md](review.md)): two poses, then a triangle,
+and two parts in the tray, all within one minute. A task needs at least one of these three kinds of goals.
 
 ```toml
 [task]
@@ -81,7 +81,7 @@ tolerance_mm = 2
 
 
 def page() -> str:
-    """The page's text."""
+    """Return the text of the page."""
     return TEXT.format(template=lab_template())
 
 

@@ -1,4 +1,4 @@
-"""What all tests share: on a busy machine an example of hypothesis may take its time."""
+"""Settings of all tests: hypothesis has no deadline per example, because other tests load the machine."""
 
 from hypothesis import settings
 

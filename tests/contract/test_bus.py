@@ -1,4 +1,4 @@
-"""One contract, two transports: what a service may expect of the bus."""
+"""Contract of the bus, tested for both transports: in memory and zenoh."""
 
 import queue
 import socket
@@ -13,13 +13,13 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import BusConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas.topics import Traffic
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 OpenBus = Callable[[str], Bus]
 
 
 def free_ports(count: int) -> int:
-    """First of `count` neighbouring free ports on loopback."""
+    """First of `count` consecutive free ports on loopback."""
     while True:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
@@ -49,7 +49,7 @@ def open_bus(request: pytest.FixtureRequest) -> Iterator[OpenBus]:
         bus.close()
 
 
-def test_a_message_reaches_who_subscribed_and_no_one_else(open_bus: OpenBus) -> None:
+def test_message_reaches_only_matching_subscribers(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     states: queue.Queue[tuple[str, bytes]] = queue.Queue()
     others: queue.Queue[tuple[str, bytes]] = queue.Queue()
@@ -61,7 +61,7 @@ def test_a_message_reaches_who_subscribed_and_no_one_else(open_bus: OpenBus) -> 
     assert others.empty()
 
 
-def test_control_arrives_in_the_order_of_sending(open_bus: OpenBus) -> None:
+def test_control_messages_arrive_in_order(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[int] = []
     edge.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(int(payload)))
@@ -69,42 +69,42 @@ def test_control_arrives_in_the_order_of_sending(open_bus: OpenBus) -> None:
     eventually(lambda: publisher.put(b"0") or got)
     for number in range(1, 500):
         publisher.put(str(number).encode())
-    # Under load control is dropped rather than queued; what arrives is in order all the same.
+    # Under load control messages are dropped instead of queued; the received messages must still be in order.
     eventually(lambda: publisher.put(b"499") or got[-1] == 499)
     assert got == sorted(got)
 
 
-def test_a_reader_that_was_held_up_goes_on_with_the_newest(open_bus: OpenBus, request: pytest.FixtureRequest) -> None:
+def test_blocked_subscriber_continues_with_newest_message(open_bus: OpenBus, request: pytest.FixtureRequest) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[int] = []
-    entered, go_on = threading.Event(), threading.Event()
+    entered, unblocked = threading.Event(), threading.Event()
 
-    def held_up(_: str, payload: bytes) -> None:
+    def blocked(_: str, payload: bytes) -> None:
         got.append(int(payload))
         if "zenoh" in request.node.name:
             entered.set()
-            go_on.wait(PATIENT_S)
+            unblocked.wait(LONG_TIMEOUT_S)
 
-    subscription = edge.subscribe_newest("hil/lab/rig1/state", held_up, 2)
+    subscription = edge.subscribe_newest("hil/lab/rig1/state", blocked, 2)
     publisher = sim.publisher("hil/lab/rig1/state", Traffic.CONTROL)
     eventually(lambda: publisher.put(b"0") or got)
     for number in range(1, 200):
         publisher.put(str(number).encode())
     publisher.put(b"200")
-    heard = queue.Queue[bytes]()
-    # The last message has gone through the link when a later one, on another key, has.
-    edge.subscribe("hil/lab/rig2/state", lambda _, payload: heard.put(payload))
+    later = queue.Queue[bytes]()
+    # When a later message on another key has arrived, all earlier messages have passed the link.
+    edge.subscribe("hil/lab/rig2/state", lambda _, payload: later.put(payload))
     marker = sim.publisher("hil/lab/rig2/state", Traffic.CONTROL)
-    eventually(lambda: marker.put(b"") or not heard.empty())
-    go_on.set()
+    eventually(lambda: marker.put(b"") or not later.empty())
+    unblocked.set()
     eventually(lambda: publisher.put(b"200") or got[-1] == 200)
     if "zenoh" in request.node.name:
-        assert len(got) < 100, "what piled up was not worked through"
+        assert len(got) < 100, "queued messages were delivered instead of dropped"
     subscription.close()
     subscription.close()
 
 
-def test_a_recording_stream_gives_a_late_subscriber_what_went_before(open_bus: OpenBus) -> None:
+def test_late_subscriber_receives_earlier_recording_messages(open_bus: OpenBus) -> None:
     sim, recorder = open_bus("sim"), open_bus("recorder")
     publisher = sim.publisher("hil/lab/log/sim/1", Traffic.RECORDING)
     for number in range(50):
@@ -119,7 +119,7 @@ def test_a_recording_stream_gives_a_late_subscriber_what_went_before(open_bus: O
     assert lost == []
 
 
-def test_a_question_is_answered_by_everyone_who_serves_it(open_bus: OpenBus) -> None:
+def test_query_is_answered_by_every_queryable(open_bus: OpenBus) -> None:
     sim, tool = open_bus("sim"), open_bus("tool")
 
     def refuse(_: bytes) -> bytes:
@@ -132,11 +132,11 @@ def test_a_question_is_answered_by_everyone_who_serves_it(open_bus: OpenBus) -> 
     assert by_error == [("", b"one:?"), ("not now", b"")]
 
 
-def test_a_question_without_a_server_gets_no_answer(open_bus: OpenBus) -> None:
+def test_query_without_queryable_gets_no_reply(open_bus: OpenBus) -> None:
     assert open_bus("tool").query("hil/lab/nobody/config", timeout_s=0.2) == []
 
 
-def test_liveliness_shows_who_is_there_and_who_went(open_bus: OpenBus) -> None:
+def test_liveliness_reports_start_and_end(open_bus: OpenBus) -> None:
     sim, tool = open_bus("sim"), open_bus("tool")
     token = sim.declare_token("hil/lab/alive/sim/1")
     eventually(lambda: tool.get_liveliness("hil/lab/alive/*/*") == ["hil/lab/alive/sim/1"])
@@ -147,7 +147,7 @@ def test_liveliness_shows_who_is_there_and_who_went(open_bus: OpenBus) -> None:
     eventually(lambda: changes[-1] == ("hil/lab/alive/sim/1", False))
 
 
-def test_what_was_closed_is_silent_and_closing_twice_is_fine(open_bus: OpenBus) -> None:
+def test_closed_objects_are_silent_and_can_be_closed_again(open_bus: OpenBus) -> None:
     sim, edge = open_bus("sim"), open_bus("edge")
     got: list[bytes] = []
     subscription = edge.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(payload))
@@ -163,22 +163,24 @@ def test_what_was_closed_is_silent_and_closing_twice_is_fine(open_bus: OpenBus) 
     edge.close()
 
 
-def test_services_find_each_other_in_any_order_and_again_after_a_restart() -> None:
+def test_services_connect_in_any_order_and_after_a_restart() -> None:
     config = BusConfig(first_port=free_ports(3))
     got: list[bytes] = []
     with ZenohBus(config, "recorder") as recorder, ZenohBus(config, "edge") as edge:
         for bus in (recorder, edge):
             bus.subscribe("hil/lab/rig1/state", lambda _, payload: got.append(payload))
-        for life in (b"first", b"second"):
+        for instance in (b"first", b"second"):
             with ZenohBus(config, "sim") as sim:
                 publisher = sim.publisher("hil/lab/rig1/state", Traffic.CONTROL)
-                eventually(lambda life=life, publisher=publisher: publisher.put(life) or got.count(life) >= 2)
+                eventually(
+                    lambda instance=instance, publisher=publisher: publisher.put(instance) or got.count(instance) >= 2
+                )
 
 
-def test_a_taken_bus_port_is_said_in_one_line() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        config = BusConfig(first_port=taken.getsockname()[1])
+def test_occupied_bus_port_is_reported_in_one_line() -> None:
+    with socket.socket() as occupied:
+        occupied.bind(("127.0.0.1", 0))
+        occupied.listen()
+        config = BusConfig(first_port=occupied.getsockname()[1])
         with pytest.raises(OperationError, match=rf"can't listen on tcp/127\.0\.0\.1:{config.first_port}.*first_port"):
             ZenohBus(config, "sim")

@@ -48,7 +48,7 @@ console.log(JSON.stringify(found));
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A recording of the recording writer, the file recovered from its truncated copy, and its export."""
+    """A recording, the file recovered from its truncated copy, and its Foxglove export."""
     folder = tmp_path_factory.mktemp("foreign")
     made = recordings.record(folder / "made.mcap", recordings.Script(seconds=5))
     complete, truncated = folder / "complete.mcap", folder / "truncated.mcap"
@@ -73,7 +73,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def counted(path: Path) -> dict[str, int]:
-    """Number of messages per topic, by the mcap library."""
+    """Number of messages per topic, read with the mcap library."""
     counts: dict[str, int] = {}
     with path.open("rb") as stream:
         for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():

@@ -1,4 +1,4 @@
-"""How a process ends: in order on the first signal, at once on the second, with its parent, and when closing hangs."""
+"""Shutdown of a process: first signal, second signal, end of its parent, closing timeout, crashed thread."""
 
 import signal
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from support.labs import free_ports
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 SERVICE = """
 import sys, threading, time
@@ -24,7 +24,7 @@ def orderly(service):
     service.stopping.wait()
     print("closing", flush=True)
 
-def stubborn(service):
+def ignoring_stop(service):
     service.ready()
     print("ready", flush=True)
     while True:
@@ -33,7 +33,7 @@ def stubborn(service):
 def failing(service):
     raise InputError("lab.toml: sim.step: unknown key")
 
-def crippled(service):
+def crashing_thread(service):
     service.ready()
     threading.Thread(target=lambda: 1 / 0, name="worker").start()
     service.stopping.wait()
@@ -62,7 +62,7 @@ def start(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
+def test_first_signal_stops_in_order(tmp_path: Path, number: signal.Signals) -> None:
     process = start(tmp_path, "orderly")
     process.send_signal(number)
     output, _ = process.communicate(timeout=10)
@@ -70,8 +70,8 @@ def test_the_first_signal_ends_in_order(tmp_path: Path, number: signal.Signals) 
     assert process.returncode == 0
 
 
-def test_the_second_signal_forces(tmp_path: Path) -> None:
-    process = start(tmp_path, "stubborn", timeout=60)
+def test_second_signal_forces_exit(tmp_path: Path) -> None:
+    process = start(tmp_path, "ignoring_stop", timeout=60)
     process.terminate()
     eventually(lambda: process.poll() is not None or process.terminate())
     assert process.wait() == 128 + signal.SIGTERM
@@ -85,7 +85,7 @@ from hilrig_runtime.process.shutdown import stop_on_signals
 stopping = threading.Event()
 stop_on_signals(stopping)
 with stopping._cond:
-    # As in the middle of `wait`.
+    # `wait` holds this lock for a moment.
     os.kill(os.getpid(), signal.SIGTERM)
     for _ in range(1000):
         pass
@@ -94,28 +94,30 @@ print("ended", flush=True)
 """
 
 
-def test_a_signal_that_comes_while_the_event_is_locked_is_heard_all_the_same() -> None:
-    done = subprocess.run([sys.executable, "-c", LOCKED], check=True, capture_output=True, text=True, timeout=PATIENT_S)
+def test_signal_while_the_event_is_locked_is_handled() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LOCKED], check=True, capture_output=True, text=True, timeout=LONG_TIMEOUT_S
+    )
     assert done.stdout == "ended\n"
 
 
-def test_a_process_whose_closing_hangs_ends_all_the_same(tmp_path: Path) -> None:
-    process = start(tmp_path, "stubborn", timeout=0.3)
+def test_process_exits_when_closing_hangs(tmp_path: Path) -> None:
+    process = start(tmp_path, "ignoring_stop", timeout=0.3)
     process.terminate()
     _, errors = process.communicate(timeout=10)
     assert "shutdown timed out" in errors
     assert process.returncode == 3
 
 
-def test_a_service_ends_with_its_parent(tmp_path: Path) -> None:
+def test_service_stops_with_its_parent(tmp_path: Path) -> None:
     process = start(tmp_path, "orderly", parent=True)
     output, _ = process.communicate(timeout=10)
     assert output == "closing\nended\n"
     assert process.returncode == 0
 
 
-def test_a_service_does_not_run_on_without_one_of_its_threads(tmp_path: Path) -> None:
-    process = start(tmp_path, "crippled", ready=False)
+def test_service_fails_when_a_thread_crashes(tmp_path: Path) -> None:
+    process = start(tmp_path, "crashing_thread", ready=False)
     output, errors = process.communicate(timeout=20)
     assert output == ""
     assert "ZeroDivisionError" in errors
@@ -124,7 +126,7 @@ def test_a_service_does_not_run_on_without_one_of_its_threads(tmp_path: Path) ->
     assert process.returncode == 3
 
 
-def test_an_error_is_one_line_and_its_exit_code(tmp_path: Path) -> None:
+def test_error_is_one_line_with_its_exit_code(tmp_path: Path) -> None:
     process = start(tmp_path, "failing", ready=False)
     output, errors = process.communicate(timeout=20)
     assert output == ""

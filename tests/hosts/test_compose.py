@@ -1,4 +1,4 @@
-"""compose.yaml: what it says is started for real, each service on a host of its own with its own certificate alone."""
+"""compose.yaml: its services run as real processes, each on its own host with its own certificate only."""
 
 import re
 import shutil
@@ -15,7 +15,7 @@ import yaml
 from hilrig_runtime.config.lab import load_lab
 from support.labs import hilrig
 from support.namespaces import Network, require_namespaces
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 ROOT = Path(__file__).parents[2]
 LAB_FILE = ROOT / "compose/lab.toml"
@@ -23,7 +23,7 @@ COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 EDGES = {"east": "rig1,rig2", "west": "rig3,rig4"}
 CERTIFICATES = {"console": "viewer"}
-"""Of what is no service of the loop: the console only looks."""
+"""Certificate of a service that is named otherwise: the console is read-only."""
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 CONTROLLER = """
@@ -41,7 +41,7 @@ print(before[0], after[0])
 client.close()
 """
 
-LOOK = """
+VIEWER = """
 import json, sys, urllib.error, urllib.request
 
 address, password = sys.argv[1:]
@@ -73,12 +73,12 @@ config.insert_json5("transport/link/tls/root_ca_certificate", '"%s"')
 try:
     zenoh.open(config).close()
 except zenoh.ZError:
-    print("not let in")
+    print("connection refused")
 """
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_every_service_is_confined_and_looked_after(name: str) -> None:
+def test_every_service_is_confined_and_has_a_health_check(name: str) -> None:
     service = SERVICES[name]
     assert service["user"] == "10001:10001"
     assert service["read_only"] is True
@@ -95,7 +95,7 @@ def test_every_service_is_confined_and_looked_after(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
+def test_every_service_mounts_only_its_own_certificate(name: str) -> None:
     mounted = {source: (target, mode) for source, target, *mode in (v.split(":") for v in SERVICES[name]["volumes"])}
     certificates = {source for source in mounted if source.startswith("./certs/")}
     own = CERTIFICATES.get(name, name)
@@ -105,7 +105,7 @@ def test_every_service_has_its_own_certificate_and_no_other(name: str) -> None:
     assert mounted.get("./recordings", ("", []))[1] == (["ro"] if name == "console" else [])
 
 
-def test_the_lab_and_the_compose_file_agree() -> None:
+def test_lab_file_and_compose_file_agree() -> None:
     lab = load_lab(LAB_FILE)
     assert lab.bus.router == "tls/router:7447"
     assert SERVICES["router"]["command"][-2:] == ["--listen", "tls/0.0.0.0:7447"]
@@ -115,16 +115,16 @@ def test_the_lab_and_the_compose_file_agree() -> None:
         assert SERVICES[edge]["command"][-4:] == ["--instance", edge, "--rigs", rigs]
         ports = [lab.ports[rig] for rig in rigs.split(",")]
         span = f"{ports[0]}-{ports[-1]}"
-        # On this host alone, until somebody says otherwise.
+        # By default the ports are published on loopback only.
         assert SERVICES[edge]["ports"] == [f"127.0.0.1:{span}:{span}"]
     assert f"./recordings:{lab.recorder.folder}" in SERVICES["recorder"]["volumes"]
     assert COMPOSE["networks"]["bus"]["internal"] is True
     assert SERVICES["console"]["ports"] == ["127.0.0.1:8050:8050"]
-    apart = {"east": ["bus", "controllers"], "west": ["bus", "controllers"], "console": ["bus", "browsers"]}
-    assert all(service["networks"] == apart.get(name, ["bus"]) for name, service in SERVICES.items())
+    networks = {"east": ["bus", "controllers"], "west": ["bus", "controllers"], "console": ["bus", "browsers"]}
+    assert all(service["networks"] == networks.get(name, ["bus"]) for name, service in SERVICES.items())
 
 
-def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compose_names() -> None:
+def test_image_installs_the_parts_named_in_compose() -> None:
     dockerfile = (ROOT / "Dockerfile").read_text()
     for folder in ("schemas", "runtime", "services", "tools", "examples"):
         assert f"COPY {folder} {folder}" in dockerfile
@@ -135,7 +135,7 @@ def test_the_image_copies_what_the_build_reads_and_installs_the_parts_that_compo
         assert f"\n{service['build']['args']['PARTS']} = [" in pyproject
 
 
-def test_a_compose_implementation_reads_it() -> None:
+def test_compose_implementation_parses_the_file() -> None:
     command = [*compose_command(), "--file", "compose.yaml", "config"]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -147,13 +147,13 @@ def test_a_compose_implementation_reads_it() -> None:
 
 
 def compose_command() -> list[str]:
-    """The compose implementation that is installed: a command of its own, or a part of `docker`."""
+    """Command of the installed compose implementation: `docker-compose` or `docker compose`."""
     for command in (["docker-compose"], ["docker", "compose"]):
         if shutil.which(command[0]) is None:
             continue
         if subprocess.run([*command, "version"], check=False, capture_output=True, timeout=60).returncode == 0:
             return command
-    pytest.skip("needs docker-compose (Debian's package of that name), or docker with its plugin compose")
+    pytest.skip("needs docker-compose (Debian package docker-compose), or docker with the compose plugin")
 
 
 def published(service: dict[str, Any]) -> list[str]:
@@ -166,7 +166,7 @@ def published(service: dict[str, Any]) -> list[str]:
 
 @dataclass
 class Containers:
-    """The services of compose.yaml, each on its own host, with what the file mounts and nothing else."""
+    """The services of compose.yaml, each on its own host with only the files that compose.yaml mounts."""
 
     network: Network
     folder: Path
@@ -174,12 +174,14 @@ class Containers:
 
     def start(self, name: str) -> None:
         with (self.folder / f"{name}.log").open("a") as log:
-            self.processes[name] = self.network.popen(name, self.words(name, SERVICES[name]["command"]), stdout=log)
+            self.processes[name] = self.network.popen(
+                name, self.local_command(name, SERVICES[name]["command"]), stdout=log
+            )
 
-    def words(self, name: str, command: list[str]) -> list[str]:
-        """A command of a container's, with the paths that stand for its mounts here."""
+    def local_command(self, name: str, command: list[str]) -> list[str]:
+        """Command of a container, with the paths of its mounts in this test."""
         inside = {"hilrig": HILRIG, "/etc/hilrig/lab.toml": str(self.folder / name / "lab.toml")}
-        return [inside.get(word, word) for word in command]
+        return [inside.get(argument, argument) for argument in command]
 
     def mount(self, name: str, certificates: Path) -> None:
         own = self.folder / name
@@ -191,9 +193,9 @@ class Containers:
         text = LAB_FILE.read_text().replace('"/certs"', f'"{own}"')
         (own / "lab.toml").write_text(text.replace('"/recordings"', f'"{self.folder / "recordings"}"'))
 
-    def is_well(self, name: str) -> bool:
-        """What the health check of a container says."""
-        command = self.words(name, SERVICES[name]["healthcheck"]["test"][1:])
+    def is_healthy(self, name: str) -> bool:
+        """Whether the health check of a container succeeds."""
+        command = self.local_command(name, SERVICES[name]["healthcheck"]["test"][1:])
         return self.network.call(name, command) == 0
 
 
@@ -204,7 +206,7 @@ def containers(tmp_path: Path) -> Iterator[Containers]:
     assert made.returncode == 0, made.stderr
     with Network([*SERVICES, "controller"]) as network:
         running = Containers(network, tmp_path, {})
-        # The router comes last: each service waits for it.
+        # The router starts last: each service waits for it.
         for name in reversed(SERVICES):
             running.mount(name, tmp_path / "certs/bus")
             running.start(name)
@@ -213,7 +215,7 @@ def containers(tmp_path: Path) -> Iterator[Containers]:
 
 @pytest.mark.hosts
 @pytest.mark.timeout(300)
-def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(containers: Containers) -> None:
+def test_services_connect_by_name_and_controllers_move_arms(containers: Containers) -> None:
     network, folder = containers.network, containers.folder
 
     def drive(edge: str, port: int) -> tuple[int, int] | None:
@@ -228,27 +230,27 @@ def test_the_services_find_each_other_by_name_and_controllers_move_the_arms(cont
     for edge, port in (("east", 5020), ("west", 5023)):
         before, after = eventually(lambda edge=edge, port=port: drive(edge, port), timeout_s=90, every_s=0.2)
         assert after > before
-    assert all(eventually(lambda name=name: containers.is_well(name)) for name in SERVICES)
+    assert all(eventually(lambda name=name: containers.is_healthy(name)) for name in SERVICES)
 
-    told = re.search(r"password: (\S+)", (folder / "console.log").read_text())
-    assert told is not None
-    look = [sys.executable, "-c", LOOK, f"http://{network.address('console')}:8050/live", told[1]]
-    seen = network.run("controller", look, stdout=subprocess.PIPE, text=True).stdout.split()
+    password = re.search(r"password: (\S+)", (folder / "console.log").read_text())
+    assert password is not None
+    viewer = [sys.executable, "-c", VIEWER, f"http://{network.address('console')}:8050/live", password[1]]
+    seen = network.run("controller", viewer, stdout=subprocess.PIPE, text=True).stdout.split()
     assert seen == ["401", *sorted(rig.name for rig in load_lab(LAB_FILE).rigs)]
 
     stranger = [sys.executable, "-c", STRANGER % (folder / "router/ca.pem")]
-    assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "not let in\n"
+    assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "connection refused\n"
 
     containers.processes["sim"].kill()
     containers.processes["sim"].wait()
-    assert not containers.is_well("sim")
+    assert not containers.is_healthy("sim")
     containers.start("sim")
-    assert eventually(lambda: containers.is_well("sim"))
+    assert eventually(lambda: containers.is_healthy("sim"))
 
     for name in ("console", "east", "west", "sim", "recorder", "router"):
         process = containers.processes[name]
-        assert process.poll() is None, f"{name} ended by itself"
+        assert process.poll() is None, f"{name} exited unexpectedly"
         process.terminate()
-        assert process.wait(PATIENT_S) == 0, f"{name} did not end well on SIGTERM"
+        assert process.wait(LONG_TIMEOUT_S) == 0, f"{name} did not exit with code 0 on SIGTERM"
     assert {path.parent.name for path in (folder / "recordings").rglob("*.mcap")} == {"rig1", "rig4"}
     assert not list((folder / "recordings").rglob("*.part"))

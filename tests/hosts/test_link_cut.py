@@ -1,4 +1,4 @@
-"""The recorder on another host than the rig, and the cable between them pulled out: nothing is lost."""
+"""Link cut between the recorder and the rig on another host: no message is lost."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 
 def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]]:
-    """Record a session during which the recorder's cable is out for a while: what was sent, and the session's files."""
+    """Record a session with a link cut of the recorder; returns the sent messages and the files of the session."""
     require_namespaces()
     config, lab = make_lab(folder, extra='bus.topology = "router"\nbus.router = "tcp/rig:7447"')
     sent_file = folder / "sent.pickle"
@@ -31,15 +31,15 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
         sender = network.popen("rig", command, stdin=subprocess.PIPE, text=True, cwd=TESTS)
         assert sender.stdin is not None
 
-        def say(line: str) -> None:
+        def send_line(line: str) -> None:
             print(line, file=sender.stdin, flush=True)
 
-        say("begin rig1")
+        send_line("begin rig1")
 
         def size() -> int:
             found = 0
             for path in files_of(lab, "rig1", "*.mcap*"):
-                # It may get its name just now.
+                # The recorder may rename the file at this moment.
                 with contextlib.suppress(FileNotFoundError):
                     found += path.stat().st_size
             return found
@@ -50,7 +50,7 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
         during = size()
         network.set_link("store", True)
         eventually(lambda: size() > during + 10_000)
-        say("end rig1")
+        send_line("end rig1")
         eventually(lambda: files_of(lab, "rig1") and not files_of(lab, "rig1", "*.part"))
         sender.stdin.close()
         assert sender.wait(20) == 0
@@ -60,24 +60,24 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
 
 @pytest.mark.hosts
 @pytest.mark.rig
-def test_a_cable_pulled_for_five_seconds_loses_nothing(tmp_path: Path) -> None:
+def test_five_second_link_cut_loses_nothing(tmp_path: Path) -> None:
     sent, [path] = record_with_a_cut(tmp_path, 5.0)
     found = recorded([path])
     assert len(found) == len(set(found))
     missing = set(sent) - set(found)
     summary = metadata(path)["hilrig.summary"]
-    assert not missing, f"{len(missing)} of {len(sent)} are missing: {sorted(missing)[0][:2]}…; stated: {summary}"
+    assert not missing, f"{len(missing)} of {len(sent)} are missing: {sorted(missing)[0][:2]}…; summary: {summary}"
     assert (summary["lost_transport"], summary["lost_recorder"], summary["clock_steps"]) == ("0", "0", "0")
 
 
 @pytest.mark.hosts
 @pytest.mark.rig
-@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes more than a minute: set HILRIG_LONG=1")
-def test_of_a_longer_cut_the_file_says_exactly_what_is_missing(tmp_path: Path) -> None:
+@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="runs for more than a minute: set HILRIG_LONG=1")
+def test_longer_link_cut_is_counted_exactly(tmp_path: Path) -> None:
     sent, paths = record_with_a_cut(tmp_path, 45.0)
     missing = set(sent) - set(recorded(paths))
     assert len(missing) > 0
-    # After 30 s without a word of who keeps the session its file ends; when the link is back it goes on in a next one.
+    # Without a message of the session's owner for 30 s the file ends; the session continues in the next file.
     summaries = [metadata(path)["hilrig.summary"] for path in paths]
     assert [summary["ended"] for summary in summaries] == ["keeper lost", "ended"]
     lost = [int(summary["lost_transport"]) + int(summary["lost_recorder"]) for summary in summaries]

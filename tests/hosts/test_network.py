@@ -1,4 +1,4 @@
-"""The hosts that other tests stand on: they find each other by name, and a cable that is out loses without a word."""
+"""Emulated hosts of other tests: name resolution, addresses, and silent packet loss on a link that is down."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ except OSError as error:
 @pytest.fixture
 def network() -> Iterator[Network]:
     require_namespaces()
-    # A host may have the gateway's name, too.
+    # A host may be named like the gateway.
     with Network(["client", "server", "gateway"]) as network:
         server = network.popen("server", [sys.executable, "-c", SERVER], stdout=subprocess.PIPE, text=True)
         assert server.stdout is not None
@@ -40,29 +40,29 @@ def network() -> Iterator[Network]:
         yield network
 
 
-def asked(network: Network, host: str, timeout_s: float = 20.0) -> str:
-    """What a host is told that asks the server: its own address, or the kind of error."""
+def query_server(network: Network, host: str, timeout_s: float = 20.0) -> str:
+    """Connect a host to the server; returns its address as seen by the server, or the name of the error."""
     command = [sys.executable, "-c", CLIENT, "server", str(timeout_s)]
     return network.run(host, command, stdout=subprocess.PIPE, text=True).stdout.strip()
 
 
-def test_hosts_find_each_other_by_name_and_see_each_others_addresses(network: Network) -> None:
+def test_hosts_resolve_names_and_see_peer_addresses(network: Network) -> None:
     for host in ("client", "gateway", "server"):
-        assert asked(network, host) == network.address(host)
+        assert query_server(network, host) == network.address(host)
 
 
-def test_what_is_sent_to_a_host_whose_cable_is_out_is_lost_without_a_word(network: Network) -> None:
+def test_packets_to_a_disconnected_host_are_dropped(network: Network) -> None:
     network.set_link("server", False)
-    assert asked(network, "client", 1.0) == "TimeoutError"
+    assert query_server(network, "client", 1.0) == "TimeoutError"
     network.set_link("server", True)
-    assert asked(network, "client") == network.address("client")
+    assert query_server(network, "client") == network.address("client")
 
 
-def test_a_host_whose_cable_is_out_reaches_itself_alone(network: Network) -> None:
+def test_disconnected_host_reaches_only_itself(network: Network) -> None:
     network.set_link("client", False)
-    assert asked(network, "client", 1.0) == "TimeoutError"
-    assert asked(network, "gateway") == network.address("gateway")
+    assert query_server(network, "client", 1.0) == "TimeoutError"
+    assert query_server(network, "gateway") == network.address("gateway")
     network.set_link("client", True)
-    assert asked(network, "client") == network.address("client")
+    assert query_server(network, "client") == network.address("client")
     network.set_link("server", False)
-    assert asked(network, "server") == network.address("server")
+    assert query_server(network, "server") == network.address("server")

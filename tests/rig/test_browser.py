@@ -15,7 +15,7 @@ from hilrig_replay.plots.palette import JOINT_COLORS, rgb
 from support.browser import CHROMIUM, Browser, share_of
 from support.labs import HILRIG, hilrig
 from support.recordings import Script, make, record, write
-from support.waiting import PATIENT_S
+from support.waiting import LONG_TIMEOUT_S
 
 pytestmark = [pytest.mark.rig, pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")]
 
@@ -124,7 +124,7 @@ def test_web_viewer_shows_the_arm_using_loopback_only(tmp_path: Path) -> None:
             elsewhere = [one for one in browser.requests if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", one)]
             assert elsewhere == [], elsewhere
         process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(LONG_TIMEOUT_S) == 0
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

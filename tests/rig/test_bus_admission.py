@@ -1,4 +1,4 @@
-"""Who is let in on the secured bus at all, and a whole lab that runs on it."""
+"""Admission to the secured bus by certificate, and a complete lab on a secured bus."""
 
 import shutil
 import socket
@@ -15,18 +15,18 @@ from hilrig_runtime.bus.zenoh_config import router_config
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.security.x509 import Credential, issue_peer, make_authority
-from support.bus_certificates import HOSTS, NOW, bad_identities, folder_of_one, make_bus_folder
+from support.bus_certificates import HOSTS, NOW, invalid_credentials, make_bus_folder, make_client_folder
 from support.labs import RunningLab, free_ports, hilrig, write_lab
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
 
-BAD = ["another authority", "expired", "not valid yet", "a controller's"]
+INVALID = ["another authority", "expired", "not valid yet", "a controller's"]
 
 
 @dataclass
 class Lab:
-    """A lab's certificates, and somebody's own."""
+    """Certificates of a lab, their authority, and the port of its router."""
 
     folder: Path
     authority: Credential
@@ -53,22 +53,24 @@ def router(lab: Lab) -> Iterator[zenoh.Session]:
         yield session
 
 
-def test_who_has_a_certificate_of_the_lab_is_let_in(lab: Lab, router: zenoh.Session) -> None:
+def test_lab_certificate_is_accepted(lab: Lab, router: zenoh.Session) -> None:
     with ZenohBus(lab.config(lab.folder), "tool") as bus:
         assert router.zid() in bus.session.info.routers_zid()
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_a_certificate_that_is_no_good_is_not_let_in(
-    lab: Lab, router: zenoh.Session, tmp_path: Path, what: str
+@pytest.mark.parametrize("defect", INVALID)
+def test_invalid_certificate_is_refused_by_the_router(
+    lab: Lab, router: zenoh.Session, tmp_path: Path, defect: str
 ) -> None:
-    mine = folder_of_one(tmp_path / "mine", lab.authority, "operator", bad_identities(lab.authority)[what])
+    client_folder = make_client_folder(
+        tmp_path / "client", lab.authority, "operator", invalid_credentials(lab.authority)[defect]
+    )
     with pytest.raises(OperationError, match=r"do not trust each other: hilrig doctor"):
-        ZenohBus(lab.config(mine), "tool")
+        ZenohBus(lab.config(client_folder), "tool")
 
 
 @pytest.mark.parametrize("link", ["tls", "tcp"])
-def test_without_a_certificate_nobody_is_let_in(lab: Lab, router: zenoh.Session, link: str) -> None:
+def test_connection_without_certificate_is_refused(lab: Lab, router: zenoh.Session, link: str) -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -80,23 +82,25 @@ def test_without_a_certificate_nobody_is_let_in(lab: Lab, router: zenoh.Session,
 
 
 @pytest.mark.parametrize("wrong", ["authority", "name"])
-def test_a_router_that_is_not_the_labs_is_not_believed(lab: Lab, tmp_path: Path, wrong: str) -> None:
+def test_router_without_certificate_of_the_lab_is_refused(lab: Lab, tmp_path: Path, wrong: str) -> None:
     authority = make_authority("stranger", NOW, 30) if wrong == "authority" else lab.authority
     hosts = HOSTS if wrong == "authority" else ["elsewhere"]
-    theirs = folder_of_one(
-        tmp_path / "theirs", lab.authority, "router", issue_peer(authority, "router", hosts, NOW, 30)
+    router_folder = make_client_folder(
+        tmp_path / "other", lab.authority, "router", issue_peer(authority, "router", hosts, NOW, 30)
     )
-    with lab.router(theirs), pytest.raises(OperationError, match="do not trust each other"):
+    with lab.router(router_folder), pytest.raises(OperationError, match="do not trust each other"):
         ZenohBus(lab.config(lab.folder), "tool")
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_a_mesh_lets_in_its_own_only(lab: Lab, tmp_path: Path, what: str) -> None:
-    mine = folder_of_one(tmp_path / "mine", lab.authority, "operator", bad_identities(lab.authority)[what])
+@pytest.mark.parametrize("defect", INVALID)
+def test_mesh_accepts_only_certificates_of_the_lab(lab: Lab, tmp_path: Path, defect: str) -> None:
+    client_folder = make_client_folder(
+        tmp_path / "client", lab.authority, "operator", invalid_credentials(lab.authority)[defect]
+    )
     with (
         ZenohBus(lab.config(lab.folder, "mesh"), "sim") as sim,
-        # A peer's session opens whoever it can reach; it tries again and again.
-        ZenohBus(lab.config(mine, "mesh"), "tool") as stranger,
+        # A session of a peer opens without any link and retries to connect.
+        ZenohBus(lab.config(client_folder, "mesh"), "tool") as stranger,
         ZenohBus(lab.config(lab.folder, "mesh"), "edge") as edge,
         ZenohBus(lab.config(lab.folder, "mesh"), "tool") as tool,
     ):
@@ -107,13 +111,13 @@ def test_a_mesh_lets_in_its_own_only(lab: Lab, tmp_path: Path, what: str) -> Non
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "operator.pem"])
-def test_a_file_that_is_missing_is_named(lab: Lab, missing: str) -> None:
+def test_missing_file_is_named(lab: Lab, missing: str) -> None:
     (lab.folder / missing).unlink()
     with pytest.raises(InputError, match=rf"bus\.tls\.folder: .*{missing} can't be read.*hilrig certs"):
         ZenohBus(lab.config(lab.folder), "tool")
 
 
-def test_a_host_without_a_key_for_the_service_is_told_which_it_needs(lab: Lab) -> None:
+def test_missing_key_of_the_service_is_named(lab: Lab) -> None:
     (lab.folder / "operator.key").unlink()
     with pytest.raises(InputError, match=r"does not contain operator\.key or viewer\.key"):
         ZenohBus(lab.config(lab.folder), "tool")
@@ -128,14 +132,14 @@ def secured_lab(tmp_path: Path) -> Iterator[RunningLab]:
         yield running
 
 
-def test_a_lab_runs_on_a_secured_bus_and_a_viewer_may_not_take_its_rig(secured_lab: RunningLab, tmp_path: Path) -> None:
+def test_viewer_cannot_release_a_lease_on_the_secured_bus(secured_lab: RunningLab, tmp_path: Path) -> None:
     with ModbusTcpClient("127.0.0.1", port=secured_lab.port) as client:
         assert client.connect()
         assert not client.write_registers(0, [500, 0, 0, 0]).isError()
         eventually(lambda: client.read_holding_registers(4, count=1).registers[0] > 100)
-        asked = hilrig("lease", "rig1", "-c", secured_lab.config, cwd=tmp_path)
-        assert asked.returncode == 0, asked.stderr
-        assert "127.0.0.1" in asked.stdout
+        shown = hilrig("lease", "rig1", "-c", secured_lab.config, cwd=tmp_path)
+        assert shown.returncode == 0, shown.stderr
+        assert "127.0.0.1" in shown.stdout
         viewers = tmp_path / "viewer"
         (viewers / "certs/bus").mkdir(parents=True)
         for name in ("ca.pem", "viewer.pem", "viewer.key"):
@@ -147,14 +151,14 @@ def test_a_lab_runs_on_a_secured_bus_and_a_viewer_may_not_take_its_rig(secured_l
     assert eventually(lambda: secured_lab.recordings)
 
 
-def test_a_lab_listens_on_loopback_only_unless_told_otherwise(tmp_path: Path) -> None:
+def test_lab_listens_on_loopback_by_default(tmp_path: Path) -> None:
     with RunningLab(write_lab(tmp_path)) as running:
         addresses = {host for pid in (running.process.pid, *running.service_pids()) for host, _ in listening(pid)}
         assert addresses == {"127.0.0.1"}
 
 
 def listening(pid: int) -> list[tuple[str, int]]:
-    """Addresses on which a process waits for TCP connections, or receives UDP."""
+    """Addresses on which a process accepts TCP connections or receives UDP packets."""
     inodes = set()
     for fd in Path(f"/proc/{pid}/fd").iterdir():
         try:

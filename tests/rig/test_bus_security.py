@@ -1,9 +1,9 @@
-"""The secured bus over real sockets: what each certificate may send, read, ask and answer, and nothing else.
+"""Access control of the secured bus over real sockets: permitted keys of each certificate for each operation.
 
-One process is attacked: the router, or a service of the mesh. It subscribes to everything, publishes everything and
-answers everything. Others come to it with each certificate of the lab in turn, and try all there is; they have no
-rules of their own to hold them back. The attacked process's rules for one direction are opened meanwhile, so that those
-for the other are seen to hold alone. The tables here say what is to get through; they are not made from the rules.
+The process under test is the router or a service of the mesh; it subscribes to, publishes and answers every key. A
+client connects with each certificate of the lab and tries every key; it has no access rules of its own. The rules of
+the process under test are replaced by open rules in one direction, so that the other direction is tested alone. The
+tables below list the permitted keys; they are independent of the rules in the product.
 """
 
 import json
@@ -19,7 +19,7 @@ import zenoh
 from hilrig_runtime.bus.zenoh_config import router_config, zenoh_config
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.security.x509 import load
-from support.bus_certificates import folder_of_one, make_bus_folder
+from support.bus_certificates import make_bus_folder, make_client_folder
 from support.labs import free_ports
 from support.waiting import eventually
 
@@ -57,28 +57,28 @@ MAY_SEND: dict[str, set[str]] = {
     "viewer": set(),
     "student": set(),
 }
-_HEALTHS = {key for key in SENT if key.startswith("health/")}
+_HEALTH = {key for key in SENT if key.startswith("health/")}
 _STATES = {"rig1/state", "rig2/state", "states/sim/1"}
 MAY_READ: dict[str, set[str]] = {
-    "sim": {"rig1/command", "rig2/command", "commands/edge/east", "commands/edge/west", *_HEALTHS},
-    "east": _STATES | _HEALTHS,
-    "west": _STATES | _HEALTHS,
-    "recorder": _EVENTS | _LOGS | _HEALTHS,
+    "sim": {"rig1/command", "rig2/command", "commands/edge/east", "commands/edge/west", *_HEALTH},
+    "east": _STATES | _HEALTH,
+    "west": _STATES | _HEALTH,
+    "recorder": _EVENTS | _LOGS | _HEALTH,
     "operator": set(SENT) - _LOGS,
     "viewer": set(SENT) - _LOGS,
     "student": set(),
 }
 _CONFIGS = {"rig1/config", "rig2/config"}
-_OF_EDGES = {f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("lease", "impairment")}
+_EDGE_QUERIES = {f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("lease", "impairment")}
 _SERVICE_INFOS = {"service_info/sim/1", "service_info/edge/1", "service_info/recorder/1"}
 _CONTROLS = {"control/sim/1", "control/edge/1", "control/recorder/1"}
-ASKED = sorted(_CONFIGS | _OF_EDGES | _SERVICE_INFOS | _CONTROLS)
-MAY_ASK: dict[str, set[str]] = {
+QUERIED = sorted(_CONFIGS | _EDGE_QUERIES | _SERVICE_INFOS | _CONTROLS)
+MAY_QUERY: dict[str, set[str]] = {
     "sim": _SERVICE_INFOS,
     "east": _CONFIGS | _SERVICE_INFOS,
     "west": _CONFIGS | _SERVICE_INFOS,
     "recorder": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
-    "operator": set(ASKED),
+    "operator": set(QUERIED),
     "viewer": _CONFIGS | _SERVICE_INFOS,
     "student": set(),
 }
@@ -91,15 +91,17 @@ MAY_ANSWER: dict[str, set[str]] = {
     "viewer": set(),
     "student": set(),
 }
-# A question to all goes out to everyone of a kind; what one answers is held by the other direction's rules.
-MAY_BE_ASKED = MAY_ANSWER | {
+# A query is sent to all services of a kind; the rules of the other direction restrict the replies.
+MAY_BE_QUERIED = MAY_ANSWER | {
     "sim": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
-    **dict.fromkeys(EDGES, _OF_EDGES | _SERVICE_INFOS | _CONTROLS),
+    **dict.fromkeys(EDGES, _EDGE_QUERIES | _SERVICE_INFOS | _CONTROLS),
     "recorder": _SERVICE_INFOS | _CONTROLS,
 }
 FLOWS = {"ingress", "egress"}
-LIVING = ["alive/sim/1", "alive/edge/1", "alive/recorder/1"]
-MAY_LIVE: dict[str, set[str]] = {name: {f"alive/{SERVICE[name]}/1"} if name in SERVICE else set() for name in MAY_SEND}
+TOKENS = ["alive/sim/1", "alive/edge/1", "alive/recorder/1"]
+MAY_DECLARE: dict[str, set[str]] = {
+    name: {f"alive/{SERVICE[name]}/1"} if name in SERVICE else set() for name in MAY_SEND
+}
 
 
 def key(name: str) -> str:
@@ -107,8 +109,8 @@ def key(name: str) -> str:
 
 
 @dataclass
-class Heard:
-    """What a session received: who sent it, on which key, how often."""
+class MessageCounter:
+    """Counts the messages received by a session, by sender and key."""
 
     counts: dict[tuple[str, str], int] = field(default_factory=dict)
 
@@ -119,18 +121,18 @@ class Heard:
         return {name for who, name in list(self.counts) if who == sender}
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        heard = sample.payload.to_bytes().decode(), str(sample.key_expr).removeprefix("hil/lab/")
-        self.counts[heard] = self.counts.get(heard, 0) + 1
+        message = sample.payload.to_bytes().decode(), str(sample.key_expr).removeprefix("hil/lab/")
+        self.counts[message] = self.counts.get(message, 0) + 1
 
 
 @dataclass
-class Meeting:
-    """The attacked process, somebody who came with a certificate, and an honest witness of the lab."""
+class Sessions:
+    """Sessions of a test: the process under test, a client with a certificate, and a reference service of the lab."""
 
-    attacked: zenoh.Session
-    guest: zenoh.Session
-    witness: zenoh.Session
-    witness_key: str
+    tested: zenoh.Session
+    client: zenoh.Session
+    reference: zenoh.Session
+    reference_key: str
     name: str
     flow: str
 
@@ -141,13 +143,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     authority = make_bus_folder(folder, NAMES)
     for name in NAMES[1:]:
         identity = load((folder / f"{name}.pem").read_bytes(), (folder / f"{name}.key").read_bytes())
-        # A student's certificate is signed by the lab, and its file has a name that is let in; what counts is within.
-        folder_of_one(folder.parent / name, authority, "viewer" if name == "student" else name, identity)
+        # The student's certificate is signed by the lab and its file has a permitted name; the common name is decisive.
+        make_client_folder(folder.parent / name, authority, "viewer" if name == "student" else name, identity)
     return folder
 
 
 def _opened(section: dict[str, Any], flows: set[str]) -> dict[str, Any]:
-    """The rules, with everything allowed to everyone in some directions."""
+    """Return the rules with everything permitted for every certificate in some directions."""
     messages = ["put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"]
     messages += ["liveliness_token", "declare_liveliness_subscriber", "liveliness_query"]
     rule = {
@@ -159,14 +161,14 @@ def _opened(section: dict[str, Any], flows: set[str]) -> dict[str, Any]:
     }
     return section | {
         "rules": [*section["rules"], rule],
-        "subjects": [*section["subjects"], {"id": "anyone"}],
-        "policies": [*section["policies"], {"rules": ["open"], "subjects": ["anyone"]}],
+        "subjects": [*section["subjects"], {"id": "any"}],
+        "policies": [*section["policies"], {"rules": ["open"], "subjects": ["any"]}],
     }
 
 
 @contextmanager
-def meeting(folder: Path, topology: str, name: str, flow: str) -> Iterator[Meeting]:
-    """Everyone joined; of the attacked process's rules those for `flow` hold, the others are opened; "": all are."""
+def connected_sessions(folder: Path, topology: str, name: str, flow: str) -> Iterator[Sessions]:
+    """Connect all sessions; the rules of the process under test apply to `flow` only ("": to no direction)."""
     port = free_ports(3)
 
     def bus(of: Path) -> BusConfig:
@@ -179,124 +181,128 @@ def meeting(folder: Path, topology: str, name: str, flow: str) -> Iterator[Meeti
             }
         )
 
-    def join(who: str) -> zenoh.Session:
+    def connect(who: str) -> zenoh.Session:
         config = zenoh_config(bus(folder.parent / who), SERVICE.get(who, "tool"))
         config.insert_json5("access_control", '{"enabled": false}')
         return zenoh.open(config)
 
-    witness = "east" if name == "recorder" else "recorder"
+    reference = "east" if name == "recorder" else "recorder"
     if topology == "router":
         config = router_config(bus(folder), "lab", f"tls/127.0.0.1:{port}")
     else:
         config = zenoh_config(bus(folder), "edge" if name == "sim" else "sim")
     rules = json.loads(config.get_json("access_control"))
     config.insert_json5("access_control", json.dumps(_opened(rules, FLOWS - {flow})))
-    with zenoh.open(config) as attacked, join(name) as guest, join(witness) as second:
-        yield Meeting(attacked, guest, second, f"{SERVICE[witness]}/event", name, flow)
+    with zenoh.open(config) as tested, connect(name) as client, connect(reference) as second:
+        yield Sessions(tested, client, second, f"{SERVICE[reference]}/event", name, flow)
 
 
 @pytest.mark.parametrize("flow", sorted(FLOWS))
 @pytest.mark.parametrize(("topology", "name"), CASES)
-def test_a_certificate_gets_through_with_what_is_its_own_and_nothing_else(
-    folder: Path, topology: str, name: str, flow: str
-) -> None:
-    with meeting(folder, topology, name, flow) as met:
+def test_certificate_permits_only_its_own_keys(folder: Path, topology: str, name: str, flow: str) -> None:
+    with connected_sessions(folder, topology, name, flow) as sessions:
         if flow == "ingress":
-            assert sent_to_the_attacked(met) == MAY_SEND[name]
-            assert shown_alive(met) == MAY_LIVE[name]
-        assert read_from_the_attacked(met) == MAY_READ[name]
-        assert answered_by_the_attacked(met) == MAY_ASK[name]
-        assert answered_to_the_attacked(met) == (MAY_ANSWER if flow == "ingress" else MAY_BE_ASKED)[name]
+            assert keys_sent(sessions) == MAY_SEND[name]
+            assert tokens_seen(sessions) == MAY_DECLARE[name]
+        assert keys_read(sessions) == MAY_READ[name]
+        assert keys_queried(sessions) == MAY_QUERY[name]
+        assert keys_answered(sessions) == (MAY_ANSWER if flow == "ingress" else MAY_BE_QUERIED)[name]
 
 
 @pytest.mark.parametrize("topology", ["router", "mesh"])
-def test_with_open_rules_all_that_is_tried_gets_through(folder: Path, topology: str) -> None:
-    with meeting(folder, topology, "student", "") as met:
+def test_open_rules_permit_every_key(folder: Path, topology: str) -> None:
+    with connected_sessions(folder, topology, "student", "") as sessions:
         for tried, everything in (
-            (sent_to_the_attacked, SENT),
-            (shown_alive, LIVING),
-            (read_from_the_attacked, SENT),
-            (answered_by_the_attacked, ASKED),
-            (answered_to_the_attacked, ASKED),
+            (keys_sent, SENT),
+            (tokens_seen, TOKENS),
+            (keys_read, SENT),
+            (keys_queried, QUERIED),
+            (keys_answered, QUERIED),
         ):
-            eventually(lambda tried=tried, everything=everything: tried(met) >= set(everything) - {"alive/recorder/1"})
+            eventually(
+                lambda tried=tried, everything=everything: tried(sessions) >= set(everything) - {"alive/recorder/1"}
+            )
 
 
-def sent_to_the_attacked(met: Meeting) -> set[str]:
-    heard = Heard()
-    with heard.listen(met.attacked, key("**")):
+def keys_sent(sessions: Sessions) -> set[str]:
+    counter = MessageCounter()
+    with counter.listen(sessions.tested, key("**")):
 
         def try_all() -> bool:
             for name in SENT:
-                met.guest.put(key(name), met.name)
-            met.witness.put(key(met.witness_key), "witness")
-            witnessed = heard.counts.get(("witness", met.witness_key), 0)
-            return witnessed >= 5 and MAY_SEND[met.name] <= heard.of(met.name)
+                sessions.client.put(key(name), sessions.name)
+            sessions.reference.put(key(sessions.reference_key), "reference")
+            reference_count = counter.counts.get(("reference", sessions.reference_key), 0)
+            return reference_count >= 5 and MAY_SEND[sessions.name] <= counter.of(sessions.name)
 
         eventually(try_all, every_s=0.02)
-    return heard.of(met.name)
+    return counter.of(sessions.name)
 
 
-def read_from_the_attacked(met: Meeting) -> set[str]:
-    guest_heard, witness_heard = Heard(), Heard()
-    # As a whole, and one by one: the rules may let in the one and not the other.
-    listening = [guest_heard.listen(met.guest, key_expr) for key_expr in ("hil/**", *map(key, SENT))]
-    watching = witness_heard.listen(met.witness, key("*/state" if met.witness_key == "edge/event" else "*/event"))
+def keys_read(sessions: Sessions) -> set[str]:
+    client_counter, reference_counter = MessageCounter(), MessageCounter()
+    # Subscribe to a wildcard and to each key: the rules may permit one and not the other.
+    subscribers = [client_counter.listen(sessions.client, key_expr) for key_expr in ("hil/**", *map(key, SENT))]
+    reference_subscriber = reference_counter.listen(
+        sessions.reference, key("*/state" if sessions.reference_key == "edge/event" else "*/event")
+    )
 
-    def say_all() -> bool:
+    def publish_all() -> bool:
         for name in SENT:
-            met.attacked.put(key(name), "attacked")
-        return sum(witness_heard.counts.values()) >= 15 and MAY_READ[met.name] <= guest_heard.of("attacked")
+            sessions.tested.put(key(name), "tested")
+        return sum(reference_counter.counts.values()) >= 15 and MAY_READ[sessions.name] <= client_counter.of("tested")
 
-    eventually(say_all, every_s=0.02)
-    for declared in (*listening, watching):
+    eventually(publish_all, every_s=0.02)
+    for declared in (*subscribers, reference_subscriber):
         declared.undeclare()
-    return guest_heard.of("attacked")
+    return client_counter.of("tested")
 
 
-def answered_by_the_attacked(met: Meeting) -> set[str]:
-    return _answered(met.attacked, met.guest, MAY_ASK[met.name])
+def keys_queried(sessions: Sessions) -> set[str]:
+    return _answered(sessions.tested, sessions.client, MAY_QUERY[sessions.name])
 
 
-def answered_to_the_attacked(met: Meeting) -> set[str]:
-    return _answered(met.guest, met.attacked, MAY_ANSWER[met.name])
+def keys_answered(sessions: Sessions) -> set[str]:
+    return _answered(sessions.client, sessions.tested, MAY_ANSWER[sessions.name])
 
 
-def _answered(server: zenoh.Session, asker: zenoh.Session, expected: set[str]) -> set[str]:
+def _answered(server: zenoh.Session, querier: zenoh.Session, expected: set[str]) -> set[str]:
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply(query.key_expr, b"answer")
 
-    served = [server.declare_queryable(key(name), answer) for name in ASKED]
+    served = [server.declare_queryable(key(name), answer) for name in QUERIED]
     answered: set[str] = set()
     rounds = 0
 
-    def ask_all() -> bool:
+    def query_all() -> bool:
         nonlocal rounds
         rounds += 1
-        for name in ASKED:
-            replies = asker.get(key(name), timeout=0.3, target=zenoh.QueryTarget.ALL)
+        for name in QUERIED:
+            replies = querier.get(key(name), timeout=0.3, target=zenoh.QueryTarget.ALL)
             if any(reply.ok is not None for reply in replies):
                 answered.add(name)
         return rounds >= 2 and expected <= answered
 
-    eventually(ask_all)
+    eventually(query_all)
     for declared in served:
         declared.undeclare()
     return answered
 
 
-def shown_alive(met: Meeting) -> set[str]:
-    tokens = [met.guest.liveliness().declare_token(key(name)) for name in LIVING]
-    witnessed = met.witness.liveliness().declare_token(key(f"alive/{met.witness_key.partition('/')[0]}/1"))
+def tokens_seen(sessions: Sessions) -> set[str]:
+    tokens = [sessions.client.liveliness().declare_token(key(name)) for name in TOKENS]
+    reference_token = sessions.reference.liveliness().declare_token(
+        key(f"alive/{sessions.reference_key.partition('/')[0]}/1")
+    )
     shown: set[str] = set()
 
-    def look() -> bool:
-        replies = met.attacked.liveliness().get(key("alive/**"), timeout=0.3)
+    def query_tokens() -> bool:
+        replies = sessions.tested.liveliness().get(key("alive/**"), timeout=0.3)
         shown.update(str(reply.ok.key_expr).removeprefix("hil/lab/") for reply in replies if reply.ok is not None)
-        return MAY_LIVE[met.name] | {f"alive/{met.witness_key.partition('/')[0]}/1"} <= shown
+        return MAY_DECLARE[sessions.name] | {f"alive/{sessions.reference_key.partition('/')[0]}/1"} <= shown
 
-    eventually(look)
-    for token in (*tokens, witnessed):
+    eventually(query_tokens)
+    for token in (*tokens, reference_token):
         token.undeclare()
-    return shown - {f"alive/{met.witness_key.partition('/')[0]}/1"}
+    return shown - {f"alive/{sessions.reference_key.partition('/')[0]}/1"}

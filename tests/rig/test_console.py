@@ -28,7 +28,7 @@ from support.browser import CHROMIUM, Browser
 from support.bus_certificates import make_bus_folder
 from support.labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
 from support.recordings import Script, record
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -365,7 +365,7 @@ def test_password_is_required_off_loopback(tmp_path: Path) -> None:
             eventually(lambda: "lab" in watcher.newest)
             assert answers(ListenAddress("", running.port), None)
             running.process.send_signal(signal.SIGINT)
-            assert running.process.wait(PATIENT_S) == 0
+            assert running.process.wait(LONG_TIMEOUT_S) == 0
             eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
         assert "the password is sent unencrypted" in running.process.stderr.read()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from support.labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
-from support.waiting import PATIENT_S
+from support.waiting import LONG_TIMEOUT_S
 
 pytestmark = pytest.mark.rig
 
@@ -96,7 +96,7 @@ def test_missing_router_is_an_error_and_missing_services_are_not(routed: Path) -
         assert with_it.returncode == 0, with_it.stdout
         assert "no service of lab 'lab' is running" in results(with_it)["services"][0]["text"]
         router.terminate()
-        assert router.wait(PATIENT_S) == 0
+        assert router.wait(LONG_TIMEOUT_S) == 0
     assert hilrig("doctor", "--service", "router", "--config", routed).returncode == 1
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from support.labs import HILRIG, RunningLab, hilrig, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -147,6 +147,6 @@ def _run_until_stopped(arguments: list[str], folder: Path) -> None:
             eventually(lambda: process.poll() is not None or (shown.exists() and shown.stat().st_size))
             assert process.poll() is None, process.stdout and process.stdout.read()
             process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENT_S) == 0
+            assert process.wait(LONG_TIMEOUT_S) == 0
         finally:
             process.kill()

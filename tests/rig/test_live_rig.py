@@ -10,7 +10,7 @@ import pytest
 
 from support.labs import HILRIG, RunningLab, hilrig, write_lab
 from support.rrd_files import RrdFile
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -39,7 +39,7 @@ def test_live_view_survives_a_simulation_restart(tmp_path: Path) -> None:
         size = save.stat().st_size
         eventually(lambda: save.stat().st_size > size + 100_000)
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENT_S) == 0, log.read_text()
+        assert process.wait(LONG_TIMEOUT_S) == 0, log.read_text()
     shown = RrdFile(save)
     assert shown.rows("/position") == shown.rows("/scene/joints/theta1") > 50
 

@@ -16,7 +16,7 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from support.labs import HILRIG, RunningLab, free_ports, hilrig, steady_controller, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -96,7 +96,7 @@ def test_prometheus_metrics_are_served(lab: RunningLab) -> None:
             assert 'hilrig_rig_served{lab="lab",rig="rig4"} 1' in text()
         finally:
             process.terminate()
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(LONG_TIMEOUT_S) == 0
     taken = hilrig("metrics", "--config", lab.config, "--listen", f"127.0.0.1:{lab.port}")
     assert taken.returncode == 3
     assert "choose another address with --listen" in taken.stderr
@@ -161,7 +161,7 @@ def test_unknown_rig_is_rejected_with_the_known_ones(lab: RunningLab, words: tup
 
 
 def test_duplicate_rig_is_rejected() -> None:
-    done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=PATIENT_S)
+    done = hilrig("sim", "--rigs", "rig1,rig1", timeout_s=LONG_TIMEOUT_S)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.endswith("hilrig: error: --rigs: duplicate rig 'rig1'\n")
 

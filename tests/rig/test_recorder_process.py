@@ -9,7 +9,7 @@ import pytest
 
 from support.labs import HILRIG, free_ports, hilrig
 from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, router, sending, wait_ready
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 
 @pytest.mark.rig
@@ -22,7 +22,7 @@ def test_signaled_recorder_finishes_its_files(tmp_path: Path, number: signal.Sig
         eventually(lambda: senders.count("rig1") > 150)
         eventually(lambda: files_of(lab, "rig1", "*.part"))
         recorder.process.send_signal(number)
-        assert recorder.process.wait(PATIENT_S) == 0
+        assert recorder.process.wait(LONG_TIMEOUT_S) == 0
         [path] = files_of(lab, "rig1")
         assert not files_of(lab, "rig1", "*.part")
         found = recorded([path])

@@ -20,7 +20,7 @@ from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, RigConfig
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
 from support.log_streams import FakeSource
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 SESSION = "20260101T000000Z-rig1-abcd"
 
@@ -205,7 +205,7 @@ def test_blocked_disk_fills_queue_and_drops_are_counted(tmp_path: Path, monkeypa
 
     def close_slowly(writer: RecordingWriter) -> None:
         if slow.is_set():
-            resume.wait(PATIENT_S)
+            resume.wait(LONG_TIMEOUT_S)
         close_chunk(writer)
 
     monkeypatch.setattr(RecordingWriter, "close_chunk", close_slowly)

@@ -8,21 +8,21 @@ import pytest
 from hilrig_replay.analysis.index import read_verdict
 from hilrig_schemas import JointState
 from support.labs import hilrig
-from support.recordings import Made, write
+from support.recordings import TimedMessage, write
 from support.virtual_rig import VirtualRig
 
 pytestmark = pytest.mark.rig
 
 
 @pytest.fixture(scope="module")
-def made() -> list[Made]:
+def made() -> list[TimedMessage]:
     with VirtualRig() as rig:
         rig.command((1.0, -0.5, -5.2, 0.01))
         rig.tick(120)
         return rig.recorded()
 
 
-def test_verify_reports_the_first_diverging_step(made: list[Made], tmp_path: Path) -> None:
+def test_verify_reports_the_first_diverging_step(made: list[TimedMessage], tmp_path: Path) -> None:
     valid, modified = tmp_path / "valid.mcap", tmp_path / "modified.mcap"
     write(valid, made)
     done = hilrig("verify", valid, "--json", "--tolerance", "0")

@@ -14,7 +14,7 @@ from hilrig_schemas import Event, JointState, RigBatch, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, CONFIG, EVENT, STATE
 from hilrig_sim.arm.model import RigParameters
 from support.labs import HILRIG, hilrig, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -103,7 +103,7 @@ def test_command_moves_the_arm_and_times_out(sim: SimProcess) -> None:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_exits_with_0_on_signal(sim: SimProcess, how: signal.Signals) -> None:
     os.kill(sim.process.pid, how)
-    assert sim.process.wait(PATIENT_S) == 0
+    assert sim.process.wait(LONG_TIMEOUT_S) == 0
     assert "Traceback" not in sim.log.read_text()
 
 

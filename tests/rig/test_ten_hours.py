@@ -14,7 +14,7 @@ import pytest
 
 from hilrig_schemas import Event, JointState, ModbusTraffic, TorqueCommand
 from support.labs import HILRIG
-from support.recordings import MS, Made, Script, make, write
+from support.recordings import MS, Script, TimedMessage, make, write
 
 pytestmark = [
     pytest.mark.alone,
@@ -35,7 +35,7 @@ print(json.dumps({"code": code.returncode, "peak_mb": peak, "stdout": code.stdou
 """
 
 
-def ten_hours() -> Iterator[Made]:
+def ten_hours() -> Iterator[TimedMessage]:
     """Repeat a section of a run; the messages are shifted in time and number for each repetition."""
     script = Script(seconds=SECTION_S, poll_ms=20.0, delay_ms=3.0)
     made = [one for one in make(script) if not isinstance(one.message, Event)]
@@ -49,7 +49,7 @@ def ten_hours() -> Iterator[Made]:
             yield one
 
 
-def _shift(one: Made, by_ns: int, steps: int, commands: int) -> None:
+def _shift(one: TimedMessage, by_ns: int, steps: int, commands: int) -> None:
     one.publish_wall_ns += by_ns
     message = one.message
     if isinstance(message, JointState):

@@ -20,7 +20,7 @@ from hilrig_replay.rerun_view.viewer import environment, executable, free_port, 
 from support.browser import share_of
 from support.labs import HILRIG
 from support.recordings import Script, record
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -103,7 +103,7 @@ def test_replay_web_stops_its_viewer_on_sigterm(rrd: Path) -> None:
         line = process.stderr.readline()
         assert line.startswith("open http://127.0.0.1:"), line
         process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENT_S) == 0
+        assert process.wait(LONG_TIMEOUT_S) == 0
         eventually(lambda: not session_of(process.pid))
     finally:
         if process.poll() is None:

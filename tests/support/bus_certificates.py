@@ -1,4 +1,4 @@
-"""Certificates for a secured bus in a test: good ones, and those that must not be let in."""
+"""Certificates for tests of a secured bus: valid ones, and invalid ones that must be refused."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -10,13 +10,13 @@ HOSTS = ["127.0.0.1", "localhost"]
 
 
 def write(folder: Path, name: str, identity: Credential) -> None:
-    """`<name>.pem` and `<name>.key`."""
+    """Write `<name>.pem` and `<name>.key`."""
     (folder / f"{name}.pem").write_bytes(identity.certificate_pem)
     (folder / f"{name}.key").write_bytes(identity.key_pem)
 
 
 def make_bus_folder(folder: Path, names: list[str], hosts: list[str] = HOSTS) -> Credential:
-    """A folder for `[bus.tls]` with a certificate for each name; gives the authority."""
+    """Create a folder for `[bus.tls]` with a certificate for each name; returns the authority."""
     folder.mkdir(parents=True)
     authority = make_authority("bus", NOW, 30)
     write(folder, "ca", authority)
@@ -25,16 +25,16 @@ def make_bus_folder(folder: Path, names: list[str], hosts: list[str] = HOSTS) ->
     return authority
 
 
-def folder_of_one(folder: Path, authority: Credential, name: str, identity: Credential) -> Path:
-    """A folder of somebody who trusts `authority` and has one certificate, under the name `name`."""
+def make_client_folder(folder: Path, authority: Credential, name: str, identity: Credential) -> Path:
+    """Create a folder with the certificate of `authority`, and one credential stored under the name `name`."""
     folder.mkdir(parents=True)
     (folder / "ca.pem").write_bytes(authority.certificate_pem)
     write(folder, name, identity)
     return folder
 
 
-def bad_identities(authority: Credential) -> dict[str, Credential]:
-    """Certificates called `operator` that nobody may be let in with, by what is wrong with them."""
+def invalid_credentials(authority: Credential) -> dict[str, Credential]:
+    """Invalid credentials with the name `operator`, by defect."""
     stranger = make_authority("stranger", NOW, 30)
     return {
         "another authority": issue_peer(stranger, "operator", HOSTS, NOW, 30),

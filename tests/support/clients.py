@@ -1,4 +1,4 @@
-"""Controllers that nobody here wrote: Debian's mbpoll, and a C program on libmodbus."""
+"""Third-party Modbus clients: mbpoll, and a C program on libmodbus."""
 
 import re
 import shutil
@@ -13,13 +13,13 @@ _KINDS = {"holding": "4", "coil": "0", "input": "3"}
 
 
 def require_mbpoll() -> None:
-    """Skip a test, with the reason, where mbpoll is not installed."""
+    """Skip the test if mbpoll is not installed."""
     if shutil.which("mbpoll") is None:
-        pytest.skip("needs mbpoll (Debian's package of that name)")
+        pytest.skip("needs mbpoll (Debian package mbpoll)")
 
 
 def mbpoll_read(port: int, register: int, count: int, kind: str = "holding") -> list[int]:
-    """Read with mbpoll, numbers as a PLC programmer counts them (from 1), values signed."""
+    """Read registers or coils with mbpoll: numbers from 1, as usual for PLCs; signed values."""
     command = ["mbpoll", "-m", "tcp", "-p", str(port), "-a", "1", "-t", _KINDS[kind], "-1", "-q"]
     command += ["-r", str(register), "-c", str(count), "127.0.0.1"]
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=10).stdout
@@ -29,14 +29,14 @@ def mbpoll_read(port: int, register: int, count: int, kind: str = "holding") -> 
 
 
 def mbpoll_write(port: int, register: int, value: int, kind: str = "holding") -> None:
-    """Write one register or coil with mbpoll, numbers from 1."""
+    """Write one register or coil with mbpoll; numbers start at 1."""
     command = ["mbpoll", "-m", "tcp", "-p", str(port), "-a", "1", "-t", _KINDS[kind], "-1", "-q"]
     command += ["-r", str(register), "127.0.0.1", "--", str(value)]
     subprocess.run(command, check=True, capture_output=True, text=True, timeout=10)
 
 
 def build_c_client() -> Path:
-    """The benchmark's controller in C on libmodbus, compiled."""
+    """Compile the benchmark's C controller, which uses libmodbus; returns its path."""
     sys.path.insert(0, str(ROOT / "bench"))
     from harness import MissingDependencyError, build_c
 

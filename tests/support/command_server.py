@@ -1,7 +1,7 @@
-"""Starts `hilrig` commands without Python's start: forks itself for each, with what most commands import.
+"""Runs `hilrig` commands in forked processes that have already imported the modules of most commands.
 
-Most of a short command's time is imports. Jobs come as lines of JSON on standard input, `{words, cwd, environ, out,
-err}`; of each the process id is told, then the exit code. It ends with its standard input.
+Imports take most of the run time of a short command. Each line of standard input is a job in JSON, `{arguments, cwd,
+environ, out, err}`; the process id and then the exit code are printed. The server ends with its standard input.
 """
 
 import gc
@@ -18,15 +18,15 @@ IMPORTED = (
     "hilrig_replay.analysis.verify",
     "hilrig_runtime.process.lifecycle",
 )
-"""What starts no threads, which a fork would leave behind; so not rerun."""
+"""Modules that start no threads: a fork does not copy threads. rerun starts threads."""
 
 
-def become(job: dict[str, Any]) -> None:
-    """Make the forked process what a shell would have started."""
+def apply_job(job: dict[str, Any]) -> None:
+    """Apply the folder, environment, arguments and files of a job to the forked process."""
     os.chdir(job["cwd"])
     os.environ.clear()
     os.environ.update(job["environ"])
-    sys.argv = ["hilrig", *job["words"]]
+    sys.argv = ["hilrig", *job["arguments"]]
     for number, path in enumerate((os.devnull, job["out"], job["err"])):
         opened = os.open(path, os.O_WRONLY if number else os.O_RDONLY)
         os.dup2(opened, number)
@@ -34,11 +34,11 @@ def become(job: dict[str, Any]) -> None:
 
 
 def serve() -> bool:
-    """Fork for each job until there are no more; true in a process that is to do one."""
+    """Fork for each job; returns True in a forked process, False in the server after the last job."""
     for line in sys.stdin:
         pid = os.fork()
         if pid == 0:
-            become(json.loads(line))
+            apply_job(json.loads(line))
             return True
         print(pid, flush=True)
         print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
@@ -48,7 +48,7 @@ def serve() -> bool:
 if __name__ == "__main__":
     for module in IMPORTED:
         import_module(module)
-    # What is there is shared with the forks, until somebody writes to it.
+    # Frozen objects are not collected, so their memory pages stay shared with the forked processes.
     gc.freeze()
     if serve():
         from hilrig_cli.__main__ import main

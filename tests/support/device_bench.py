@@ -77,10 +77,10 @@ class Bench:
         client.record_request(self.clock.monotonic_ns())
         return list(struct.unpack(f">{count}H", self.device.read_registers(client, table, address, count)))
 
-    def write(self, client: Client, address: int, *words: int) -> None:
+    def write(self, client: Client, address: int, *values: int) -> None:
         now_ns = self.clock.monotonic_ns()
         client.record_request(now_ns)
-        self.device.write_registers(client, address, struct.pack(f">{len(words)}H", *words), now_ns)
+        self.device.write_registers(client, address, struct.pack(f">{len(values)}H", *values), now_ns)
 
     def wait(self, ms: float) -> None:
         self.clock.advance(round(ms * MS))

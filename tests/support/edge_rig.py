@@ -196,10 +196,10 @@ class RawClient:
         assert reply[:2] == bytes((function, 2 * count)), reply.hex()
         return list(struct.unpack(f">{count}H", reply[2:]))
 
-    def write(self, address: int, *words: int) -> bytes:
+    def write(self, address: int, *values: int) -> bytes:
         """Write registers with function 16; return the PDU of the response."""
-        data = b"".join((word & 0xFFFF).to_bytes(2, "big") for word in words)
-        return self.ask(struct.pack(">BHHB", 16, address, len(words), 2 * len(words)) + data)
+        data = b"".join((value & 0xFFFF).to_bytes(2, "big") for value in values)
+        return self.ask(struct.pack(">BHHB", 16, address, len(values), 2 * len(values)) + data)
 
     def closed(self) -> bool:
         """Wait until the peer sends data or closes the connection; return whether it closed it."""

@@ -1,4 +1,4 @@
-"""A whole lab for a test: `hilrig up` as a user starts it, on ports that are free, in a folder of its own."""
+"""Complete labs for tests: `hilrig up` on free ports in a temporary folder, and `hilrig` commands."""
 
 import functools
 import json
@@ -21,7 +21,7 @@ HILRIG = [sys.executable, "-m", "hilrig_cli"]
 
 
 def free_ports(count: int) -> int:
-    """First of `count` neighbouring ports that are free on loopback."""
+    """First of `count` consecutive ports that are free on loopback."""
     while True:
         with closing(socket.socket()) as probe:
             probe.bind(("127.0.0.1", 0))
@@ -38,11 +38,11 @@ def free_ports(count: int) -> int:
 def hilrig(
     *arguments: str | Path, cwd: Path | None = None, timeout_s: float = 120.0
 ) -> subprocess.CompletedProcess[str]:
-    """Run a `hilrig` command to its end, in a process of its own that was spared Python's start and imports.
+    """Run a `hilrig` command in a process that is forked from a server with the modules already imported.
 
-    That commands start from nothing too is shown by tests/rig/test_documentation.py.
+    tests/rig/test_documentation.py tests commands in new Python processes.
     """
-    words = list(map(str, arguments))
+    command = list(map(str, arguments))
     with TemporaryDirectory() as folder:
         out, err = (Path(folder) / name for name in ("out", "err"))
         for path in (out, err):
@@ -50,7 +50,7 @@ def hilrig(
         server = _command_server()
         assert server.stdin is not None
         assert server.stdout is not None
-        job = {"words": words, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
+        job = {"arguments": command, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
         server.stdin.write(json.dumps({**job, "out": str(out), "err": str(err)}) + "\n")
         server.stdin.flush()
         pid = int(server.stdout.readline())
@@ -60,21 +60,21 @@ def hilrig(
         late = not killer.is_alive()
         killer.cancel()
         if late:
-            raise subprocess.TimeoutExpired(words, timeout_s, out.read_text(), err.read_text())
-        return subprocess.CompletedProcess(words, code, out.read_text(), err.read_text())
+            raise subprocess.TimeoutExpired(command, timeout_s, out.read_text(), err.read_text())
+        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
 
 
 @functools.cache
 def _command_server() -> "subprocess.Popen[str]":
-    """One for all commands of this process; it ends with us, for then its standard input does."""
+    """Server for all commands of this process; it ends when this process ends and closes its standard input."""
     command = [sys.executable, str(Path(__file__).with_name("command_server.py"))]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:
-    """Write a `lab.toml` with free ports and recordings in `folder`; `extra` are more `[table.key]` lines of TOML.
+    """Write a `lab.toml` with free ports, and recordings in `folder`; returns its path.
 
-    Lines of `extra` of the form `edge.watchdog_ms = 300` go into their tables.
+    Each line of `extra` has the form `edge.watchdog_ms = 300` and is added to its table.
     """
     tables: dict[str, list[str]] = {
         "edge": [f"first_port = {free_ports(rigs)}"],
@@ -92,7 +92,7 @@ def write_lab(folder: Path, *, rigs: int = 1, extra: str = "") -> Path:
 
 
 class RunningLab:
-    """`hilrig up` on a lab's file; a context manager that leaves no process behind."""
+    """`hilrig up` with a lab file; a context manager that ends all processes on exit."""
 
     def __init__(self, config: Path, *options: str) -> None:
         from hilrig_runtime.config.lab import load_lab
@@ -113,18 +113,18 @@ class RunningLab:
         return sorted(self.lab.recorder.folder.rglob("*.mcap"), key=lambda path: path.stat().st_mtime)
 
     def output(self) -> str:
-        """What `up` and its services said so far."""
+        """Output of `up` and its services so far."""
         return self.log.read_text()
 
     def service_pid(self, name: str) -> int:
         """Process id of a service: the child of `up` that runs that command.
 
         Raises:
-            LookupError: none runs now.
+            LookupError: no such service is running.
         """
         for pid in _children(self.process.pid):
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-            if name.encode() in words:
+            arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            if name.encode() in arguments:
                 return pid
         raise LookupError(name)
 
@@ -133,14 +133,14 @@ class RunningLab:
         return _children(self.process.pid)
 
     def stop(self, number: signal.Signals = signal.SIGTERM, *, timeout_s: float = 30.0) -> int:
-        """Send a signal to `up` and wait for its end; gives the exit code."""
+        """Send a signal to `up` and wait until it exits; returns the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.process.wait(timeout_s)
 
     def __enter__(self) -> Self:
         with self.log.open("w") as log:
-            # It ends with the tests, also where these are killed.
+            # The lab ends with the test process, also if that is killed.
             command = [*HILRIG, "up", "--stop-with-parent", "--config", str(self.config), *self.options]
             self.process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=self.config.parent, start_new_session=True
@@ -172,7 +172,7 @@ class RunningLab:
 
 @contextmanager
 def steady_controller(port: int) -> Iterator[None]:
-    """A controller that turns joint 1, fifty times a second, with a connection of its own."""
+    """Run a controller process that commands joint 1 fifty times per second."""
     program = Path(__file__).with_name("steady_controller.py")
     process = subprocess.Popen(
         [sys.executable, str(program), "127.0.0.1", str(port)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
@@ -191,7 +191,7 @@ def _children(parent: int) -> list[int]:
                 stat = (entry / "stat").read_text()
             except OSError:
                 continue
-            # The name in brackets may hold spaces; state and parent follow it.
+            # The name in parentheses may contain spaces; state and parent follow it.
             state, ppid = stat.rpartition(")")[2].split()[:2]
             if int(ppid) == parent and state != "Z":
                 found.append(int(entry.name))

@@ -63,7 +63,9 @@ class FakeSource:
         event.session_data.controller = controller
         return self.put(EVENT, rig, event, publish_ns)
 
-    def end(self, rig: str, session: str, publish_ns: int, reason: str = "the controller left") -> Sent:
+    def end(
+        self, rig: str, session: str, publish_ns: int, reason: str = "the controller closed the connection"
+    ) -> Sent:
         """Add the event that ends a session."""
         event = Event(rig=rig, session=session, kind=Event.SESSION_END, wall_ns=publish_ns, source=self.name)
         event.session_data.reason = reason

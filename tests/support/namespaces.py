@@ -1,8 +1,8 @@
-"""Several hosts on one machine: network namespaces around a gateway, names resolving as on a compose network.
+"""Emulated hosts on one machine: network namespaces around a gateway, with name resolution as on a compose network.
 
-Each host has a cable of its own to the gateway, which forwards between them. No bridge is needed: containers and small
-kernels often have none. Needs root and iproute2. Everything is taken down when the context is left, and every process
-that was started in it is ended by its id.
+A veth pair connects each host to the gateway, which forwards packets. No bridge is needed: containers and small
+kernels often do not support bridges. Needs root and iproute2. On exit of the context all namespaces are removed, and
+all processes that were started in it are ended by their ids.
 """
 
 import os
@@ -19,25 +19,25 @@ import pytest
 
 
 def require_namespaces() -> None:
-    """Skip a test, with the reason, where namespaces can't be had."""
+    """Skip the test if network namespaces are unavailable."""
     if reason := _missing():
         pytest.skip(reason)
 
 
 @cache
 def _missing() -> str | None:
-    """What is missing for namespaces; tried once with all that a network needs."""
+    """Reason why network namespaces are unavailable, found by creating a network once; None if they are available."""
     if os.name != "posix" or os.geteuid() != 0:
-        return "needs root, for network namespaces"
+        return "needs root to create network namespaces"
     if shutil.which("ip") is None:
-        return "needs `ip` (Debian's package iproute2)"
+        return "needs `ip` (Debian package iproute2)"
     try:
         with Network(["near", "far"]) as network:
             network.run("near", ["getent", "hosts", "far"], capture_output=True, text=True)
     except subprocess.CalledProcessError as error:
-        said = " ".join((error.stderr or "").split()) or f"exit code {error.returncode}"
+        output = " ".join((error.stderr or "").split()) or f"exit code {error.returncode}"
         need = "network namespaces and veth pairs (CAP_SYS_ADMIN, CAP_NET_ADMIN)"
-        return f"needs {need}; `{' '.join(error.cmd)}` failed: {said}"
+        return f"needs {need}; `{' '.join(error.cmd)}` failed: {output}"
     return None
 
 
@@ -47,7 +47,7 @@ _GATEWAY = "10.77.0.1"
 
 
 class Network:
-    """Hosts by name, each in a namespace of its own, around one gateway; use it as a context manager."""
+    """Context manager of hosts by name, each in its own namespace, around one gateway."""
 
     def __init__(self, hosts: list[str]) -> None:
         self._prefix = f"hr{os.getpid()}n{next(_NUMBERS)}"
@@ -59,7 +59,7 @@ class Network:
         return self._addresses[host]
 
     def popen(self, host: str, command: list[str], **options: Any) -> subprocess.Popen[Any]:
-        """Start a process on a host; it is ended with the network, if it has not ended before."""
+        """Start a process on a host; it is ended on exit of the context if it is still running."""
         process = subprocess.Popen(["ip", "netns", "exec", self._namespace(host), *command], **options)
         self._closing.callback(_end, process)
         return process
@@ -67,16 +67,16 @@ class Network:
     def run(
         self, host: str, command: list[str], *, check: bool = True, **options: Any
     ) -> subprocess.CompletedProcess[Any]:
-        """Run a command on a host to its end."""
+        """Run a command on a host and wait until it exits."""
         return subprocess.run(["ip", "netns", "exec", self._namespace(host), *command], check=check, **options)
 
     def call(self, host: str, command: list[str]) -> int:
-        """Run a command on a host to its end, silently; gives its exit code."""
-        words = ["ip", "netns", "exec", self._namespace(host), *command]
-        return subprocess.run(words, check=False, capture_output=True).returncode
+        """Run a command on a host without output; returns its exit code."""
+        arguments = ["ip", "netns", "exec", self._namespace(host), *command]
+        return subprocess.run(arguments, check=False, capture_output=True).returncode
 
     def set_link(self, host: str, up: bool) -> None:
-        """Plug a host's cable in or out; senders are not told that what they send is lost."""
+        """Set a host's link up or down; packets to a host whose link is down are dropped silently."""
         _ip("-n", self._gateway, "link", "set", self._port(host), "up" if up else "down")
 
     def __enter__(self) -> Self:
@@ -95,13 +95,13 @@ class Network:
     def _build(self) -> None:
         self._add_namespace(self._gateway)
         _ip("netns", "exec", self._gateway, "sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
-        # Of a host whose cable is out no sender hears that it can't be reached.
+        # Packets to a host whose link is down are dropped without an ICMP error.
         _ip("-n", self._gateway, "route", "add", "blackhole", _NET)
         names = "127.0.0.1 localhost\n" + "".join(f"{address} {host}\n" for host, address in self._addresses.items())
         for host, address in self._addresses.items():
             namespace, port = self._namespace(host), self._port(host)
             self._add_namespace(namespace)
-            # `ip netns exec` shows a namespace's processes this file as /etc/hosts.
+            # `ip netns exec` mounts this file as /etc/hosts.
             etc = Path("/etc/netns") / namespace
             etc.mkdir(parents=True)
             self._closing.callback(shutil.rmtree, etc, ignore_errors=True)

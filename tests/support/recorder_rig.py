@@ -24,7 +24,7 @@ from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import Event, JointState, OpenSession, RigConfig, TorqueCommand
 from hilrig_schemas.topics import COMMAND, CONFIG, STATE, alive_key
 from support.labs import HILRIG, free_ports, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 Key = tuple[str, int, bytes]
 """(channel, sequence of the publisher, payload)."""
@@ -181,7 +181,7 @@ def router() -> Iterator[str]:
         yield endpoint
     finally:
         process.stdin.close()
-        process.wait(PATIENT_S)
+        process.wait(LONG_TIMEOUT_S)
         process.stdout.close()
 
 

@@ -54,7 +54,7 @@ class Script:
     """Stalls of the edge: start time, s → duration."""
     law: str = "wave"
     """Control law: a `wave`, or `feedback` from the positions that were read."""
-    behind: int = 0
+    feedback_delay_polls: int = 0
     """Age of the positions that the feedback uses, polls."""
     delayed_ack_ms: float = 0.0
     """Delay of a request that directly follows a write, caused by a delayed acknowledgment."""
@@ -73,7 +73,7 @@ def position(seconds: float) -> np.ndarray:
 
 
 @dataclass
-class Made:
+class TimedMessage:
     """One message of a recording."""
 
     topic: str
@@ -81,17 +81,17 @@ class Made:
     message: Message
 
 
-def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[Made]:
+def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str = "rig1") -> list[TimedMessage]:
     """The messages of a scripted run, in the order of publication."""
     random = Random(script.seed)
     step_ns = round(script.step_ms * MS)
     ticks = _ticks(script, step_ns, random)
     writes = list(_cycles(script, ticks, random)) if script.controllers else []
-    made: list[Made] = []
+    made: list[TimedMessage] = []
     for write in writes:
         command = write.command
         command.rig, command.session, command.controller = rig, session, CONTROLLER
-        made.append(Made("command", command.sent_ns - EDGE_FROM_WALL_NS, command))
+        made.append(TimedMessage("command", command.sent_ns - EDGE_FROM_WALL_NS, command))
     waiting = iter(writes)
     following = next(waiting, None)
     newest: _Write | None = None
@@ -126,17 +126,18 @@ def make(script: Script, session: str = "20260101T000000Z-rig1-abcd", rig: str =
         if parts and (step - 1) % 50 == 0:
             parts[held].x += 0.002
             state.parts.extend(parts)
-        made.append(Made("state", state.wall_ns, state))
+        made.append(TimedMessage("state", state.wall_ns, state))
         if missed:
             text = f"{missed} steps missed"
             event = Event(rig=rig, session=session, kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step)
             event.wall_ns, event.source = state.wall_ns, "sim/1"
             event.overrun_data.missed_steps = missed
-            made.append(Made("event", event.wall_ns, event))
-    for at_ns, kind, text in ((0, Event.SESSION_START, "took the rig"), (tick_ns, Event.SESSION_END, "left the rig")):
-        event = Event(rig=rig, session=session, kind=kind, severity=Event.INFO, text=f"{CONTROLLER} {text}")
+            made.append(TimedMessage("event", event.wall_ns, event))
+    started, ended = f"started by {CONTROLLER}", "ended: the connection was closed"
+    for at_ns, kind, text in ((0, Event.SESSION_START, started), (tick_ns, Event.SESSION_END, ended)):
+        event = Event(rig=rig, session=session, kind=kind, severity=Event.INFO, text=f"session {session} {text}")
         event.wall_ns, event.source = START_WALL_NS + at_ns, "edge/1"
-        made.append(Made("event", event.wall_ns, event))
+        made.append(TimedMessage("event", event.wall_ns, event))
     made.extend(_traffic(writes, rig))
     return sorted(made, key=lambda one: one.publish_wall_ns)
 
@@ -188,7 +189,7 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
     begin_ns, seq = round(30 * MS), 0
     seen: tuple[int, int] | None = None
-    seen_before: deque[np.ndarray] = deque(maxlen=2 + script.behind)
+    seen_before: deque[np.ndarray] = deque(maxlen=2 + script.feedback_delay_polls)
     while begin_ns < script.seconds * 1e9 - 100 * MS:
         if script.order == "read-compute-write":
             asked_ns = max(begin_ns + network_ns, free_ns)
@@ -231,14 +232,14 @@ def _cycles(script: Script, ticks: dict[int, tuple[int, int, int]], random: Rand
 
 def _effort(script: Script, seen: Sequence[np.ndarray], seconds: float, seq: int) -> np.ndarray:
     """Torques of a control law: a wave that does not depend on the arm, or feedback from an earlier poll."""
-    if script.law == "wave" or len(seen) < 2 + script.behind:
+    if script.law == "wave" or len(seen) < 2 + script.feedback_delay_polls:
         return 3 * np.sin(0.9 * seq / 50 + np.arange(4))
-    newest, older = seen[-1 - script.behind], seen[-2 - script.behind]
+    newest, older = seen[-1 - script.feedback_delay_polls], seen[-2 - script.feedback_delay_polls]
     setpoint = position(seconds) * REGISTER_SCALE
     return np.array([0.5, 0.4, 0.3, 0.2]) * (setpoint - newest) - 0.6 * (newest - older)
 
 
-def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
+def _traffic(writes: list[_Write], rig: str) -> Iterator[TimedMessage]:
     read = ModbusKind(function=3, address=4, count=4, controller=CONTROLLER)
     wrote = ModbusKind(function=16, address=0, count=4, controller=CONTROLLER)
     batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
@@ -250,13 +251,13 @@ def _traffic(writes: list[_Write], rig: str) -> Iterator[Made]:
         if len(batch.arrived_ns) >= 20 or write is writes[-1]:
             batch.closed_ns = command.sent_ns
             batch.wall_ns = command.wall_ns
-            yield Made("traffic", batch.wall_ns, batch)
+            yield TimedMessage("traffic", batch.wall_ns, batch)
             batch = ModbusTraffic(rig=rig, kinds=[read, wrote])
 
 
 def write(
     path: Path,
-    made: Iterable[Made],
+    made: Iterable[TimedMessage],
     *,
     script: Script = Script(),
     metadata: Mapping[str, Mapping[str, str]] | None = None,
@@ -275,7 +276,7 @@ def write(
     Args:
         path: the file.
         made: the messages.
-        script: script of the run, for the metadata.
+        script: script of the run (used for its metadata).
         metadata: additional or replaced metadata records.
         schema_version: version of the message schemas in the metadata.
         compression: compression of the chunks.

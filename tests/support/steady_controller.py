@@ -1,6 +1,6 @@
-"""A controller for tests of faults: the same torque fifty times a second, connecting again whenever it must.
+"""Controller for fault tests: writes a constant torque fifty times per second and reconnects after errors.
 
-usage: steady_controller.py HOST PORT; ends with its standard input, and then prints how many writes were answered.
+Usage: steady_controller.py HOST PORT. Ends with its standard input, then prints the number of answered writes.
 """
 
 import socket
@@ -27,7 +27,7 @@ def main() -> None:
                     if not answer:
                         break
                     answered += not answer[7] & 0x80
-                    # Each torque is based on a state, as in any loop; whether there is one is not asked here.
+                    # Read a state, as a control loop does; the response may be an exception.
                     connection.sendall(READ)
                     if not connection.recv(64):
                         break

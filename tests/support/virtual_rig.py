@@ -19,7 +19,7 @@ from hilrig_schemas import Event, JointState, RigBatch, TorqueCommand
 from hilrig_schemas.topics import COMMANDS, EVENT, STATE
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
-from support.recordings import Made
+from support.recordings import TimedMessage
 
 REGISTERS = np.array([18000 / np.pi, 18000 / np.pi, 100_000.0, 18000 / np.pi])
 """Factors from rad and m to the position registers."""
@@ -85,10 +85,10 @@ class VirtualRig:
         """Kinds of the events so far."""
         return [Event.Kind.Name(event.kind) for event in self.events]
 
-    def recorded(self) -> list[Made]:
+    def recorded(self) -> list[TimedMessage]:
         """Return everything that was published, in the format of `recordings.write`."""
-        made = [Made("state", state.wall_ns, state) for state in self.states]
-        made += [Made("event", event.wall_ns, event) for event in self.events]
+        made = [TimedMessage("state", state.wall_ns, state) for state in self.states]
+        made += [TimedMessage("event", event.wall_ns, event) for event in self.events]
         return sorted(made, key=lambda one: one.publish_wall_ns)
 
     def __enter__(self) -> Self:
@@ -113,7 +113,9 @@ def pick_and_place() -> ModuleType:
     return module
 
 
-def work(rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_delay_ms: int = 0) -> float | None:
+def run_controller(
+    rig: VirtualRig, seconds: float, *, state_delay_ms: int = 0, command_delay_ms: int = 0
+) -> float | None:
     """Run the example controller with int16 registers, twice per step; return when it was done, s, or None.
 
     The delays are added to the step that a loop through the rig takes.

@@ -1,4 +1,4 @@
-"""Waiting on conditions, never on time; and how punctual the machine is meanwhile."""
+"""Waits for conditions with a timeout, and measures scheduling stalls of the machine."""
 
 import threading
 import time
@@ -8,24 +8,24 @@ from typing import Self, TypeVar
 
 T = TypeVar("T")
 
-PATIENT_S = 60.0
-"""How long to wait for what will come, where time is not the question: the machine may be busy with other tests."""
+LONG_TIMEOUT_S = 60.0
+"""Timeout where the duration is not under test: other tests may load the machine."""
 
 
-def eventually(condition: Callable[[], T], *, timeout_s: float = PATIENT_S, every_s: float = 0.01) -> T:
-    """Call `condition` until it gives something true, and return that; fail after `timeout_s`."""
+def eventually(condition: Callable[[], T], *, timeout_s: float = LONG_TIMEOUT_S, every_s: float = 0.01) -> T:
+    """Call `condition` until it returns a true value, and return that; fail after `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while True:
         value = condition()
         if value:
             return value
         if time.monotonic() > deadline:
-            raise AssertionError(f"did not come true within {timeout_s} s (last: {value!r})")
+            raise AssertionError(f"condition not met within {timeout_s} s (last value: {value!r})")
         time.sleep(every_s)
 
 
 class Stalls:
-    """How long the machine keeps a thread of this process waiting, at worst; a context manager."""
+    """Context manager that measures the longest scheduling delay of a thread of this process."""
 
     PERIOD_S = 0.005
 
@@ -33,10 +33,6 @@ class Stalls:
         self.worst_s = 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch)
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self.worst_s = 0.0
 
     def _watch(self) -> None:
         before_s = time.monotonic()

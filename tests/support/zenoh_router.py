@@ -1,4 +1,4 @@
-"""A zenoh router for tests: the same code that the router's image runs, embedded. Ends with its standard input."""
+"""zenoh router for tests: the router library in a Python process. Ends with its standard input."""
 
 import argparse
 import json

@@ -7,7 +7,7 @@ import pytest
 from hilrig_replay.export.delay_trace import delay_trace
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
-from support.recordings import Made, Script, make, record, write
+from support.recordings import Script, TimedMessage, make, record, write
 
 
 def trace_ms(folder: Path, script: Script) -> tuple[float, ...]:
@@ -37,7 +37,7 @@ def test_recording_with_losses_is_rejected(tmp_path: Path, lost: dict[str, int])
 
 
 def test_recording_with_missing_commands_is_rejected(tmp_path: Path) -> None:
-    made: list[Made] = make(Script(seconds=8.0, poll_ms=20.0))
+    made: list[TimedMessage] = make(Script(seconds=8.0, poll_ms=20.0))
     commands = [each for each in made if each.topic == "command"]
     removed = {id(each) for each in commands[100:110]}
     path = write(tmp_path / "run.mcap", [each for each in made if id(each) not in removed], script=Script(seconds=8.0))

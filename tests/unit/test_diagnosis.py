@@ -80,7 +80,9 @@ def test_finds_delayed_acknowledgments(tmp_path: Path, wait_ms: float) -> None:
 
 @pytest.mark.parametrize("poll_ms", [20.0, 40.0, 100.0])
 def test_finds_torques_based_on_the_previous_poll(tmp_path: Path, poll_ms: float) -> None:
-    found = findings(tmp_path, Script(seconds=20.0, poll_ms=poll_ms, law="feedback", behind=1))["previous_poll"]
+    found = findings(tmp_path, Script(seconds=20.0, poll_ms=poll_ms, law="feedback", feedback_delay_polls=1))[
+        "previous_poll"
+    ]
     assert found.evidence["added_ms"] == pytest.approx(poll_ms, rel=0.05)
     assert found.evidence["unexplained_previous"] < found.evidence["unexplained_newest"]
 

@@ -16,7 +16,7 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import JointState, RigConfig
 from hilrig_schemas.topics import CONFIG, RIG_TOPICS, Traffic
 from hilrig_sim.arm.urdf import urdf
-from support.recordings import PARAMETERS, Made, Script, make
+from support.recordings import PARAMETERS, Script, TimedMessage, make
 from support.rrd_files import RrdFile
 
 KEYS = {topic.name: topic.key("lab", "rig1") for topic in RIG_TOPICS}
@@ -37,7 +37,7 @@ class Watched:
         config = RigConfig(rig="rig1", step_ns=20_000_000, parameters_json=PARAMETERS.to_json(), urdf=urdf(PARAMETERS))
         self.bus.declare_queryable(CONFIG.key("lab", "rig1"), lambda _: config.SerializeToString())
 
-    def send(self, made: list[Made]) -> None:
+    def send(self, made: list[TimedMessage]) -> None:
         for one in made:
             self.bus.publisher(KEYS[one.topic], Traffic.CONTROL).put(one.message.SerializeToString())
 

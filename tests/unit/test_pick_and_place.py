@@ -8,7 +8,7 @@ from hilrig_schemas import JointState, PartState
 from hilrig_sim.arm.dynamics import forward_dynamics
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from support.recordings import PARAMETERS
-from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, work
+from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, run_controller
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
@@ -19,7 +19,7 @@ def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
 @pytest.mark.parametrize("extra_ms", [0, 20, 40, 60])
 def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     with VirtualRig() as rig:
-        done_s = work(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
+        done_s = run_controller(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
         parts, held = last_parts(rig.states)
     result = evaluate_placement(PARAMETERS.scene, parts, held=held)
     assert result.placed == len(PARAMETERS.scene.parts) == 4

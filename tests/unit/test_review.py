@@ -19,10 +19,10 @@ from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
-from support.recordings import PARAMETERS, Made, Script, make, position, record, write
+from support.recordings import PARAMETERS, Script, TimedMessage, make, position, record, write
 
 
-def named(folder: Path, name: str, script: Script, made: list[Made] | None = None) -> Run:
+def named(folder: Path, name: str, script: Script, made: list[TimedMessage] | None = None) -> Run:
     made = made or make(script)
     for one in made:
         if getattr(one.message, "session", ""):
@@ -133,7 +133,7 @@ def test_initial_zero_torque_is_not_a_controller_command(tmp_path: Path) -> None
             one.message.session, one.message.command_seq = "", 1
     first = made[0]
     made.insert(
-        0, Made("command", first.publish_wall_ns, TorqueCommand(rig="rig1", seq=1, effort=[0.0] * 4, safe=True))
+        0, TimedMessage("command", first.publish_wall_ns, TorqueCommand(rig="rig1", seq=1, effort=[0.0] * 4, safe=True))
     )
     run = named(tmp_path, "alone", silent, made)
     assert find_origin(run, "motion") == Origin(0, "start")

@@ -10,20 +10,20 @@ from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event, JointState, TorqueCommand
-from support.recordings import START_WALL_NS, Made, Script, make, record, write
+from support.recordings import START_WALL_NS, Script, TimedMessage, make, record, write
 
 
 @pytest.fixture(scope="module")
-def made() -> list[Made]:
+def made() -> list[TimedMessage]:
     return make(Script(seconds=3.0))
 
 
 @pytest.fixture
-def path(tmp_path: Path, made: list[Made]) -> Path:
+def path(tmp_path: Path, made: list[TimedMessage]) -> Path:
     return write(tmp_path / "run.mcap", made)
 
 
-def test_reads_all_fields_of_states(path: Path, made: list[Made]) -> None:
+def test_reads_all_fields_of_states(path: Path, made: list[TimedMessage]) -> None:
     run = open_run(path)
     sent = [one.message for one in made if isinstance(one.message, JointState)]
     assert len(run.states) == len(sent) == 150
@@ -37,7 +37,7 @@ def test_reads_all_fields_of_states(path: Path, made: list[Made]) -> None:
             assert np.array_equal(value, expected if not hasattr(expected, "append") else list(expected)), name
 
 
-def test_reads_all_fields_of_commands(path: Path, made: list[Made]) -> None:
+def test_reads_all_fields_of_commands(path: Path, made: list[TimedMessage]) -> None:
     run = open_run(path)
     sent = [one.message for one in made if isinstance(one.message, TorqueCommand)]
     assert len(run.commands) == len(sent) > 500
@@ -51,7 +51,7 @@ def test_reads_all_fields_of_commands(path: Path, made: list[Made]) -> None:
             assert np.array_equal(value, expected if not hasattr(expected, "append") else list(expected)), name
 
 
-def test_reads_parts_events_and_requests(path: Path, made: list[Made]) -> None:
+def test_reads_parts_events_and_requests(path: Path, made: list[TimedMessage]) -> None:
     run = open_run(path)
     assert set(run.names.texts(run.parts["part"])) == {"red", "blue", "green", "yellow"}
     assert list(run.events["kind"]) == ["SESSION_START", "SESSION_END"]
@@ -81,7 +81,7 @@ def test_time_axis_uses_the_clock_of_the_states(path: Path) -> None:
     assert np.array_equal(run.time_ns(run.commands), run.commands["wall_ns"] - run.start_wall_ns)
 
 
-def test_time_axis_continues_across_a_simulation_restart(tmp_path: Path, made: list[Made]) -> None:
+def test_time_axis_continues_across_a_simulation_restart(tmp_path: Path, made: list[TimedMessage]) -> None:
     states = [one for one in made if isinstance(one.message, JointState)]
     for number, one in enumerate(states[100:]):
         message = JointState()
@@ -89,7 +89,7 @@ def test_time_axis_continues_across_a_simulation_restart(tmp_path: Path, made: l
         # A new process: steps from 1, and an unrelated clock.
         message.incarnation, message.step = 99, number + 1
         message.sampled_ns -= 4_000_000_000_000
-        states[100 + number] = Made("state", one.publish_wall_ns, message)
+        states[100 + number] = TimedMessage("state", one.publish_wall_ns, message)
     run = open_run(write(tmp_path / "run.mcap", states))
     assert np.allclose(np.diff(run.time_s(run.states)), 0.02, atol=2e-4)
 
@@ -115,7 +115,7 @@ def test_reads_a_time_range(path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_reads_all_mcap_compressions(tmp_path: Path, made: list[Made], compression: CompressionType) -> None:
+def test_reads_all_mcap_compressions(tmp_path: Path, made: list[TimedMessage], compression: CompressionType) -> None:
     assert len(open_run(write(tmp_path / "run.mcap", made, compression=compression)).states) == 150
 
 
@@ -139,7 +139,7 @@ def test_reports_a_file_of_another_format(tmp_path: Path, content: bytes, words:
         open_run(path)
 
 
-def test_truncated_file_error_names_the_recover_command(tmp_path: Path, made: list[Made]) -> None:
+def test_truncated_file_error_names_the_recover_command(tmp_path: Path, made: list[TimedMessage]) -> None:
     path = write(tmp_path / "run.mcap.part", made, finish=False)
     with pytest.raises(InputError, match=r"still being written, or truncated.*`hilrig recover .*run\.mcap\.part`"):
         open_run(path)
@@ -163,13 +163,13 @@ def test_checksum_detects_a_flipped_bit(path: Path) -> None:
             pass
 
 
-def test_reports_a_recording_without_states(tmp_path: Path, made: list[Made]) -> None:
+def test_reports_a_recording_without_states(tmp_path: Path, made: list[TimedMessage]) -> None:
     path = write(tmp_path / "run.mcap", [one for one in made if one.topic == "event"])
     with pytest.raises(InputError, match=r"empty recording: it contains no state of the arm \(2 other messages\)"):
         open_run(path)
 
 
-def test_reports_a_newer_schema_version(tmp_path: Path, made: list[Made]) -> None:
+def test_reports_a_newer_schema_version(tmp_path: Path, made: list[TimedMessage]) -> None:
     path = write(tmp_path / "run.mcap", made, schema_version="hilrig.v2")
     with pytest.raises(
         InputError, match=r"recorded with message schemas hilrig\.v2, but this version reads hilrig\.v1"

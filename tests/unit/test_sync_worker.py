@@ -11,7 +11,7 @@ from typing import Any
 
 from hilrig_recorder.storage.sync_worker import SyncWorker
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 
 @dataclass(eq=False)
@@ -153,6 +153,6 @@ def test_shutdown_renames_every_file_without_sync_if_late() -> None:
 
     worker.finish(slow, finish_slowly)  # type: ignore[arg-type]
     worker.finish(fast, fast.finish)  # type: ignore[arg-type]
-    assert started.wait(PATIENT_S)
+    assert started.wait(LONG_TIMEOUT_S)
     assert worker.close(0.05)
     assert (slow.done, fast.done) == (["publish"], ["finish", "publish"])

@@ -10,15 +10,15 @@ from hilrig_replay.analysis.verify import OTHER_PLATFORM_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState
 from hilrig_sim.platform_fingerprint import machine_name
-from support.recordings import Made, record, write
-from support.virtual_rig import VirtualRig, work
+from support.recordings import TimedMessage, record, write
+from support.virtual_rig import VirtualRig, run_controller
 
 
 @pytest.fixture(scope="module")
-def run() -> list[Made]:
+def run() -> list[TimedMessage]:
     """The pick-and-place example, then a reset, an impact on the joint limits, and a falling quill."""
     with VirtualRig() as rig:
-        work(rig, 14.0, state_delay_ms=10, command_delay_ms=10)
+        run_controller(rig, 14.0, state_delay_ms=10, command_delay_ms=10)
         rig.command((0, 0, -5, 0), resets=0)
         rig.tick(20)
         rig.command((20, -8, 3, 1), magnet=True, resets=1)
@@ -28,20 +28,20 @@ def run() -> list[Made]:
         return rig.recorded()
 
 
-def states(made: list[Made]) -> list[JointState]:
+def states(made: list[TimedMessage]) -> list[JointState]:
     return [one.message for one in made if isinstance(one.message, JointState)]
 
 
-def copied(made: list[Made]) -> list[Made]:
+def copied(made: list[TimedMessage]) -> list[TimedMessage]:
     copies = []
     for one in made:
         message = type(one.message)()
         message.CopyFrom(one.message)
-        copies.append(Made(one.topic, one.publish_wall_ns, message))
+        copies.append(TimedMessage(one.topic, one.publish_wall_ns, message))
     return copies
 
 
-def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[Made], tmp_path: Path) -> None:
+def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[TimedMessage], tmp_path: Path) -> None:
     kinds = {one.message.kind for one in run if not isinstance(one.message, JointState)}
     assert len(kinds) >= 4
     found = verify(write(tmp_path / "run.mcap", run), tolerance=0.0)
@@ -55,7 +55,7 @@ def test_verifies_picks_stops_and_a_reset_bit_for_bit(run: list[Made], tmp_path:
 
 
 @pytest.mark.parametrize("row", [40, 333, 700])
-def test_finds_the_step_of_a_changed_effort(run: list[Made], tmp_path: Path, row: int) -> None:
+def test_finds_the_step_of_a_changed_effort(run: list[TimedMessage], tmp_path: Path, row: int) -> None:
     changed = copied(run)
     state = states(changed)[row]
     state.effort[1] += 0.001
@@ -68,7 +68,7 @@ def test_finds_the_step_of_a_changed_effort(run: list[Made], tmp_path: Path, row
     assert not verify(tmp_path / "run.mcap", tolerance=OTHER_PLATFORM_TOLERANCE).same
 
 
-def test_finds_the_step_before_a_changed_position(run: list[Made], tmp_path: Path) -> None:
+def test_finds_the_step_before_a_changed_position(run: list[TimedMessage], tmp_path: Path) -> None:
     changed = copied(run)
     state = states(changed)[500]
     state.position[0] = np.nextafter(state.position[0], 10)
@@ -77,7 +77,7 @@ def test_finds_the_step_before_a_changed_position(run: list[Made], tmp_path: Pat
     assert verify(tmp_path / "run.mcap", tolerance=1e-9).same
 
 
-def test_finds_a_changed_part_position(run: list[Made], tmp_path: Path) -> None:
+def test_finds_a_changed_part_position(run: list[TimedMessage], tmp_path: Path) -> None:
     changed = copied(run)
     state = next(state for state in states(changed)[300:] if state.parts)
     state.parts[0].x += 0.001
@@ -86,7 +86,7 @@ def test_finds_a_changed_part_position(run: list[Made], tmp_path: Path) -> None:
     assert found.largest_part_deviation == pytest.approx(0.001)
 
 
-def test_missing_states_are_gaps_not_divergence(run: list[Made], tmp_path: Path) -> None:
+def test_missing_states_are_gaps_not_divergence(run: list[TimedMessage], tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", run, missing={"state": {20, 21, 400}})
     found = verify(path, tolerance=0.0)
     assert found.same
@@ -96,7 +96,7 @@ def test_missing_states_are_gaps_not_divergence(run: list[Made], tmp_path: Path)
     assert "2 gaps" in found.sentence()
 
 
-def test_a_simulation_restart_is_a_gap(run: list[Made], tmp_path: Path) -> None:
+def test_a_simulation_restart_is_a_gap(run: list[TimedMessage], tmp_path: Path) -> None:
     restarted = copied(run)
     for state in states(restarted)[200:]:
         state.incarnation += 1
@@ -107,7 +107,7 @@ def test_a_simulation_restart_is_a_gap(run: list[Made], tmp_path: Path) -> None:
     assert found.first_diverging_step != states(restarted)[199].step
 
 
-def test_finds_a_changed_held_part(run: list[Made], tmp_path: Path) -> None:
+def test_finds_a_changed_held_part(run: list[TimedMessage], tmp_path: Path) -> None:
     changed = copied(run)
     state = next(state for state in states(changed) if state.held_part == "blue")
     state.held_part = "red"
@@ -116,7 +116,7 @@ def test_finds_a_changed_held_part(run: list[Made], tmp_path: Path) -> None:
     assert found.largest_part_deviation == np.inf
 
 
-def test_default_tolerance_depends_on_the_platform(run: list[Made], tmp_path: Path) -> None:
+def test_default_tolerance_depends_on_the_platform(run: list[TimedMessage], tmp_path: Path) -> None:
     found = verify(write(tmp_path / "run.mcap", run))
     assert found.machine != machine_name()
     assert found.tolerance == OTHER_PLATFORM_TOLERANCE
@@ -128,7 +128,7 @@ def test_rejects_a_run_not_made_by_the_model(tmp_path: Path) -> None:
     assert found.first_diverging_step == 1
 
 
-def test_reports_a_recording_without_parameters(run: list[Made], tmp_path: Path) -> None:
+def test_reports_a_recording_without_parameters(run: list[TimedMessage], tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", run, metadata={"hilrig.config": {"step_ns": "20000000"}})
     with pytest.raises(InputError, match="does not contain the parameters"):
         verify(path)

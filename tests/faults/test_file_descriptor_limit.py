@@ -1,4 +1,4 @@
-"""An edge whose connections have used up the files that it may open serves those that it has, and says so."""
+"""An edge at its limit of open files keeps serving the existing connections and logs the limit."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from hilrig_runtime.config.lab import load_lab
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH
 from support.labs import HILRIG, write_lab
-from support.waiting import PATIENT_S, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 LIMIT = 64
 READ = bytes.fromhex("0001 0000 0006 01 03 0004 0004")
@@ -26,34 +26,34 @@ def read(connection: socket.socket) -> bytes:
 
 
 @pytest.mark.rig
-@pytest.mark.skipif(os.name != "posix", reason="elsewhere a process has no such limit")
-def test_an_edge_without_a_file_left_goes_on(tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX resource limits (ulimit)")
+def test_edge_at_its_file_limit_keeps_serving(tmp_path: Path) -> None:
     config = write_lab(tmp_path, extra="edge.max_connections = 200\nedge.max_connections_per_host = 200")
     lab = load_lab(config)
     log = tmp_path / "edge.log"
     command = ["sh", "-c", f'ulimit -n {LIMIT}; exec "$@"', "sh", *HILRIG, "edge", "--config", str(config)]
-    heard: list[Health] = []
+    reports: list[Health] = []
     with log.open("w") as out, ExitStack() as closing:
         edge = subprocess.Popen(command, stdout=out, stderr=out, cwd=tmp_path)
         try:
             bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
-            # Before the files are used up: this link is one too.
+            # Subscribe before the limit is reached: the link needs a file descriptor too.
             bus.subscribe(
-                HEALTH.key(lab.name, "edge", "*"), lambda _, payload: heard.append(Health.FromString(payload))
+                HEALTH.key(lab.name, "edge", "*"), lambda _, payload: reports.append(Health.FromString(payload))
             )
-            eventually(lambda: heard)
+            eventually(lambda: reports)
             address = (lab.edge.host, lab.edge.first_port)
-            first = closing.enter_context(socket.create_connection(address, timeout=PATIENT_S))
+            first = closing.enter_context(socket.create_connection(address, timeout=LONG_TIMEOUT_S))
             assert read(first)
             for _ in range(LIMIT):
-                closing.enter_context(socket.create_connection(address, timeout=PATIENT_S))
+                closing.enter_context(socket.create_connection(address, timeout=LONG_TIMEOUT_S))
             eventually(lambda: "Too many open files" in log.read_text())
-            before = len(heard)
-            eventually(lambda: len(heard) >= before + 2)
-            assert heard[-1].connections > LIMIT // 4
+            before = len(reports)
+            eventually(lambda: len(reports) >= before + 2)
+            assert reports[-1].connections > LIMIT // 4
             assert read(first)
         finally:
             edge.send_signal(signal.SIGTERM)
-            code = edge.wait(PATIENT_S)
+            code = edge.wait(LONG_TIMEOUT_S)
     assert code == 0
     assert "Traceback" not in log.read_text()
