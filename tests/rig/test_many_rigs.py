@@ -137,7 +137,7 @@ def test_rig_is_added_used_and_removed(lab: RunningLab, controller: ModbusTcpCli
 def test_rejected_rig_leaves_no_trace(lab: RunningLab) -> None:
     for arguments, code, text in [
         (("add", "rig1"), 2, "rig 'rig1' already exists in the lab"),
-        (("add", "no name"), 2, "name: expected"),
+        (("add", "no name"), 2, "name: must be"),
         (("add", "late", "--port", str(lab.port)), 3, "rig 'late' was not added: edge/[12] .* can't listen on"),
         (("remove", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
         (("reset", "nobody"), 2, "unknown rig 'nobody'; this lab has rig1"),
@@ -171,7 +171,10 @@ def test_duplicate_rig_is_rejected() -> None:
     [
         (("sim", "--instance", "2"), "sim/1 on .* already serves rig1, rig2, rig3 and 1 more; each rig has one sim"),
         (("edge", "--instance", "3", "--rigs", "rig3"), "edge/2 on .* already serves rig3; each rig has one edge"),
-        (("edge", "--instance", "2", "--rigs", "rig3"), "another edge is called '2' already"),
+        (
+            ("edge", "--instance", "2", "--rigs", "rig3"),
+            "edge/2 on .* has the same instance name; choose another --instance",
+        ),
     ],
 )
 def test_second_service_of_a_rig_does_not_start(lab: RunningLab, arguments: tuple[str, ...], reason: str) -> None:
