@@ -144,7 +144,7 @@ def test_host_with_invalid_certificate_is_refused(
             )
             done = lab.run("stranger", "top", "-c", str(config), "--json")
             assert done.returncode == 3, defect
-            assert "do not trust each other" in done.stderr, defect
+            assert "certificates do not match" in done.stderr, defect
         config.write_text(config_of(tmp_path, make_client_folder(tmp_path / "sim", authority, "sim", wrong["expired"])))
         with (tmp_path / "stderr").open("w") as errors:
             command = [HILRIG, "sim", "-c", str(config)]
