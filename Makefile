@@ -56,6 +56,7 @@ check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
+	$(BIN)/python scripts/check_vocabulary.py
 
 gen: .venv/dev ## generate code and documentation tables from their sources
 	$(BIN)/python -m grpc_tools.protoc -I schemas --python_out=schemas --pyi_out=schemas schemas/hilrig_schemas/v1/*.proto

@@ -44,7 +44,7 @@ FORBIDDEN: Final = {
     r"\bsee the module\b": "one line",
     r"(?<!Math\.)\bfloors?\b(?!\()(?! (of|at) (the )?(scene|plant|world))": "layer",
     r"\bthe way of\b|\bof the house\b": "data flow",
-    r"\b(colour|centre|metre|millimetre|behaviour|neighbour|authoris|quantis|analys(e|es|ed|ing)\b|catalogue|grey\b|"
+    r"\b(colour|centre|metre|millimetre|behaviour|neighbour|authoris|quantis|analys(e|ed|ing)\b|catalogue|grey\b|"
     r"synchronis|linearis|recognis|organis|initialis|normalis|minimis|maximis|optimis|serialis|discretis|summaris|"
     r"acknowledgement|favour|honour|labelled\b|modelled|travelled|signalled|cancelled|towards|whilst|licence)": (
         "American spelling"
@@ -53,6 +53,8 @@ FORBIDDEN: Final = {
 """Expression → what to write instead."""
 KINDS: Final = {".py", ".md", ".proto", ".js", ".html", ".css", ".toml", ".yaml", ".c", ".sh", ".st", ".cfg", ""}
 EXEMPT: Final = ("docs/glossary.md", "scripts/check_vocabulary.py", "LICENSE", "constraints.txt")
+PINNED_NAMES: Final = re.compile(r"\b(colour|(table_)?centre(_mm)?)\b(?! of)|delayed_acknowledgement")
+"""Keys of lab.toml and of recordings, which keep their spelling."""
 _PATTERNS: Final = [(re.compile(pattern, re.IGNORECASE), instead) for pattern, instead in FORBIDDEN.items()]
 
 
@@ -68,7 +70,8 @@ def main() -> int:
         skip = name in EXEMPT or "_pb2" in name or path.suffix not in KINDS or not path.is_file()
         if skip or (under and not name.startswith(under)):
             continue
-        for line, text in _texts(path):
+        for line, found_text in _texts(path):
+            text = PINNED_NAMES.sub("", found_text)
             for pattern, instead in _PATTERNS:
                 for found in pattern.finditer(text):
                     at = line + text.count("\n", 0, found.start())

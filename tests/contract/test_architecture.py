@@ -71,13 +71,3 @@ def test_module_names_are_unique_within_a_package() -> None:
         for name, package in PACKAGES.items()
     }
     assert {name: stems for name, stems in found.items() if stems} == {}
-
-
-def test_docstrings_describe_their_class() -> None:
-    vague = [
-        str(path.relative_to(ROOT))
-        for package in PACKAGES.values()
-        for path in modules(package)
-        if "See the module" in path.read_text(encoding="utf-8")
-    ]
-    assert vague == []

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from hilrig_runtime.messaging.recording_stream import MAX_CACHE_S
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, times, wait_ready
-from support.waiting import Stalls, eventually
+from support.waiting import StallMonitor, eventually
 
 KILLS = times("HILRIG_RECORDER_KILLS", 4)
 CACHED_S = MAX_CACHE_S - 3
@@ -44,7 +44,7 @@ def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:
     config, lab = make_lab(tmp_path, rigs=3)
     rigs = [rig.name for rig in lab.rigs]
     lives: list[Life] = []
-    with sending(lab, rigs) as senders, Stalls() as stalls:
+    with sending(lab, rigs) as senders, StallMonitor() as stalls:
         for number in range(KILLS):
             with RecorderProcess(config) as recorder:
                 wait_ready(lab, recorder)

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from hilrig_schemas import Event, JointState, TorqueCommand
 from support.labs import HILRIG, RunningLab, hilrig, write_lab
 from support.namespaces import Network, require_namespaces
-from support.waiting import LONG_TIMEOUT_S, Stalls, eventually
+from support.waiting import LONG_TIMEOUT_S, StallMonitor, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
 TOLERANCE_MS = 15
@@ -52,7 +52,7 @@ def messages(path: Path, topic: str, kind: type) -> list:  # type: ignore[type-a
         return [kind.FromString(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
 
 
-def check_recording(recording: Path, cause: str, stalls: Stalls) -> None:
+def check_recording(recording: Path, cause: str, stalls: StallMonitor) -> None:
     """Check that the torque of the last write ended in time, and that the event has the cause.
 
     The machine may stall twice.
@@ -85,7 +85,7 @@ FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
 @pytest.mark.rig
 def test_torque_is_zero_after_controller_failure(tmp_path: Path) -> None:
     config = write_lab(tmp_path, rigs=3, extra=f"edge.watchdog_ms = {TIMEOUT_MS}")
-    with Stalls() as stalls, RunningLab(config) as lab:
+    with StallMonitor() as stalls, RunningLab(config) as lab:
         processes = {
             rig: subprocess.Popen(controller(lab.lab.ports[rig], mode), stdout=subprocess.PIPE, text=True)
             for rig, (mode, _, _) in FAULTS.items()
@@ -117,7 +117,7 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
     """A killed edge does not repeat the command: the command timeout of the simulation stops the torque."""
     extra = "sim.command_timeout_ms = 300\nedge.repeat_ms = 100"
     config = write_lab(tmp_path, extra=extra)
-    with Stalls() as stalls, RunningLab(config) as lab:
+    with StallMonitor() as stalls, RunningLab(config) as lab:
         process = subprocess.Popen(controller(lab.port), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         try:
             assert process.stdout is not None
@@ -146,7 +146,7 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
 def test_torque_is_zero_after_network_failure(tmp_path: Path) -> None:
     require_namespaces()
     lab = write_lab(tmp_path, extra=f"edge.watchdog_ms = {TIMEOUT_MS}\nedge.host = '0.0.0.0'")
-    with Stalls() as stalls, Network(["rig", "pc"]) as network:
+    with StallMonitor() as stalls, Network(["rig", "pc"]) as network:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
         eventually(lambda: "running" in (tmp_path / "up.log").read_text())

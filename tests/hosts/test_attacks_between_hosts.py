@@ -77,7 +77,7 @@ def secured_lab(folder: Path) -> Iterator[tuple[MultiHostLab, Credential]]:
     authority = make_bus_folder(folder / "bus", ["router", "sim", *EDGES, "recorder", "operator"], ["router"])
     config = folder / "lab.toml"
     config.write_text(config_of(folder, folder / "bus"))
-    with Network([*COMMANDS, "pc", "stranger"]) as network:
+    with Network([*COMMANDS, "pc", "attacker"]) as network:
         yield MultiHostLab(network, config, load_lab(config), COMMANDS), authority
 
 
@@ -108,7 +108,7 @@ def test_flood_on_one_rig_affects_no_other_rig_or_watchdog(lab: MultiHostLab) ->
         lab.wait_for_closed_loop(10, SAME_EDGE_RIG)
         begin_ns = time.monotonic_ns()
         command = [sys.executable, "-c", FLOOD, FLOODED_RIG.edge, str(FLOODED_RIG.port), str(FLOOD_S)]
-        flood = lab.network.popen("stranger", command)
+        flood = lab.network.popen("attacker", command)
         time.sleep(FLOOD_S / 2)
         # A controller is killed during the flood: the watchdog must still set its torque to zero.
         killed_ns = time.monotonic_ns()
@@ -142,16 +142,16 @@ def test_host_with_invalid_certificate_is_refused(
             config.write_text(
                 config_of(tmp_path, make_client_folder(tmp_path / str(number), authority, "operator", identity))
             )
-            done = lab.run("stranger", "top", "-c", str(config), "--json")
+            done = lab.run("attacker", "top", "-c", str(config), "--json")
             assert done.returncode == 3, defect
             assert "certificates do not match" in done.stderr, defect
         config.write_text(config_of(tmp_path, make_client_folder(tmp_path / "sim", authority, "sim", wrong["expired"])))
         with (tmp_path / "stderr").open("w") as errors:
             command = [HILRIG, "sim", "-c", str(config)]
-            stranger = lab.network.popen("stranger", command, stdin=subprocess.PIPE, stderr=errors)
+            second_simulation = lab.network.popen("attacker", command, stdin=subprocess.PIPE, stderr=errors)
         eventually(lambda: "waiting: no zenoh router answers" in Path(errors.name).read_text())
-        stranger.terminate()
-        assert stranger.wait(LONG_TIMEOUT_S) == 0
+        second_simulation.terminate()
+        assert second_simulation.wait(LONG_TIMEOUT_S) == 0
     states = session.states()
     during = states[(states["sampled_ns"] > begin_ns) & (states["sampled_ns"] < session.end_ns)]
     assert len(np.unique(states["incarnation"])) == 1, "states of another simulation were recorded"

@@ -23,7 +23,7 @@ COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 EDGES = {"east": "rig1,rig2", "west": "rig3,rig4"}
 CERTIFICATES = {"console": "viewer"}
-"""Certificate of a service that is named otherwise: the console is read-only."""
+"""Services whose certificate has another name: the console uses the read-only certificate `viewer`."""
 HILRIG = str(Path(sys.executable).with_name("hilrig"))
 
 CONTROLLER = """
@@ -47,8 +47,8 @@ import json, sys, urllib.error, urllib.request
 address, password = sys.argv[1:]
 try:
     urllib.request.urlopen(address, timeout=10)
-except urllib.error.HTTPError as refusal:
-    print(refusal.code)
+except urllib.error.HTTPError as error:
+    print(error.code)
 known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
 known.add_password(None, address, "teacher", password)
 opener = urllib.request.build_opener(urllib.request.HTTPBasicAuthHandler(known))
@@ -61,7 +61,7 @@ with opener.open(address, timeout=20) as stream:
             break
 """
 
-STRANGER = """
+UNTRUSTED_CLIENT = """
 import zenoh
 
 config = zenoh.Config()
@@ -90,8 +90,8 @@ def test_every_service_is_confined_and_has_a_health_check(name: str) -> None:
     assert service["command"][:2] == ["hilrig", kind]
     assert service["build"]["args"]["PARTS"] == kind
     check = service["healthcheck"]["test"]
-    asked = ["console", "--check"] if kind == "console" else ["doctor", "--service", kind]
-    assert check[: 2 + len(asked)] == ["CMD", "hilrig", *asked]
+    expected = ["console", "--check"] if kind == "console" else ["doctor", "--service", kind]
+    assert check[: 2 + len(expected)] == ["CMD", "hilrig", *expected]
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -238,8 +238,10 @@ def test_services_connect_by_name_and_controllers_move_arms(containers: Containe
     seen = network.run("controller", viewer, stdout=subprocess.PIPE, text=True).stdout.split()
     assert seen == ["401", *sorted(rig.name for rig in load_lab(LAB_FILE).rigs)]
 
-    stranger = [sys.executable, "-c", STRANGER % (folder / "router/ca.pem")]
-    assert network.run("controller", stranger, stdout=subprocess.PIPE, text=True).stdout == "connection refused\n"
+    untrusted_client = [sys.executable, "-c", UNTRUSTED_CLIENT % (folder / "router/ca.pem")]
+    assert (
+        network.run("controller", untrusted_client, stdout=subprocess.PIPE, text=True).stdout == "connection refused\n"
+    )
 
     containers.processes["sim"].kill()
     containers.processes["sim"].wait()

@@ -83,7 +83,7 @@ def test_connection_without_certificate_is_refused(lab: Lab, router: zenoh.Sessi
 
 @pytest.mark.parametrize("wrong", ["authority", "name"])
 def test_router_without_certificate_of_the_lab_is_refused(lab: Lab, tmp_path: Path, wrong: str) -> None:
-    authority = make_authority("stranger", NOW, 30) if wrong == "authority" else lab.authority
+    authority = make_authority("other", NOW, 30) if wrong == "authority" else lab.authority
     hosts = HOSTS if wrong == "authority" else ["elsewhere"]
     router_folder = make_client_folder(
         tmp_path / "other", lab.authority, "router", issue_peer(authority, "router", hosts, NOW, 30)
@@ -100,14 +100,14 @@ def test_mesh_accepts_only_certificates_of_the_lab(lab: Lab, tmp_path: Path, def
     with (
         ZenohBus(lab.config(lab.folder, "mesh"), "sim") as sim,
         # A session of a peer opens without any link and retries to connect.
-        ZenohBus(lab.config(client_folder, "mesh"), "tool") as stranger,
+        ZenohBus(lab.config(client_folder, "mesh"), "tool") as untrusted,
         ZenohBus(lab.config(lab.folder, "mesh"), "edge") as edge,
         ZenohBus(lab.config(lab.folder, "mesh"), "tool") as tool,
     ):
         for service in (edge, tool):
             eventually(lambda service=service: service.session.zid() in sim.session.info.peers_zid())
-        assert stranger.session.zid() not in sim.session.info.peers_zid()
-        assert stranger.session.info.peers_zid() == []
+        assert untrusted.session.zid() not in sim.session.info.peers_zid()
+        assert untrusted.session.info.peers_zid() == []
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "operator.pem"])

@@ -35,9 +35,9 @@ def make_client_folder(folder: Path, authority: Credential, name: str, identity:
 
 def invalid_credentials(authority: Credential) -> dict[str, Credential]:
     """Invalid credentials with the name `operator`, by defect."""
-    stranger = make_authority("stranger", NOW, 30)
+    other_authority = make_authority("other", NOW, 30)
     return {
-        "another authority": issue_peer(stranger, "operator", HOSTS, NOW, 30),
+        "another authority": issue_peer(other_authority, "operator", HOSTS, NOW, 30),
         "expired": issue_peer(authority, "operator", HOSTS, NOW - timedelta(days=10), 9),
         "not valid yet": issue_peer(authority, "operator", HOSTS, NOW + timedelta(days=2), 9),
         "a controller's": issue_client(make_authority("controllers", NOW, 30), "operator", "operator", NOW, 30),

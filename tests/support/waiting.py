@@ -24,7 +24,7 @@ def eventually(condition: Callable[[], T], *, timeout_s: float = LONG_TIMEOUT_S,
         time.sleep(every_s)
 
 
-class Stalls:
+class StallMonitor:
     """Context manager that measures the longest scheduling delay of a thread of this process."""
 
     PERIOD_S = 0.005

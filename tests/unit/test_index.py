@@ -33,7 +33,7 @@ def test_entry_has_the_metadata_of_the_file(tmp_path: Path) -> None:
     assert entry.duration_s == pytest.approx(1.0, abs=0.05)
     assert entry.size == path.stat().st_size
     assert (entry.lost_transport, entry.lost_recorder) == (3, 2)
-    assert entry.trouble == ""
+    assert entry.error == ""
 
 
 def test_measures_the_loop_latency_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,8 +62,8 @@ def test_measuring_reports_damage_inside_a_file(tmp_path: Path) -> None:
     path.write_bytes(data)
     index = RunIndex(tmp_path)
     [entry] = index.measure(index.load())
-    assert entry.trouble.startswith("damaged")
-    assert "hilrig recover" in entry.trouble
+    assert entry.error.startswith("damaged")
+    assert "hilrig recover" in entry.error
     assert (entry.fit, entry.loop_p50_ms) == (False, None)
     index.save()
     # The damage is stored in the index.
@@ -90,19 +90,19 @@ def test_rebuilds_a_damaged_index(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "trouble"),
+    ("content", "error"),
     [
         (b"", "the file is empty"),
         (b"not an mcap file, but long enough to be one", "not an MCAP file (bad magic)"),
         (None, "truncated (no footer)"),
     ],
 )
-def test_lists_an_unusable_file_with_the_reason(tmp_path: Path, content: bytes | None, trouble: str) -> None:
+def test_lists_an_unusable_file_with_the_reason(tmp_path: Path, content: bytes | None, error: str) -> None:
     path = make(tmp_path)
     good = path.read_bytes()
     path.write_bytes(good[:-100] if content is None else content)
     [entry] = RunIndex(tmp_path).load()
-    assert trouble in entry.trouble
+    assert error in entry.error
 
 
 def test_lists_files_truncated_or_changed_anywhere(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_lists_files_truncated_or_changed_anywhere(tmp_path: Path) -> None:
     for length in range(0, len(good), 97):
         path.write_bytes(good[:length])
         entry = read_entry(tmp_path, "lab/rig1/" + path.name, path.stat())
-        assert entry.trouble
+        assert entry.error
     for at in range(len(good) - 600, len(good)):
         path.write_bytes(good[:at] + bytes([good[at] ^ 0xFF]) + good[at + 1 :])
         read_entry(tmp_path, "lab/rig1/" + path.name, path.stat())
@@ -179,7 +179,7 @@ def test_command_lists_filters_and_sorts(tmp_path: Path) -> None:
     assert answer.returncode == 0, answer.stderr
     runs = json.loads(answer.stdout)["runs"]
     assert [Path(run["path"]).stem[-4:] for run in runs] == ["long", "abcd", "bad"]
-    assert runs[2]["trouble"] == "the file is empty"
+    assert runs[2]["error"] == "the file is empty"
     assert json.loads(hilrig("runs", tmp_path, "--json", "--rig", "rig2").stdout)["runs"] == []
     limited = json.loads(hilrig("runs", tmp_path, "--json", "--limit", "1", "--controller", "192.0.2").stdout)
     assert (limited["total"], len(limited["runs"])) == (2, 1)

@@ -122,7 +122,7 @@ def test_batch_whose_end_is_overwritten_in_transport_is_not_recorded() -> None:
     for _ in range(3):
         source.state("rig1", 1)
     sent = encode_batch(source.batch())
-    # What a zenoh session that is closed writes after the part of a batch: a length and frames of its own.
+    # Bytes that a closing zenoh session writes after a truncated batch: a length and frames of its own.
     following = bytes.fromhex("c009a5b7f08c3b31009e21088585025f0200") * len(sent)
     for length in range(1, len(sent)):
         queue = IngestQueue(10, ManualClock())

@@ -66,7 +66,7 @@ def _flatten(error: ValidationError, place: tuple[str | int, ...]) -> Iterator[A
 def _known_keys(model: str, place: tuple[str | int, ...]) -> list[str]:
     """Return the keys of the table at a place inside the model of that name."""
     tables = [one for one in _all_subclasses(Section) if one.__name__ == model]
-    for part, following in zip(place, (*place[1:], None), strict=True):
+    for part, following in zip(place, (*place, None)[1:], strict=True):
         fields = [one.model_fields[part] for one in tables if part in one.model_fields]
         forms = [mark.section for field in fields for mark in field.metadata if isinstance(mark, TableForm)]
         if forms and not isinstance(following, int):

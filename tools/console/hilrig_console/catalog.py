@@ -170,7 +170,7 @@ class RecordingCatalog:
 
 
 def _search_text(entry: RunEntry) -> str:
-    return f"{entry.path} {entry.rig} {entry.controller} {entry.ended} {entry.trouble}".lower()
+    return f"{entry.path} {entry.rig} {entry.controller} {entry.ended} {entry.error}".lower()
 
 
 def _row(entry: RunEntry) -> dict[str, Any]:
@@ -180,6 +180,5 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
     row["unfit"] = "; ".join(entry.unfit_reasons)
-    row["error"] = row.pop("trouble")
     row["open"] = entry.ended == IN_PROGRESS
     return row

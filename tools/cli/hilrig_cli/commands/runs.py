@@ -197,8 +197,8 @@ def _lost(entry: "RunEntry") -> int:
 def _ending(entry: "RunEntry") -> str:
     from rich.markup import escape
 
-    if entry.trouble:
-        return f"[red]{escape(entry.trouble)}[/]"
+    if entry.error:
+        return f"[red]{escape(entry.error)}[/]"
     if entry.ended in ABNORMAL_ENDINGS:
         return f"[yellow]{escape(f'{entry.ended}: {entry.reason}')}[/]"
     return escape(entry.ended)

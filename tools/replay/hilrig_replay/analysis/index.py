@@ -68,7 +68,7 @@ class RunEntry:
     overruns: int = 0
     missed_steps: int = 0
     clock_steps: int = 0
-    trouble: str = ""
+    error: str = ""
     """Error that makes the file unusable; empty: no error."""
     measured: bool = False
     """Whether the next four fields were measured."""
@@ -118,7 +118,7 @@ class RunIndex:
         for done, entry in enumerate(entries):
             if on_progress is not None:
                 on_progress(done)
-            if not entry.measured and not entry.trouble and entry.ended != IN_PROGRESS:
+            if not entry.measured and not entry.error and entry.ended != IN_PROGRESS:
                 found = measure_entry(self.folder, entry)
                 self._known[entry.path] = replace(found, verified=None)
                 self._changed = True
@@ -160,7 +160,7 @@ class RunIndex:
 
 
 def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
-    """Entry of a file from its metadata; a defect of the file is reported in `trouble`."""
+    """Entry of a file from its metadata; a defect of the file is reported in `error`."""
     blank = RunEntry(relative, info.st_size, info.st_mtime_ns, rig=Path(relative).parent.name)
     path = folder / relative
     try:
@@ -169,22 +169,22 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
                 return _unfinished_entry(blank, stream)
             return _finished_entry(blank, stream, info.st_size)
     except OSError as error:
-        return replace(blank, trouble=f"can't be read: {error.strerror}")
+        return replace(blank, error=f"can't be read: {error.strerror}")
     except _UnusableError as error:
-        return replace(blank, trouble=str(error))
+        return replace(blank, error=str(error))
     except (McapError, struct.error, ValueError, KeyError, IndexError) as error:
-        return replace(blank, trouble=f"damaged ({error or type(error).__name__}): run `hilrig recover`")
+        return replace(blank, error=f"damaged ({error or type(error).__name__}): run `hilrig recover`")
 
 
 def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
-    """Add the loop latency of a recording to its entry; damage of the file is reported in `trouble`."""
+    """Add the loop latency of a recording to its entry; damage of the file is reported in `error`."""
     path = folder / entry.path
     try:
         report = measure(open_run(path))
     except HilrigError as error:
-        # `trouble` is for damaged files only: for others, the list shows how the recording ended.
-        trouble = error.description if isinstance(error, DamagedRecordingError) else ""
-        return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), trouble=trouble)
+        # `error` is for damaged files only: for others, the list shows how the recording ended.
+        damage = error.description if isinstance(error, DamagedRecordingError) else ""
+        return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), error=damage)
     loop = report.loop_ms
     return replace(
         entry,
@@ -287,7 +287,7 @@ def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
         overruns=int(trailer.get("overruns", 0)),
         missed_steps=int(trailer.get("missed_steps", 0)),
         clock_steps=int(trailer.get("clock_steps", 0)),
-        trouble="" if session else "not a hilrig recording",
+        error="" if session else "not a hilrig recording",
     )
 
 
