@@ -49,7 +49,7 @@ def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:
             with RecorderProcess(config) as recorder:
                 wait_ready(lab, recorder)
                 ready_s = now_s()
-                stalls.forget()
+                stalls.reset()
                 if not number:
                     for rig in rigs:
                         senders.begin(rig)

@@ -113,4 +113,4 @@ def test_printed_router_configuration_is_valid_json(routed: Path) -> None:
     assert config["scouting"]["multicast"]["enabled"] is False
     wrong = hilrig("router", "--config", routed, "--listen", "tls/0.0.0.0:7447")
     assert wrong.returncode == 2
-    assert "expected tcp/<address>:<port>" in wrong.stderr
+    assert "must be tcp/<address>:<port>" in wrong.stderr

@@ -24,7 +24,7 @@ def test_full_disk_is_reported_in_one_line(arguments: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
         done = run_command(*arguments, stdout=full)
     assert done.returncode == 3
-    assert done.stderr == "hilrig: error: the output: can't be written: No space left on device\n"
+    assert done.stderr == "hilrig: error: standard output: can't be written: No space left on device\n"
 
 
 def test_characters_missing_in_the_encoding_are_dropped(tmp_path: Path) -> None:

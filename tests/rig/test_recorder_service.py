@@ -120,7 +120,7 @@ def test_session_is_recorded_with_every_published_byte(tmp_path: Path) -> None:
     assert found["hilrig.session"]["controller"] == "192.0.2.7:40001"
     assert found["hilrig.config"]["step_ns"] == "20000000"
     assert found["hilrig.summary"]["ended"] == "ended"
-    assert found["hilrig.summary"]["reason"] == "the controller left"
+    assert found["hilrig.summary"]["reason"] == "the controller closed the connection"
     assert found["hilrig.summary"]["lost_transport"] == found["hilrig.summary"]["lost_recorder"] == "0"
     assert found["hilrig.summary"]["messages"] == "204"
     with path.open("rb") as stream:

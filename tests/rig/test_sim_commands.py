@@ -62,7 +62,7 @@ def test_figures_prints_expected_and_computed_values(tmp_path: Path) -> None:
     ("arguments", "code", "message"),
     [
         (("verify", "nothing.mcap"), 2, "no such file"),
-        (("figures", "--step-ms", "7"), 2, "does not divide a second"),
+        (("figures", "--step-ms", "7"), 2, "a second must be a multiple of the step"),
         (("figures", "--out", "/proc/figures"), 3, "can't be written"),
     ],
 )

@@ -34,6 +34,10 @@ class StallMonitor:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch)
 
+    def reset(self) -> None:
+        """Measure from now on."""
+        self.worst_s = 0.0
+
     def _watch(self) -> None:
         before_s = time.monotonic()
         while not self._ended.wait(self.PERIOD_S):

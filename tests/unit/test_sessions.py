@@ -163,7 +163,7 @@ def test_file_closes_when_all_streams_passed_the_end() -> None:
     after = bench.sim.state("rig1", end.publish_ns + 15 * MS)
     bench.accept(bench.sim.batch())
     bench.wait(200 * MS)
-    assert (bench.file.end, bench.file.reason) == ("ended", "the controller left")
+    assert (bench.file.end, bench.file.reason) == ("ended", "the controller closed the connection")
     assert payloads(late, after) == bench.file.payloads[-2:]
 
 
