@@ -226,7 +226,19 @@ class EdgeService:
                     await asyncio.sleep(0)
                 endpoint.on_tick(monotonic_ns())
             service.beat(monotonic_ns())
-            deadline_ns += (missed + 1) * TICK_NS
+            deadline_ns = self._middle_of_step(deadline_ns + (missed + 1) * TICK_NS)
+
+    def _middle_of_step(self, deadline_ns: int) -> int:
+        """Return the time nearest to a deadline that is half a step after a state arrived, ns, monotonic clock.
+
+        A tick of many rigs takes milliseconds: it must not coincide with the arrival of states or the deadline of
+        commands. Without states the deadline stays.
+        """
+        step_ns = self._service.lab.sim.step_ns
+        state = next((state for rig in self._endpoints if (state := self._states.get(rig)) is not None), None)
+        if state is None or step_ns > TICK_NS:
+            return deadline_ns
+        return deadline_ns + (state.arrived_ns - deadline_ns) % step_ns - step_ns // 2
 
     def _close(self) -> None:
         self._closing.close()
