@@ -71,3 +71,12 @@ def test_module_names_are_unique_within_a_package() -> None:
         for name, package in PACKAGES.items()
     }
     assert {name: stems for name, stems in found.items() if stems} == {}
+
+
+def test_test_names_have_at_most_sixty_characters() -> None:
+    names = {
+        name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(r"^ *(?:async )?def (test_\w+)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    }
+    assert {name for name in names if len(name) > 60} == set()

@@ -117,7 +117,7 @@ def test_malformed_batches_are_counted_and_ignored() -> None:
     assert (queue.malformed, queue.get(0)) == (2, None)
 
 
-def test_batch_whose_end_is_overwritten_in_transport_is_not_recorded() -> None:
+def test_batch_with_an_overwritten_end_is_not_recorded() -> None:
     source = FakeSource()
     for _ in range(3):
         source.state("rig1", 1)

@@ -77,7 +77,7 @@ def test_a_flush_is_due_once_a_period() -> None:
     assert [len(batch.keys) for batch in out.batches] == [1, 3]
 
 
-def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_none() -> None:
+def test_open_sessions_are_sent_at_once_and_repeated() -> None:
     out = Collecting()
     log = RecordingStream(out, "edge/1", incarnation=7)
     log.set_sessions([OpenSession(rig="rig1", session="s1")])
@@ -90,7 +90,7 @@ def test_the_open_sessions_are_stated_at_once_and_repeated_also_when_there_are_n
     assert all(batch.complete_sessions for batch in out.batches)
 
 
-def test_a_loop_of_the_same_period_that_jitters_sends_a_batch_each_turn() -> None:
+def test_jittering_loop_sends_a_batch_each_turn() -> None:
     out = Collecting()
     log = RecordingStream(out, "sim/1", incarnation=7)
     jitter = random.Random(1)
