@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from hilrig_modbus_edge.protocol.exceptions import ModbusError
+from hilrig_modbus_edge.device.exceptions import ModbusError
 from hilrig_modbus_edge.registers.map import (
     ECHO_ADDRESS,
     MAGNET_COIL,
@@ -359,7 +359,7 @@ def test_write_of_read_only_client_gets_01(bench: Bench) -> None:
 def test_watchdog_zeroes_torque_when_writes_stop(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1000, 1000, 1000, 1000)
-    assert bench.deadlines == [bench.clock.monotonic_ns() + 1000 * MS]
+    assert [timer.at_ns for timer in bench.timers] == [bench.clock.monotonic_ns() + 1000 * MS]
     bench.wait(999)
     assert not bench.commands[-1].safe
     bench.wait(1)
@@ -437,6 +437,14 @@ def test_new_session_restores_timeout_and_echo_defaults(bench: Bench) -> None:
     bench.write(other, 0, 1)
     assert bench.read(other, ECHO_ADDRESS, 2) == [0, 1000]
     assert [command.echo for command in bench.commands if command.controller] == [4711, 0]
+
+
+def test_echo_write_of_new_session_restores_default_timeout(bench: Bench) -> None:
+    one, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(one, ECHO_ADDRESS, 4711, 150)
+    bench.device.disconnect(one, "done")
+    bench.write(other, ECHO_ADDRESS, 4712)
+    assert bench.read(other, ECHO_ADDRESS, 2) == [4712, 1000]
 
 
 # -- sessions

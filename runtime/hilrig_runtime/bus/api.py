@@ -8,7 +8,6 @@ a slow callback delays every other topic of the process.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final, Self
 
 from hilrig_schemas.topics import Traffic
@@ -25,18 +24,16 @@ OnLiveliness = Callable[[str, bool], None]
 
 
 class Handle(ABC):
-    """A declaration on the bus that can be withdrawn."""
+    """A resource that is closed, as a context manager too: a declaration on the bus, a connection, a service."""
 
     @abstractmethod
     def close(self) -> None:
-        """Withdraw the declaration; a second call does nothing."""
+        """Close the resource, for example withdraw the declaration; a second call does nothing."""
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -8,8 +8,8 @@ publishers and caches of `messaging`.
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from types import MappingProxyType, TracebackType
-from typing import Final, Self, TypeVar
+from types import MappingProxyType
+from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
@@ -17,7 +17,7 @@ from hilrig_runtime.bus.api import Bus, Handle, Publisher
 from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
-from hilrig_runtime.messaging.publisher import CommandSink, RigPublisher
+from hilrig_runtime.messaging.publisher import RigPublisher
 from hilrig_runtime.messaging.recording_stream import RecordingStream, batch_cache_depth
 from hilrig_runtime.messaging.rig_batch import BatchPublisher
 from hilrig_runtime.process.discovery import PeerRegistry
@@ -31,8 +31,8 @@ EXTRA_QUEUED_BATCHES: Final = 64
 """Capacity of the queue of received batches beyond one batch per rig."""
 
 
-class Service:
-    """The resources of a running service; a context manager."""
+class Service(Handle):
+    """The resources of a running service."""
 
     def __init__(
         self,
@@ -105,17 +105,11 @@ class Service:
             token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 
-    def rig_publisher(
-        self,
-        topic: RigTopic[MessageT],
-        rig: str,
-        *,
-        control_path: CommandSink | None = None,
-    ) -> RigPublisher[MessageT]:
-        """Create a publisher of a rig's topic; `control_path` gets each encoded message before it is published."""
+    def rig_publisher(self, topic: RigTopic[MessageT], rig: str) -> RigPublisher[MessageT]:
+        """Create a publisher of a rig's topic."""
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters, control_path)
+        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters)
 
     def latest_value_cache(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})
@@ -178,14 +172,6 @@ class Service:
 
     def _rigs_reached(self) -> list[tuple[str, str]]:
         return [(rig.name, self.addresses(rig.name)) for rig in self.rigs]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Flush the recording stream, then close everything in reverse order; a second call does nothing."""

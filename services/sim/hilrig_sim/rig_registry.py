@@ -8,8 +8,6 @@ changes are active until the simulation stops; the next one starts with the rigs
 import json
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from types import TracebackType
-from typing import Self
 
 from google.protobuf.message import DecodeError
 
@@ -39,8 +37,8 @@ class StaticReply:
         return self.payload
 
 
-class RigRegistry:
-    """Registry of the simulated rigs; a context manager."""
+class RigRegistry(Handle):
+    """Registry of the simulated rigs."""
 
     def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
         self._service = service
@@ -54,12 +52,8 @@ class RigRegistry:
         self._control = service.bus.declare_queryable(key, self._handle_control)
         service.counters.rigs = len(service.rigs)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Stop serving configurations and control requests."""
         self._control.close()
         for handle in self._served.values():
             handle.close()
