@@ -25,6 +25,7 @@ from hilrig_cli.local.local_lab import running_lab
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import TRANSPORT
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
@@ -112,7 +113,7 @@ def _evaluate(
         overruns=overruns,
         missed_steps=missed,
         tick_lateness_ms=report.jitter_ms.tick_lateness,
-        bus_ms=report.stages_ms["transport"],
+        bus_ms=report.stages_ms[TRANSPORT.key],
         modbus_ms=Statistics.of(round_trips_ns),
         loop_ms=report.loop_ms,
         stolen=stolen,
