@@ -72,7 +72,8 @@ def measure_timing(
     set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
-        ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}
+        default = LabConfig()
+        ports = {"modbus_port": free_ports(default.edge.first_port), "bus_port": free_ports(default.bus.first_port, 3)}
         config.write_text(LAB_TEMPLATE.format(step_ms=step_ms, folder=folder, **ports))
         lab = load_lab(config)
         processors = os.cpu_count() or 1
