@@ -44,7 +44,7 @@ def delay_trace(run: Run) -> TraceDelay:
             f"{run.path}: unusable as a delay trace: {report.samples} loop latency samples, "
             f"at least {MIN_SAMPLES} are required"
         )
-    delays_ms = (sum(report.table[stage.key] for stage in TRACE_STAGES)) / 1e6
+    delays_ms = np.sum([report.table[stage.key] for stage in TRACE_STAGES], axis=0) / 1e6
     if (delays_ms < 0).any():
         raise InputError(f"{run.path}: unusable as a delay trace: inconsistent time stamps, a delay is negative")
     longest = int(np.argmax(delays_ms))
