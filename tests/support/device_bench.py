@@ -3,7 +3,7 @@
 import random
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hilrig_modbus_edge.device.client import Client
@@ -11,6 +11,8 @@ from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.registers.map import RegisterTable
+from hilrig_runtime.config.impairment import ImpairmentConfig
+from hilrig_runtime.config.lab import EdgeConfig
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -43,7 +45,7 @@ class Bench:
         self.timers: list[Timer] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
-        values = DeviceSettings(**settings)
+        values = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
         self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
 
