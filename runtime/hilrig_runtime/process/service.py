@@ -105,6 +105,11 @@ class Service:
             token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
 
+    def set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
+        """Replace the rigs of this service, because one was added or removed."""
+        self.rigs = rigs
+        self.counters.rigs = len(rigs)
+
     def rig_publisher(
         self,
         topic: RigTopic[MessageT],

@@ -1,5 +1,7 @@
 """Simulation service: a tick at each absolute deadline, and queued calls between two ticks."""
 
+from contextlib import closing
+
 import numpy as np
 
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
@@ -22,7 +24,7 @@ def run(service: Service) -> None:
     simulation = Simulation(service, parameters)
     step_ns = lab.sim.step_ns
     turns = OwnerThreadExecutor()
-    with RigRegistry(service, simulation, turns):
+    with closing(RigRegistry(service, simulation, turns)):
         rate = Rate(step_ns, service.clock)
         freeze_gc()
         service.ready()
