@@ -19,7 +19,7 @@ from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.control import handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.timing.rate import Tick
+from hilrig_runtime.timing.rate import Rate
 from hilrig_runtime.timing.realtime import freeze_gc
 from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, ResetRig, topics
 
@@ -215,20 +215,17 @@ class EdgeService:
             await asyncio.sleep(TICK_NS * 1e-9)
 
     async def _run_ticks(self) -> None:
-        service, counters = self._service, self._service.counters
+        service, rate = self._service, Rate(TICK_NS, self._service.clock)
         monotonic_ns = service.clock.monotonic_ns
-        deadline_ns = monotonic_ns() + TICK_NS
         while not service.stopping.is_set():
-            await asyncio.sleep((deadline_ns - monotonic_ns()) * 1e-9)
-            now_ns = monotonic_ns()
-            missed = max(0, (now_ns - deadline_ns) // TICK_NS)
-            counters.count_tick(Tick(deadline_ns, max(0, now_ns - deadline_ns), missed), TICK_NS)
+            await asyncio.sleep(rate.remaining_s)
+            service.counters.count_tick(rate.tick(monotonic_ns()), TICK_NS)
             for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)
                 endpoint.on_tick(monotonic_ns())
             service.beat(monotonic_ns())
-            deadline_ns = self._middle_of_step(deadline_ns + (missed + 1) * TICK_NS)
+            rate.next_ns = self._middle_of_step(rate.next_ns)
 
     def _middle_of_step(self, deadline_ns: int) -> int:
         """Return the time nearest to a deadline that is half a step after a state arrived, ns, monotonic clock.

@@ -26,6 +26,7 @@ from hilrig_runtime.messaging.recording_stream import FLUSH_PERIOD_NS
 from hilrig_runtime.process.control import handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
+from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import ControlReply, Event, OpenSession, RigConfig, RigReport, StartSession, StopSession
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
@@ -80,6 +81,7 @@ class Recorder:
         self._service = service
         self._clock = service.clock
         lab, config = service.lab, service.lab.recorder
+        self._ticks = Rate(TICK_PERIOD_NS, service.clock)
         self._executor = OwnerThreadExecutor()
         """Processes control requests and the results of other threads on the recorder's thread."""
         self._config_due_ns: dict[str, int] = {}
@@ -144,31 +146,29 @@ class Recorder:
     def run(self) -> None:
         """Record until the service is stopped, then record the messages published before."""
         service, clock = self._service, self._clock
-        due_ns = clock.monotonic_ns()
         service.recording_stream.set_sessions(self._manual_sessions.sessions)
         service.ready()
         while not service.stopping.is_set():
-            due_ns = self._run_once(due_ns)
+            self._run_once()
         # Receive the last batches for a short time, then write the messages in the queue.
         deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_TIMEOUT_NS
         while self._sessions.recordings and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._run_once(due_ns)
+            self._run_once()
         self._stream.close()
         deadline_ns = clock.monotonic_ns() + _QUEUE_DRAIN_TIMEOUT_NS
         while self._queue.depth > 0 and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._run_once(due_ns)
+            self._run_once()
 
-    def _run_once(self, due_ns: int) -> int:
+    def _run_once(self) -> None:
         now_ns = self._clock.monotonic_ns()
-        if now_ns >= due_ns:
+        if now_ns >= self._ticks.next_ns:
             self._tick(now_ns)
             # The next tick is due one period after this one ends, so that a long tick does not delay received batches.
+            self._ticks.restart()
             now_ns = self._clock.monotonic_ns()
-            due_ns = now_ns + TICK_PERIOD_NS
-        received = self._queue.get(max(0.0, (due_ns - now_ns) * 1e-9))
+        received = self._queue.get(self._ticks.remaining_s)
         if received is not None:
             self._sessions.accept(received, now_ns)
-        return due_ns
 
     def _tick(self, now_ns: int) -> None:
         self._sessions.tick(now_ns, self._clock.wall_ns())
