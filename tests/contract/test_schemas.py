@@ -56,6 +56,12 @@ def test_topic_names_and_channels_are_unique() -> None:
     assert set(channels) == {"/state", "/command", "/event", "/traffic"}
 
 
+def test_every_topic_is_in_the_registry() -> None:
+    assert {topic.name for topic in vars(topics).values() if isinstance(topic, topics.Topic)} == {
+        topic.name for topic in topics.all_topics()
+    }
+
+
 @pytest.mark.parametrize("topic", topics.RIG_TOPICS, ids=lambda topic: topic.name)
 def test_rig_key_can_be_parsed(topic: RigTopic) -> None:  # type: ignore[type-arg]
     assert topics.parse_rig_key(topic.key("lab", "rig1")) == RigKey("lab", "rig1", topic)

@@ -3,10 +3,11 @@
 from importlib.metadata import version
 
 from hilrig_runtime.bus.api import Bus
+from hilrig_runtime.process.control import release_series
 from hilrig_schemas import ControlRequest, Event, RemoveRig, ServiceInfo, topics
 
 OWN = version("hilrig")
-SERIES = ".".join(OWN.split(".")[:2])
+SERIES = ".".join(release_series(OWN))
 
 
 def older_request(kind: Event.Kind, text: str = "") -> bytes:
@@ -37,17 +38,31 @@ REFUSED = [
     ),
     (newer_request("0.0.9"), wrong_version("0.0.9")),
     (newer_request("0.91.0"), wrong_version("0.91.0")),
-    (newer_request("9.2.0"), wrong_version("9.2.0")),
+    (newer_request("99.2.0"), wrong_version("99.2.0")),
     (unknown_request(f"{SERIES}.99"), wrong_version(f"{SERIES}.99")),
     (b"", wrong_version("0.1")),
     (b"\xff\x00rubbish", "not a valid ControlRequest: 9 bytes can't be decoded"),
 ]
 """Payloads and the errors of the replies to them."""
 
+EXECUTED = {
+    "sim": ("add_rig", "remove_rig"),
+    "edge": ("add_rig", "remove_rig", "reset_rig"),
+    "recorder": ("start_session", "stop_session"),
+}
+"""Requests that each service executes."""
+KINDS = tuple(field.name for field in ControlRequest.DESCRIPTOR.oneofs_by_name["request"].fields)
+
 
 def assert_refuses_foreign_requests(bus: Bus, lab: str, info: ServiceInfo) -> None:
-    """Query a service's control key with every payload of `REFUSED`."""
+    """Query a service's control key with every payload of `REFUSED`, and the requests that other services execute."""
     key = topics.CONTROL.key(lab, info.service, info.instance)
     for payload, error in REFUSED:
         (reply,) = bus.query(key, payload)
         assert (reply.error, reply.payload) == (error, b""), payload
+    executed = EXECUTED[info.service]
+    for kind in set(KINDS).difference(executed):
+        request = ControlRequest(software_version=OWN)
+        getattr(request, kind).SetInParent()
+        (reply,) = bus.query(key, request.SerializeToString())
+        assert reply.error == f"this service does not execute {kind}; it executes {', '.join(executed)}"

@@ -6,9 +6,9 @@ from hilrig_cli.client import send_control_request
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.control import handle_control_request
+from hilrig_runtime.process.control import handle_control_request, release_series
 from hilrig_schemas import ControlReply, ControlRequest, ResetRig, ServiceInfo, StartSession, topics
-from support.foreign_requests import OWN, REFUSED, SERIES
+from support.foreign_requests import EXECUTED, KINDS, OWN, REFUSED, SERIES
 
 LAB = LabConfig()
 
@@ -69,6 +69,11 @@ def test_command_does_not_ask_a_service_of_another_series(older: str) -> None:
     assert service.rigs == []
 
 
+def test_release_series_is_the_part_that_marks_incompatibility() -> None:
+    assert release_series("0.2.0.dev0") == release_series("0.2.7") == ("0", "2")
+    assert release_series("1.2.0") == release_series("1.9.0") == ("1",)
+
+
 def test_request_of_another_service_is_refused() -> None:
     with pytest.raises(OperationError) as refusal:
         FakeService().send(ControlRequest(start_session=StartSession(rig="rig1")))
@@ -82,3 +87,7 @@ def test_only_queries_have_a_request_type(topic: topics.Topic) -> None:  # type:
     without_payload = (topics.CONFIG, topics.SERVICE_INFO)
     is_query = topic.traffic is topics.Traffic.QUERY
     assert (topic.request is not None) == (is_query and topic not in without_payload)
+
+
+def test_every_request_is_executed_by_a_service() -> None:
+    assert {kind for kinds in EXECUTED.values() for kind in kinds} == set(KINDS)

@@ -47,13 +47,19 @@ def decode_request(message: type[MessageT], payload: bytes) -> MessageT:
 
 
 def check_versions(services: str, command: str) -> None:
-    """Check that two versions of hilrig exchange control requests: major and minor version are equal.
+    """Check that two versions of hilrig are of the same release series, and so exchange control requests.
 
     Raises:
         OperationError: they differ; contains both. An empty version of the command is 0.1's, which sends none.
     """
-    if services.split(".")[:2] != command.split(".")[:2]:
+    if release_series(services) != release_series(command):
         raise _wrong_version(services, command)
+
+
+def release_series(software_version: str) -> tuple[str, ...]:
+    """Return the numbers of a version that are equal in compatible versions: the first; before 1.0 the second too."""
+    numbers = software_version.split(".")
+    return tuple(numbers[:2] if numbers[0] == "0" else numbers[:1])
 
 
 def _wrong_version(services: str, command: str) -> OperationError:
