@@ -43,7 +43,7 @@ class Handle(ABC):
 class Publisher(Handle):
     """Publishes on one key."""
 
-    def __init__(self, put: Callable[[bytes], object], declaration: Handle | None = None) -> None:
+    def __init__(self, put: Callable[[bytes], None], declaration: Handle | None = None) -> None:
         self.put = put
         """Publishes one message; succeeds without a subscriber, because subscribers check age and sequence. It is the
         transport's function itself, which saves a Python call on the control path."""

@@ -11,13 +11,12 @@ from hilrig_schemas import ControlReply, ControlRequest
 
 MessageT = TypeVar("MessageT", bound=Message)
 
+Handlers = Mapping[str, Callable[[Any], ControlReply]]
+"""Handlers of control requests, by the field of the request, as `add_rig`; they get that field."""
 
-def handle_control_request(handlers: Mapping[str, Callable[[Any], ControlReply]], payload: bytes) -> bytes:
+
+def handle_control_request(handlers: Handlers, payload: bytes) -> bytes:
     """Execute a `ControlRequest` with the handler of its kind; return a `ControlReply`.
-
-    Args:
-        handlers: by the field of the request, as `add_rig`; they get that field.
-        payload: the encoded request.
 
     Raises:
         HilrigError: the request is of another version, unknown or invalid, or cannot be executed.

@@ -16,7 +16,7 @@ from hilrig_modbus_edge.rig_endpoint import RigEndpoint
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop
 from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.control import handle_control_request
+from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
@@ -96,7 +96,11 @@ class EdgeService:
             for endpoint in self._endpoints.values():
                 endpoint.device.start()
                 self._declare_queries(endpoint)
-            handlers = {"add_rig": self._add_rig, "remove_rig": self._remove_rig, "reset_rig": self._reset_rig}
+            handlers: Handlers = {
+                "add_rig": self._add_rig,
+                "remove_rig": self._remove_rig,
+                "reset_rig": self._reset_rig,
+            }
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
             handler = partial(handle_control_request, handlers)
             self._closing.enter_context(self._executor.serve(service.bus, key, handler))

@@ -23,7 +23,7 @@ from hilrig_recorder.storage.store import FileStore
 from hilrig_recorder.storage.sync_worker import SyncWorker
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.messaging.recording_stream import FLUSH_PERIOD_NS
-from hilrig_runtime.process.control import handle_control_request
+from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
@@ -116,7 +116,7 @@ class Recorder:
         self._stream = service.bus.subscribe_recording(
             LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batch_cache_depth
         )
-        handlers = {"start_session": self._start_session, "stop_session": self._stop_session}
+        handlers: Handlers = {"start_session": self._start_session, "stop_session": self._stop_session}
         self._control = self._executor.serve(
             service.bus,
             CONTROL.key(lab.name, service.name, service.instance),

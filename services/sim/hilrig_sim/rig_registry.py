@@ -14,7 +14,7 @@ from importlib.metadata import version
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import read_rig
 from hilrig_runtime.errors import OperationError
-from hilrig_runtime.process.control import handle_control_request
+from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, RigConfig, topics
@@ -52,7 +52,7 @@ class RigRegistry:
             self._serve(rig.name, parameters)
             self._emit_start(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
-        handlers = {"add_rig": self._add_rig, "remove_rig": self._remove_rig}
+        handlers: Handlers = {"add_rig": self._add_rig, "remove_rig": self._remove_rig}
         self._control = service.bus.declare_queryable(key, partial(handle_control_request, handlers))
         service.counters.rigs = len(service.rigs)
 
