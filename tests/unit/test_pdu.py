@@ -21,7 +21,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from hilrig_modbus_edge.protocol import pdu
+from hilrig_modbus_edge.server import pdu
 from support.device_bench import Bench
 
 WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=4)

@@ -32,7 +32,7 @@ EXTRA_QUEUED_BATCHES: Final = 64
 
 
 class Service(Handle):
-    """The resources of a running service."""
+    """The resources of a running service; a context manager."""
 
     def __init__(
         self,
@@ -104,6 +104,11 @@ class Service(Handle):
             self.claim()
             token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
+
+    def set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
+        """Replace the rigs of this service, because one was added or removed."""
+        self.rigs = rigs
+        self.counters.rigs = len(rigs)
 
     def rig_publisher(self, topic: RigTopic[MessageT], rig: str) -> RigPublisher[MessageT]:
         """Create a publisher of a rig's topic."""

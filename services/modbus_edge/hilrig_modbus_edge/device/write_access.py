@@ -14,12 +14,12 @@ from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter
-from hilrig_modbus_edge.device.exceptions import ModbusError
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
+from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_runtime.process.session_id import session_id
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
