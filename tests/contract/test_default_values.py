@@ -13,8 +13,19 @@ from hilrig_cli.commands.jitter import jitter
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.server.tls import HANDSHAKE_TIMEOUT_S
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentSetting
-from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig, TlsConfig
+from hilrig_runtime.config.lab import (
+    ArmConfig,
+    EdgeConfig,
+    LabConfig,
+    RecorderConfig,
+    RigSettings,
+    SimConfig,
+    TlsConfig,
+)
+from hilrig_runtime.config.scene import MagnetConfig, PartConfig, SceneConfig, TableConfig, TrayConfig
+from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.config.template import lab_template
 from hilrig_sim.arm.integrators import TABLEAUS
 from hilrig_sim.arm.model import RigParameters
@@ -205,3 +216,15 @@ def test_example_controller_knows_the_default_arm_and_scene() -> None:
         )
         assert task.table == rig.scene.table_height
     assert example.Task((), ()).table == rig.scene.table_height
+
+
+def test_every_key_of_the_lab_file_is_used() -> None:
+    sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
+    text = "".join(path.read_text(encoding="utf-8") for path in sources if not path.stem.endswith("_pb2"))
+    models = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig, BusTlsConfig, RigSettings]
+    assert [
+        f"{model.__name__}.{key}"
+        for model in [*models, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig, TaskConfig]
+        for key in model.model_fields
+        if not re.search(rf"\.{key}\b", text)
+    ] == []

@@ -28,7 +28,7 @@ def registered() -> Iterator[tuple[str, str, str | None]]:
         yield callback.__module__, str(group.name), group.rich_help_panel
 
 
-def test_every_command_module_is_registered_in_a_panel() -> None:
+def test_every_module_is_registered() -> None:
     assert {module.rpartition(".")[2] for module, _, _ in registered()} == {path.stem for path in MODULES}
     assert {panel for _, _, panel in registered()} == PANELS
 
