@@ -8,7 +8,7 @@ import pytest
 from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import Recording
 from hilrig_recorder.ingest.sessions import BLOCK_PERIOD_NS, DRAIN_MAX_NS, OWNER_TIMEOUT_NS, SessionTracker
-from hilrig_recorder.mcap_format.channels import parse_message_header
+from hilrig_recorder.mcap_format.records import decode_message_head
 from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
@@ -41,7 +41,7 @@ class FakeFile:
     @property
     def log_times(self) -> list[int]:
         self.flush()
-        return [parse_message_header(record).log_time for record in self.records]
+        return [decode_message_head(record).log_time for record in self.records]
 
 
 @dataclass

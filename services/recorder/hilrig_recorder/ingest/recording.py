@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL, parse_message_header
+from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL
+from hilrig_recorder.mcap_format.records import decode_message_head
 
 SECOND_NS: Final = 1_000_000_000
 POSTROLL_NS: Final = SECOND_NS // 2
@@ -76,7 +77,7 @@ class Recording:
             self.sink.write(records)
 
     def _accepts(self, record: bytes, not_before_ns: int) -> bool:
-        header = parse_message_header(record)
+        header = decode_message_head(record)
         if header.log_time < not_before_ns:
             return False
         if self.end_wall_ns is not None and header.publish_time > self.end_wall_ns + POSTROLL_NS:

@@ -22,7 +22,8 @@ from hilrig_recorder.ingest.sources import (
     PublisherState,
     PublisherTracker,
 )
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL, encode_message
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
+from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_schemas import Event, LogBatch
 from hilrig_schemas.topics import is_name, parse_rig_key
