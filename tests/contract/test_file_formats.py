@@ -15,7 +15,7 @@ SOURCES = [
     if not path.stem.endswith("_pb2")
 ]
 SUFFIX = re.compile(r"(?<!hilrig)\.(mcap|part|recovering|recovered|damaged)(?![a-z_])")
-READERS_OF_THE_LIBRARY = {"mcap.data_stream", "mcap.stream_reader", "mcap.writer"}
+LIBRARY = {"mcap.data_stream", "mcap.stream_reader", "mcap.writer"}
 
 
 def literals(source: str) -> list[tuple[int, str]]:
@@ -59,12 +59,12 @@ def test_suffixes_of_recordings_are_in_one_module() -> None:
 
 
 def test_layout_of_mcap_records_is_in_one_module() -> None:
-    found = [
-        str(path.relative_to(ROOT))
+    found = {
+        str(path.relative_to(ROOT)): modules
         for path in SOURCES
         if path != FORMAT / "records.py"
-        and (imports(path.read_text()) & READERS_OF_THE_LIBRARY or (path.parent == FORMAT and "struct" in imports(path.read_text())))
-    ]
+        and (modules := imports(path.read_text()) & (LIBRARY | ({"struct"} if path.parent == FORMAT else set())))
+    }
     assert not found, "use mcap_format/records.py and mcap_format/reader.py"
 
 
@@ -72,6 +72,7 @@ def test_name_parts_are_documented() -> None:
     from hilrig_recorder.mcap_format.file_names import NAME_PARTS, NAME_TEMPLATE
 
     page = (ROOT / "docs/recordings.md").read_text()
-    rows = dict(re.findall(r"^\| `([^|]*)` \| (.*) \|$", page.partition("## File names")[2].partition("\n## ")[0], re.M))
+    section = page.partition("## File names")[2].partition("\n## ")[0]
+    rows = dict(re.findall(r"^\| `([^|]*)` \| (.*) \|$", section, re.MULTILINE))
     assert rows == NAME_PARTS
     assert f"`{NAME_TEMPLATE}`" in page

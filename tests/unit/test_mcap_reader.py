@@ -9,13 +9,15 @@ import lz4.frame
 import pytest
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
+from mcap.records import Attachment
+from mcap.records import ChunkIndex as LibraryChunkIndex
 from mcap.stream_reader import StreamReader
 
 from hilrig_recorder.mcap_format.reader import buffer_reader, chunk_records, decompress
 from hilrig_recorder.mcap_format.records import (
     MAX_CHUNK_BYTES,
     Chunk,
+    ChunkIndex,
     DamagedError,
     Message,
     decode_chunk,
@@ -105,8 +107,9 @@ def test_malformed_summary_is_refused(
     # The list of recordings reads neither chunk indexes nor schemas.
     assert "damaged (" in entry.error or (not has_checksum and "CHUNK" in change.__name__.upper())
     # All messages are before the damage.
-    recovered = recover(path, tmp_path / "new.mcap")
-    assert (recovered.damaged_bytes, recovered.messages) == (0, sum(open_run(tmp_path / "new.mcap").file.counts.values()))
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert recovery.damaged_bytes == 0
+    assert recovery.messages == sum(open_run(tmp_path / "new.mcap").file.counts.values()) > 0
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
@@ -135,9 +138,9 @@ def test_record_must_end_inside_its_chunk(length: int) -> None:
     found = []
     with pytest.raises(DamagedError, match=f"of {length} bytes"):
         found.extend(chunk_records(first + bytes(second)))
-    assert found == []
+    assert [item.sequence for item in found if isinstance(item, Message)] == [1]
     for at in (1, 8, 9, 30):
-        with pytest.raises(DamagedError, match=r"truncated|bytes in a chunk"):
+        with pytest.raises(DamagedError, match=r"truncated|bytes in a chunk|of 3 bytes"):
             list(chunk_records(first + bytes(second[:at])))
 
 
@@ -149,8 +152,8 @@ def test_messages_of_wanted_channels_only() -> None:
 
 def test_attachment_with_wrong_checksum_is_recovered_not_refused(tmp_path: Path, good: bytes) -> None:
     path, data = tmp_path / "run.mcap", bytearray(good)
-    offset = next(at for at, item in scan(good) if type(item).__name__ == "Attachment")
-    data[offset + 60] ^= 1
+    offset = next(at for at, item in scan(good) if isinstance(item, Attachment) and len(item.data) > 1000)
+    data[offset + 1000] ^= 1
     path.write_bytes(data)
     assert open_run(path).file.counts["state"] > 0
     assert any("attachment with checksum" in reason for reason in recover(path, tmp_path / "new.mcap").reasons)
@@ -168,12 +171,8 @@ def test_indexes_are_those_of_the_mcap_library(tmp_path: Path) -> None:
     data = path.read_bytes()
     reader = buffer_reader(data)
     summary = reader.summary()
-    expected = [record for record in records if isinstance(record, ChunkIndex)]
-    found = [
-        reader.chunk_index(record, summary)
-        for record in reader.summary_records(summary)
-        if record.opcode == Opcode.CHUNK_INDEX
-    ]
+    expected = [record for record in records if isinstance(record, LibraryChunkIndex)]
+    found = [item for item in reader.summary_items(summary) if isinstance(item, ChunkIndex)]
     assert [tuple(index) for index in found] == [
         (
             index.message_start_time,

@@ -29,9 +29,6 @@ class FakeFile:
     end: str = ""
     reason: str = ""
 
-    def write(self, records: Sequence[bytes]) -> None:
-        self.records += records
-
     @property
     def payloads(self) -> list[bytes]:
         """Payloads of the written and the pending messages."""
@@ -58,16 +55,22 @@ class FakeStore:
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
     horizon_ns: dict[int, int] = field(default_factory=dict)
 
-    def open(self, recording: Recording) -> FakeFile | None:
+    def open(self, recording: Recording) -> bool:
         if not self.accepts:
-            return None
+            return False
         recording.seen, recording.last, recording.horizon_ns = self.seen, dict(self.last), self.horizon_ns
         self.files.append(FakeFile(recording, self.flush))
-        return self.files[-1]
+        return True
+
+    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
+        self._file(recording).records += records
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
-        file = next(file for file in self.files if file.recording is recording)
+        file = self._file(recording)
         file.end, file.reason = end, reason
+
+    def _file(self, recording: Recording) -> FakeFile:
+        return next(file for file in self.files if file.recording is recording)
 
     def record_loss(self, _recording: Recording, _source: str, key: str, transport: int, recorder: int) -> None:
         self.losses.append((key, transport, recorder))

@@ -10,7 +10,7 @@ from typing import IO, NamedTuple, overload
 import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, McapRecord, MetadataIndex, Schema
+from mcap.records import AttachmentIndex, Channel, McapRecord, MetadataIndex, Schema, Statistics
 
 from hilrig_recorder.mcap_format.records import (
     CHUNK_HEAD_BYTES,
@@ -172,16 +172,45 @@ class RecordReader:
         section = RecordReader(lambda offset, size: content[offset - start : offset - start + size], self.size)
         return section.heads(start, end)
 
-    def chunk_index(self, record: Record, summary: Summary) -> ChunkIndex:
-        """The chunk index in a record of the summary section; the chunk is before this section."""
-        index = decode_chunk_index(record.content, record.offset)
-        if not len(MAGIC) <= index.offset <= summary.start - index.length:
-            raise DamagedError(
-                f"chunk index record: {index.length} bytes at {index.offset}, expected between {len(MAGIC)} and "
-                f"{summary.start}",
-                record.offset,
-            )
-        return index
+    def summary_items(self, summary: Summary) -> Iterator[McapRecord | ChunkIndex]:
+        """The decoded records of the summary section; each chunk is before this section, and has an index.
+
+        Raises:
+            DamagedError: as `summary_records`; or an index is wrong or missing.
+        """
+        found = 0
+        stated = None
+        for offset, opcode, content, _ in self.summary_records(summary):
+            if opcode == Opcode.CHUNK_INDEX:
+                found += 1
+                index = decode_chunk_index(content, offset)
+                if not len(MAGIC) <= index.offset <= summary.start - index.length:
+                    raise DamagedError(
+                        f"chunk index record: {index.length} bytes at {index.offset}, expected between {len(MAGIC)} "
+                        f"and {summary.start}",
+                        offset,
+                    )
+                yield index
+                continue
+            item = decode_record(opcode, content, offset)
+            if isinstance(item, Statistics):
+                stated = item.chunk_count
+            if item is not None:
+                yield item
+        if stated not in (None, found):
+            raise DamagedError(f"{found} chunk indexes, expected {stated}", summary.start)
+
+    def check_indexes(self) -> None:
+        """Check that every index in the summary section points to a record of its kind.
+
+        Raises:
+            DamagedError: one does not.
+        """
+        for item in self.summary_items(self.summary()):
+            if isinstance(item, ChunkIndex):
+                self.indexed(Opcode.CHUNK, item.offset, item.length)
+            elif isinstance(item, MetadataIndex | AttachmentIndex):
+                self.indexed_record(item)
 
     def chunk_infos(self, begin: int, end: int) -> Iterator[ChunkInfo]:
         """The infos of the chunks that hilrig wrote from `begin` to `end`, so that a writer keeps no list of them.

@@ -13,8 +13,9 @@ from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, RECOVERING_SUFFIX
+from hilrig_recorder.mcap_format.file_names import recovering_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, map_file
+from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.records import MAGIC, Chunk, DamagedError, Message, encode_message
 from hilrig_recorder.mcap_format.scan import (
     MAX_BEGIN_BYTES,
@@ -116,6 +117,8 @@ def recover(source: Path, path: Path, *, should_continue: Callable[[], bool] = l
         InputError: `source` can't be read, is not an MCAP file, or is being written.
         OperationError: the new file can't be written, or `should_continue` returned False.
     """
+    if source.is_dir():
+        raise InputError(f"{source}: is a folder; give the MCAP files in it")
     with _locked(source):
         return _recover(source, path, should_continue)
 
@@ -128,7 +131,7 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
         return recovery
     if path.exists():
         raise OperationError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
-    temporary_path = path.with_name(path.name + RECOVERING_SUFFIX)
+    temporary_path = recovering_path(path)
     try:
         temporary_path.unlink(missing_ok=True)
         _Copier(view, recovery, finished).write(path, temporary_path, should_continue)
@@ -140,15 +143,16 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
 
 def _is_intact(view: memoryview, source: Path, should_continue: Callable[[], bool]) -> bool:
     """Whether a finished file has no damage: a defective disk may damage chunks and leave the end valid."""
-    for _, item in scan(view):
-        if isinstance(item, Damage):
-            return False
-        if isinstance(item, Chunk):
-            _check_interrupt(should_continue, source)
-            try:
-                read_chunk(item)
-            except DamagedError:
+    try:
+        buffer_reader(view).check_indexes()
+        for _, item in scan(view):
+            if isinstance(item, Damage):
                 return False
+            if isinstance(item, Chunk):
+                _check_interrupt(should_continue, source)
+                read_chunk(item)
+    except DamagedError:
+        return False
     return True
 
 
@@ -310,16 +314,3 @@ class _Copier:
                 **{name: str(count) for name, count in self._losses.items()},
             }
         return records
-
-
-def recovered_path(source: Path) -> Path:
-    """The default path of a recovered file: without `.part`, or with `.recovered` before the suffix.
-
-    Raises:
-        InputError: `source` is a folder.
-    """
-    if source.is_dir():
-        raise InputError(f"{source}: is a folder; give the MCAP files in it")
-    if source.name.endswith(PART_SUFFIX):
-        return source.with_name(source.name.removesuffix(PART_SUFFIX))
-    return source.with_name(f"{source.stem}.recovered{source.suffix or MCAP_SUFFIX}")

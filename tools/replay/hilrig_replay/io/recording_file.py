@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema, Statistics
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
@@ -22,7 +21,7 @@ from hilrig_recorder.mcap_format.reader import (
     chunk_records,
     file_reader,
 )
-from hilrig_recorder.mcap_format.records import MAGIC, MAX_TIME_NS, Chunk, DamagedError, Message, decode_record
+from hilrig_recorder.mcap_format.records import MAGIC, MAX_TIME_NS, Chunk, ChunkIndex, DamagedError, Message
 from hilrig_recorder.mcap_format.scan import Damage, read_chunk, scan
 from hilrig_replay.io.columns import RowBuffer, Rows
 from hilrig_runtime.errors import InputError
@@ -170,7 +169,7 @@ def open_recording(path: Path) -> RecordingFile:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: expected a recording (.mcap), found a folder") from None
+        raise InputError(f"{path}: expected a recording ({MCAP_SUFFIX}), found a folder") from None
     except OSError as error:
         raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
     except NoMcapError as error:
@@ -205,23 +204,16 @@ def _read_summary(reader: RecordReader) -> _FileContents | None:
         return None
     contents = _FileContents()
     index: list[MetadataIndex | AttachmentIndex] = []
-    chunk_count = None
-    for record in reader.summary_records(summary):
-        if record.opcode == Opcode.CHUNK_INDEX:
-            chunk = reader.chunk_index(record, summary)
-            contents.chunks.append(chunk.first_ns, chunk.last_ns, chunk.offset, chunk.length, _bits(chunk.channels))
-            continue
-        item = decode_record(record.opcode, record.content, record.offset)
-        if isinstance(item, Schema | Channel):
+    for item in reader.summary_items(summary):
+        if isinstance(item, ChunkIndex):
+            contents.chunks.append(item.first_ns, item.last_ns, item.offset, item.length, _bits(item.channels))
+        elif isinstance(item, Schema | Channel):
             contents.add(item)
         elif isinstance(item, Statistics):
-            chunk_count = item.chunk_count
             contents.counts = item.channel_message_counts
             contents.start_ns, contents.end_ns = item.message_start_time, item.message_end_time
         elif isinstance(item, MetadataIndex | AttachmentIndex):
             index.append(item)
-    if chunk_count not in (None, len(contents.chunks)):
-        raise DamagedError(f"{len(contents.chunks)} chunk indexes, expected {chunk_count}", summary.start)
     for entry in index:
         contents.add(reader.indexed_record(entry))
     return contents
