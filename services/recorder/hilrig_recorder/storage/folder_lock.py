@@ -12,8 +12,7 @@ import sys
 import time
 from collections.abc import Collection
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self
+from typing import IO, Any, Final
 
 from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_runtime.errors import OperationError, list_names
@@ -60,14 +59,6 @@ class FolderLock:
     def close(self) -> None:
         """Release the lock."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _lock_with_retries(file: IO[str]) -> bool:
