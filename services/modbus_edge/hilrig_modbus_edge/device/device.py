@@ -13,7 +13,7 @@ from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client, Host, address_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, repeat_suffix
+from hilrig_modbus_edge.device.events import EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session
@@ -37,6 +37,7 @@ from hilrig_modbus_edge.registers.map import (
 )
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate_limiter import repeat_suffix
 from hilrig_schemas import Event, LeaseStatus
 
 # Looking up an enumeration member is a function call: the one that each request needs is looked up once.

@@ -9,16 +9,15 @@ from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.events import repeat_suffix
-from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import OperationError, listen_failure
 from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 
 BACKLOG: Final = 128
 """Connections that the system queues until they are accepted."""
@@ -39,7 +38,7 @@ class RigServer:
         self.connections: set[Connection] = set()
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters)
-        self._rate_limiter = RateLimiter(MALFORMED_LOG_PERIOD_NS)
+        self._rate_limiter: RateLimiter[str] = RateLimiter(MALFORMED_LOG_PERIOD_NS)
         self._acceptors: list[asyncio.Task[None]] = []
         self._tls_servers: list[asyncio.Server] = []
 
@@ -118,8 +117,7 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
-        # Python appends the address to the system's message.
-        reason = (error.strerror or str(error)).partition(" (while")[0]
+        reason = listen_failure(error)
         if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
             hint = "edge.host in lab.toml must be an address of this host"
         elif error.errno in (errno.EMFILE, errno.ENFILE):
