@@ -17,6 +17,15 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
 
 MS = 1_000_000
+EDGE = EdgeConfig(
+    watchdog_ms=1000.0,
+    watchdog_min_ms=100.0,
+    watchdog_max_ms=10_000.0,
+    lease_timeout_ms=5000.0,
+    session_grace_ms=5000.0,
+    repeat_ms=200.0,
+)
+"""Settings of the tests, independent of the defaults."""
 
 
 class Bench:
@@ -32,7 +41,7 @@ class Bench:
         self.sends: list[int] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
-        device_settings = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
+        device_settings = replace(DeviceSettings.of(EDGE, ImpairmentConfig()), **settings)
         self.device = Device("rig1", device_settings, self.clock, self, lambda: self.arrival, random.Random(4))
 
     def send_command(self, command: TorqueCommand) -> None:
