@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilrig_replay.io.output import output_file
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.plots.palette import JOINT_COLORS, JOINT_SYMBOLS, rgb
 from hilrig_replay.rerun_view.layout import SIM_TIME
 from hilrig_replay.rerun_view.sinks import to_file

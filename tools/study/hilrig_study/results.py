@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from hilrig_replay.io.output import output_file
+from hilrig_replay.io.output_file import output_file
 from hilrig_sim.arm.model import JOINT_NAMES
 from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig

@@ -25,7 +25,7 @@ def live(
 ) -> None:
     """Show a running rig in the rerun viewer, like `replay`, until the viewer is closed or Ctrl-C."""
     from hilrig_cli.client import check_rig
-    from hilrig_replay.io.output import output_file
+    from hilrig_replay.io.output_file import output_file
     from hilrig_replay.rerun_view.layout import layout
     from hilrig_replay.rerun_view.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
     from hilrig_replay.rerun_view.sinks import to_file, to_viewer

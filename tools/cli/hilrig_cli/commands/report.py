@@ -38,7 +38,7 @@ def report(
     from rich.progress import Progress
 
     from hilrig_replay.grading.task_loading import load_task
-    from hilrig_replay.io.output import check_output, output_file
+    from hilrig_replay.io.output_file import check_output, output_file
     from hilrig_replay.io.paths import find_recordings
     from hilrig_replay.report.report import build_report
 

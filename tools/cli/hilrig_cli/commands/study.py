@@ -75,7 +75,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     if live and not chosen.live:
         raise InputError(f"{file}: --live requires live points, but the study has none: add [[live]] with x and y")
     # Imported after the validation, so that errors in the study are reported without delay.
-    from hilrig_replay.io.output import check_output
+    from hilrig_replay.io.output_file import check_output
     from hilrig_study.plots import Marker, plane_figure, save_plots, traces
     from hilrig_study.rerun_plots import save_study_rrd
     from hilrig_study.results import save_results

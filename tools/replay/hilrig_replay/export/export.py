@@ -23,7 +23,7 @@ from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import Rows, StringTable
-from hilrig_replay.io.output import output_file
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
 from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase

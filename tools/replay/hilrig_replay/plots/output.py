@@ -6,7 +6,7 @@ from typing import Final
 
 from matplotlib.figure import Figure
 
-from hilrig_replay.io.output import check_output, output_file
+from hilrig_replay.io.output_file import check_output, output_file
 from hilrig_runtime.errors import InputError
 
 FORMATS: Final = (".png", ".svg", ".pdf")

@@ -7,7 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilrig_replay.grading.task_loading import recorded_task
-from hilrig_replay.io.output import output_file
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout

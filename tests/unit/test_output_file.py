@@ -7,7 +7,7 @@ import pytest
 
 from hilrig_cli.local.demo import run_demo
 from hilrig_replay.export.export import export_tables
-from hilrig_replay.io.output import check_output, output_file
+from hilrig_replay.io.output_file import check_output, output_file
 from hilrig_replay.io.run import open_run
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.errors import InputError, OperationError
