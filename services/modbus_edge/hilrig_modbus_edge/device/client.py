@@ -18,7 +18,7 @@ def address_of(host: str, port: int) -> str:
 
 
 @dataclass(slots=True, eq=False)
-class Controller:
+class ConnectedController:
     """A controller with all its connections: one connection may read and another write."""
 
     name: str
@@ -44,7 +44,7 @@ class Client:
     certificate: str = ""
     """Name in its certificate; empty: it has none."""
     may_write: bool = True
-    controller: Controller = field(init=False)
+    controller: ConnectedController = field(init=False)
     """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
     """Time of its last request, ns, monotonic clock."""
@@ -55,7 +55,7 @@ class Client:
     basis: ServedState | None = None
     """`served` when its newest bytes arrived: they cannot be based on a newer one."""
     other_basis: ServedState | None = None
-    """`Controller.served` when its newest bytes arrived: the basis of a client that was itself served none."""
+    """`ConnectedController.served` when its newest bytes arrived: the basis of a client that was itself served none."""
 
     def record_request(self, now_ns: int) -> None:
         """Record that a request arrived."""

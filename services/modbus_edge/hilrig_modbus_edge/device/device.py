@@ -10,7 +10,7 @@ from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.device.client import Client, Controller, address_of, controller_of
+from hilrig_modbus_edge.device.client import Client, ConnectedController, address_of, controller_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import EventEmitter
@@ -64,7 +64,7 @@ class Device:
     ) -> None:
         self.rig = rig
         self.clients: set[Client] = set()
-        self._controllers: dict[str, Controller] = {}
+        self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
         self._monotonic_ns = clock.monotonic_ns
         self._session = SessionState()
@@ -102,7 +102,7 @@ class Device:
         now_ns = self._monotonic_ns()
         client = Client(host, address_of(host, port), certificate, may_write, last_request_ns=now_ns)
         name = controller_of(client, self._lease_setting)
-        client.controller = self._controllers.setdefault(name, Controller(name))
+        client.controller = self._controllers.setdefault(name, ConnectedController(name))
         client.controller.clients.add(client)
         self.clients.add(client)
         return client
