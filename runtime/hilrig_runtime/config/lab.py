@@ -4,7 +4,6 @@ Units are SI unless the key's name states another one (`step_ms`, `timeout_ms`).
 with the defaults below.
 """
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +15,7 @@ from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
+from hilrig_runtime.config.toml_file import parse_toml, read_text
 from hilrig_runtime.config.types import (
     Flag,
     Name,
@@ -343,20 +343,7 @@ def load_lab(path: Path | None) -> LabConfig:
     Raises:
         InputError: the file can't be read, or is not a valid lab configuration; names every error.
     """
-    return LabConfig() if path is None else parse_lab(read_lab_text(path), str(path))
-
-
-def read_lab_text(path: Path) -> str:
-    """Read the text of a lab's file.
-
-    Raises:
-        InputError: the file can't be read.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise InputError(f"{path}: can't be read: {reason}") from error
+    return LabConfig() if path is None else parse_lab(read_text(path), str(path))
 
 
 def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
@@ -366,9 +353,7 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
         InputError: as `load_lab`.
     """
     try:
-        lab = LabConfig.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where}: invalid TOML: {error}") from error
+        lab = LabConfig.model_validate(parse_toml(text, where))
     except ValidationError as error:
         raise InputError("\n".join(f"{where}: {text}" for text in format_validation_error(error))) from error
     lab._source = text

@@ -5,7 +5,6 @@ degrees, as in `lab.toml`; gains are in SI units.
 """
 
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -17,6 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from hilrig_runtime.config.impairment import ImpairmentSetting, LinkImpairments
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
+from hilrig_runtime.config.toml_file import parse_toml, read_text
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
 from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
@@ -317,13 +317,7 @@ def load_study(path: Path) -> StudyConfig:
     Raises:
         InputError: the file can't be read, is not valid TOML, or is not a valid study; the message has every error.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: can't be read: {reason}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: invalid TOML: {error}") from error
+    values = parse_toml(read_text(path), str(path))
     try:
         study = StudyConfig.model_validate(values)
     except ValidationError as error:

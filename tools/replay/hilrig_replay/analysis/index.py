@@ -148,7 +148,7 @@ class RunIndex:
                 row[reasons] = tuple(row[reasons])
                 known[row[0]] = RunEntry(*row)
             return known
-        except (OSError, ValueError, KeyError, TypeError, IndexError):
+        except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
             # Damaged, or of another version: the index is rebuilt.
             return {}
 
@@ -210,7 +210,7 @@ def read_verdict(path: Path) -> bool | None:
     try:
         verdict = json.loads(path.with_name(path.name + VERDICT_SUFFIX).read_text())
         return bool(verdict["verified"]) if verdict["size"] == path.stat().st_size else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
