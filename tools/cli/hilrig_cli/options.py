@@ -13,7 +13,6 @@ Config = Annotated[
         "-c",
         metavar="LAB.TOML",
         help="Configuration file of the lab; default: one rig with default settings.",
-        show_default=False,
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]

@@ -20,15 +20,10 @@ def console(
             metavar="FILE",
             help="File whose first line is the password. Default: no password on loopback, otherwise a generated one, "
             "which is printed.",
-            show_default=False,
         ),
     ] = None,
-    certificate: Annotated[
-        Path | None, typer.Option(metavar="PEM", help="Serve HTTPS with this certificate.", show_default=False)
-    ] = None,
-    key: Annotated[
-        Path | None, typer.Option(metavar="PEM", help="Private key of the certificate.", show_default=False)
-    ] = None,
+    certificate: Annotated[Path | None, typer.Option(metavar="PEM", help="Serve HTTPS with this certificate.")] = None,
+    key: Annotated[Path | None, typer.Option(metavar="PEM", help="Private key of the certificate.")] = None,
     name: Annotated[
         list[str] | None,
         typer.Option(help="Additional host name that browsers use for this host; may be repeated."),

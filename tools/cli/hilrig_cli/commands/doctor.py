@@ -21,12 +21,11 @@ def doctor(
         typer.Option(
             metavar="NAME",
             help="Check this service only (sim, edge, recorder or router); for container health checks.",
-            show_default=False,
         ),
     ] = "",
     instance: Annotated[
         str,
-        typer.Option(metavar="NAME", help="With --service: check this instance; default: any.", show_default=False),
+        typer.Option(metavar="NAME", help="With --service: check this instance; default: any."),
     ] = "",
     as_json: AsJson = False,
 ) -> None:

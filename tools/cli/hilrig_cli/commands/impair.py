@@ -22,25 +22,17 @@ def impair(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: show all rigs of the lab.")] = "",
     preset: Annotated[
         str,
-        typer.Option(
-            metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms.", show_default=False
-        ),
+        typer.Option(metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms."),
     ] = "",
-    state: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state link, ms: {DELAY_SYNTAX}.", show_default=False)
-    ] = "",
+    state: Annotated[str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state link, ms: {DELAY_SYNTAX}.")] = "",
     command: Annotated[
         str,
-        typer.Option(metavar="KIND:ARGS", help="Delay of the command link; kinds as for --state.", show_default=False),
+        typer.Option(metavar="KIND:ARGS", help="Delay of the command link; kinds as for --state."),
     ] = "",
-    loss: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.", show_default=False)
-    ] = "",
+    loss: Annotated[str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.")] = "",
     trace: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording.", show_default=False
-        ),
+        typer.Option(metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the delays and losses.")] = 1,
     off: Annotated[bool, typer.Option("--off", help="Remove the impairment.")] = False,

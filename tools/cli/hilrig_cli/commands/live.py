@@ -14,12 +14,12 @@ from hilrig_cli.options import Config
 def live(
     rig: Annotated[
         str | None,
-        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig.", show_default=False),
+        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig."),
     ] = None,
     config: Config = None,
     save: Annotated[
         Path | None,
-        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
+        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def play(
-    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
+    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.")],
     config: Config = None,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed factor.")] = 1.0,
     start: Annotated[float, typer.Option(min=0.0, help="Start position in the recording, s.")] = 0.0,

@@ -11,11 +11,11 @@ import typer
 def replay(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view."),
     ],
     save: Annotated[
         Path | None,
-        typer.Option(metavar="RUN.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
+        typer.Option(metavar="RUN.RRD", help="Write a rerun file instead of opening a viewer."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:

@@ -51,14 +51,13 @@ def add(
     rig: Name,
     port: Annotated[
         int | None,
-        typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports.", show_default=False),
+        typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports."),
     ] = None,
     settings: Annotated[
         Path | None,
         typer.Option(
             metavar="RIG.TOML",
             help="File with settings that differ from the lab's; keys as in \\[\\[rigs]].",
-            show_default=False,
         ),
     ] = None,
     config: Config = None,

@@ -20,7 +20,6 @@ Rigs = Annotated[
     typer.Option(
         metavar="RIG,RIG…",
         help="Rigs that this process serves; default: all rigs of the lab.",
-        show_default=False,
     ),
 ]
 Instance = Annotated[
