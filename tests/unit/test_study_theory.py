@@ -14,9 +14,9 @@ from hilrig_study.controllers.lqr import PredictiveLqr
 from hilrig_study.linear_model import LinearPlant, linearize
 from hilrig_study.simulation.timing import LoopTiming
 from hilrig_study.theory.margins import (
+    STABLE_RADIUS,
     LinearLaw,
     constant_latency_timing,
-    is_stable,
     linearize_law,
     loop_matrix,
     margins,
@@ -213,8 +213,11 @@ def test_delay_margin_equals_spectral_radius_limit(pose: tuple[float, float, flo
     added = round(margin.delay_margin_s / step_s)
     tolerance = 1
     assert tolerance <= 0.02 * added
-    assert is_stable(phi, gamma, law, timing, command_delay_ns=(added - tolerance) * step_ns)
-    assert not is_stable(phi, gamma, law, timing, command_delay_ns=(added + tolerance) * step_ns)
+    stable, unstable = (
+        spectral_radius(loop_matrix(phi, gamma, law, timing, command_delay_ns=steps * step_ns))
+        for steps in (added - tolerance, added + tolerance)
+    )
+    assert stable < STABLE_RADIUS <= unstable
 
 
 @pytest.mark.parametrize("gain", [0.6, 1.0])

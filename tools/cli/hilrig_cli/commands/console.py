@@ -1,12 +1,11 @@
 """`hilrig console`: web console of the lab."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def console(
@@ -38,7 +37,6 @@ def console(
     """
     import platform
     import secrets
-    import threading
 
     from hilrig_console.auth import AccessPolicy, normalize_host_names
     from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
@@ -62,19 +60,14 @@ def console(
     names = normalize_host_names([platform.node(), address.host, *(name or [])])
     server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
     lower_priority()
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     force_exit_after(stopping, 8.0)
     with server:
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if generated:
             print(f"password: {password} (any user name)", flush=True)
         if tls is None and not address.is_loopback:
-            print(
-                "hilrig: warning: without --certificate and --key the password is sent unencrypted",
-                file=sys.stderr,
-                flush=True,
-            )
+            log("warning: without --certificate and --key the password is sent unencrypted")
         wait_for(stopping)
 
 

@@ -1,6 +1,7 @@
 """`hilrig doctor`: diagnosis of a deployment."""
 
 import json
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -40,11 +41,7 @@ def doctor(
     results = _check_service(lab, service, instance) if service else _check_all(lab)
     errors = [result for result in results if result.level is Level.ERROR]
     if as_json:
-        rows = [
-            {"check": result.check, "level": result.level.value, "text": result.text, "fix": result.fix}
-            for result in results
-        ]
-        print(json.dumps({"lab": lab.name, "well": not errors, "findings": rows}))
+        print(json.dumps({"lab": lab.name, "well": not errors, "findings": [asdict(result) for result in results]}))
     else:
         _print_table(results)
     if errors:
@@ -94,10 +91,10 @@ def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]
 def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[CheckResult]":
     from hilrig_cli.doctor import CheckResult
     from hilrig_cli.doctor.services import collect, matches
-    from hilrig_cli.service_kinds import SERVICE_KINDS
     from hilrig_runtime.errors import HilrigError, InputError
+    from hilrig_schemas.topics import SERVICES
 
-    if service not in (*SERVICE_KINDS, "router"):
+    if service not in (*SERVICES, "router"):
         raise InputError(f"--service {service}: expected sim, edge, recorder or router")
     if service == "router" and lab.bus.topology != "router":
         raise InputError('--service router: this lab has no router (bus.topology in lab.toml is not "router")')

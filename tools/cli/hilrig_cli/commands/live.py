@@ -1,14 +1,12 @@
 """`hilrig live`: shows a running rig in the rerun viewer."""
 
-import sys
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def live(
@@ -39,11 +37,7 @@ def live(
         raise InputError("--save and --web can't be combined: use one of them")
     lab = load_lab(config)
     name = rig or lab.rigs[0].name
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-
-    def log(line: str) -> None:
-        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+    stopping = stop_on_signals()
 
     blueprint = layout(live=True)
     with ExitStack() as closing:

@@ -1,7 +1,6 @@
 """`hilrig replay`: shows recordings in the rerun viewer."""
 
 import sys
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -32,8 +31,7 @@ def replay(
     if save is not None:
         save_rrd(opened, save)
         return
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     grpc_port, web_port = free_port(), free_port() if web else None
     with running_viewer(grpc_port, web_port) as viewer:
         if web_port is not None:

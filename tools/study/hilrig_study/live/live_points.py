@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_study.live.live_loop import RigClient, drive, measure_tick_phase
 from hilrig_study.live.twin import compare_with_twins
-from hilrig_study.study_config import PointConfig, StudyConfig
+from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import cell_at
 
 CLOCK_RIG: Final = "clock"
@@ -84,13 +85,9 @@ def run_live_points(
                 point, number = points[index]
                 report(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
                 run = _run_point(study, folder, lab, f"point{index + 1}", cells[index], check_processes)
-                comparison = compare_with_twins(study, cells[index], run, folder)
-                compared.append(_point_values(point, names[number], run) | comparison.as_dict())
+                place = {"x": point.x, "y": point.y, "controller": names[number], "recording": str(run.path)}
+                compared.append(place | asdict(compare_with_twins(study, cells[index], run, folder)))
     return compared
-
-
-def _point_values(point: PointConfig, controller: str, run: Run) -> dict[str, Any]:
-    return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
 def _point_impairments(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
