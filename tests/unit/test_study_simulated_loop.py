@@ -229,7 +229,7 @@ def test_simulation_and_theory_agree_on_stable_delays(pose: tuple[float, float, 
     timing = LoopTiming()
     delays_ms = range(0, 121)
     steps = [timing.latency_steps(0, ms * MS)[0] for ms in delays_ms]
-    theory = {n: is_stable(phi, gamma, law, timing, 0, ms * MS) for ms, n in zip(delays_ms, steps, strict=True)}
+    theory = {n: is_stable(phi, gamma, law, timing, ms * MS) for ms, n in zip(delays_ms, steps, strict=True)}
     lines = [timeline(timing, 3000, command_delay_ns=ms * MS) for ms in delays_ms]
     outcome = run(pd(gain), lines, pose=pose, ticks=3000, linear=True, quantize=False, limit=1e9)
     simulated = [

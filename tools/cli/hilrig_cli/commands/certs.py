@@ -2,14 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from hilrig_cli.options import AsJson, Config
-
-if TYPE_CHECKING:
-    from hilrig_runtime.config.lab import LabConfig
 
 
 def certs(
@@ -64,7 +61,7 @@ def certs(
             controllers.write(name, issue_client(authority, name, role, now, days))
 
     authority = bus.authority(f"hilrig {lab.name}: bus")
-    router_names = _distinct([*_router_host(lab), *(host or []), *loopback])
+    router_names = _distinct([*_reachable(lab.bus.router_host), *(host or []), *loopback])
     service_names = _distinct([*_reachable(lab.bus.host), *loopback])
     required = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
     for name, names in ({"router": router_names} | required).items():
@@ -92,11 +89,6 @@ def certs(
         print(f"[{table}]")
         for key, value in values.items():
             print(f'{key} = "{value}"')
-
-
-def _router_host(lab: "LabConfig") -> list[str]:
-    address = lab.bus.router.partition("/")[2].partition("?")[0]
-    return _reachable(address.rpartition(":")[0].strip("[]"))
 
 
 def _reachable(host: str) -> list[str]:

@@ -73,13 +73,13 @@ def console(
 
 def _password(file: Path) -> str:
     from hilrig_console.auth import MIN_PASSWORD_CHARS
+    from hilrig_runtime.config.validation import read_text
     from hilrig_runtime.errors import InputError
 
     try:
-        password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"--password-file: {file}: can't be read: {reason}") from error
+        password = read_text(file).partition("\n")[0].strip()
+    except InputError as error:
+        raise InputError(f"--password-file: {error}") from error
     if len(password) < MIN_PASSWORD_CHARS:
         raise InputError(
             f"--password-file: {file}: the password in the first line must have at least {MIN_PASSWORD_CHARS} "

@@ -74,28 +74,19 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     Raises:
         InputError: the requested impairment is invalid.
     """
-    from pydantic import ValidationError
-
     from hilrig_runtime.config.impairment import ImpairmentConfig
-    from hilrig_runtime.config.validation import format_validation_error
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.config.validation import validate
 
-    try:
-        base = ImpairmentConfig(preset=preset or "none").links
-        delays = {
-            "state": state or base.state.delay,
-            "command": command or base.command.delay,
-        }
-        if trace is not None:
-            from hilrig_replay.export.delay_trace import delay_trace
-            from hilrig_replay.io.run import open_run
+    base = validate(ImpairmentConfig, {"preset": preset or "none"}).links
+    delays = {"state": state or base.state.delay, "command": command or base.command.delay}
+    if trace is not None:
+        from hilrig_replay.export.delay_trace import delay_trace
+        from hilrig_replay.io.run import open_run
 
-            delays["command"] = delay_trace(open_run(trace))
-        losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
-        links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
-        return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **links})
-    except ValidationError as error:
-        raise InputError("\n".join(format_validation_error(error))) from error
+        delays["command"] = delay_trace(open_run(trace))
+    losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
+    links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
+    return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})
 
 
 def _row(status: "ImpairmentStatus") -> dict[str, object]:

@@ -152,17 +152,13 @@ def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
 
 
 def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
-    import tomllib
-
-    from hilrig_runtime.config.lab import read_lab_text, read_rig
+    from hilrig_runtime.config.lab import read_rig
+    from hilrig_runtime.config.validation import parse_toml, read_text
     from hilrig_runtime.errors import InputError
 
     if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
         raise InputError(f"rig {rig!r} already exists in the lab: choose another name")
-    try:
-        values = {} if settings is None else tomllib.loads(read_lab_text(settings))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{settings}: invalid TOML: {error}") from error
+    values = {} if settings is None else parse_toml(read_text(settings), str(settings))
     if port is not None:
         values["port"] = port
     return read_rig(json.dumps(values | {"name": rig}))
