@@ -123,10 +123,9 @@ class ConsoleServer:
         # Lower levels only log aborted connections.
         logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._serve, name="console", daemon=True)
-
-    def _serve(self) -> None:
-        self._server.run(sockets=[self._socket])
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="console", daemon=True
+        )
 
     def __enter__(self) -> "ConsoleServer":
         self._subscriber.__enter__()

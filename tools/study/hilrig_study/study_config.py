@@ -11,13 +11,13 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from hilrig_runtime.config.impairment import ImpairmentSetting, LinkImpairments
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
-from hilrig_runtime.config.validation import format_validation_error, parse_toml, read_text, validate
+from hilrig_runtime.config.validation import parse_toml, read_text, validate
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import JOINT_NAMES, RigParameters, joints_si
 from hilrig_sim.parameters import rig_parameters
@@ -266,15 +266,9 @@ class StudyConfig(Section):
         step = step_ms or self.loop.step_ms
         substeps = max(1, math.ceil(step / 20.0))
         start = tuple(p + o for p, o in zip(self.task.pose, self.task.offset, strict=True))
-        try:
-            arm = ArmConfig.model_validate({**self.arm.model_dump(), "start_position": start})
-            return LabConfig(
-                name="study",
-                sim=SimConfig(step_ms=step, substeps=substeps),
-                rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),),
-            )
-        except ValidationError as error:
-            raise InputError("; ".join(format_validation_error(error))) from error
+        arm = validate(ArmConfig, {**self.arm.model_dump(), "start_position": start})
+        sim = validate(SimConfig, {"step_ms": step, "substeps": substeps})
+        return LabConfig(name="study", sim=sim, rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),))
 
     def link_impairments(self, controller: int) -> LinkImpairments:
         """Return the link impairments of a controller, without the swept values."""

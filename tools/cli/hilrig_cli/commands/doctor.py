@@ -9,8 +9,6 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from hilrig_cli.doctor import CheckResult
     from hilrig_runtime.config.lab import LabConfig
 
@@ -49,7 +47,6 @@ def doctor(
 
 
 def _check_all(lab: "LabConfig") -> "list[CheckResult]":
-    from datetime import UTC, datetime
     from importlib.metadata import version
 
     from hilrig_cli.doctor import CheckResult, host, services
@@ -67,7 +64,7 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     results += services.check_versions((health for health, _ in snapshot.healths.values()), version("hilrig"))
     results += services.check_clocks(list(snapshot.healths.values()))
     if lab.bus.tls is not None or lab.edge.tls is not None:
-        results += _check_certificates(lab, datetime.now(UTC))
+        results += _check_certificates(lab)
     results += host.check_ports(lab, snapshot.services)
     results += host.check_open_files(lab)
     results += host.check_timer_accuracy(lab)
@@ -75,7 +72,9 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     return results
 
 
-def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]":
+def _check_certificates(lab: "LabConfig") -> "list[CheckResult]":
+    from datetime import UTC, datetime
+
     from hilrig_cli.doctor import CheckResult
 
     try:
@@ -85,7 +84,7 @@ def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]
         text = f"not checked: {error.name!r} is not installed on this host"
         fix = "pip install 'hilrig[edge]', or check copies of the certificates on another host"
         return [CheckResult.warning("certificates", text, fix)]
-    return list(check_certificates(lab, now))
+    return list(check_certificates(lab, datetime.now(UTC)))
 
 
 def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[CheckResult]":
