@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.run import open_run
 from hilrig_replay.rerun_view.view import root_names, save_rrd
@@ -32,7 +33,7 @@ def test_stages_sum_to_the_loop_latency(tmp_path: Path) -> None:
     shown = RrdFile(tmp_path / "run.rrd")
     ends = shown.column("/stages", "scalars")
     loops = measure(run).table["loop"] / 1e6
-    assert ends.shape == (len(loops), 7)
+    assert ends.shape == (len(loops), 1 + len(STAGES))
     assert np.allclose(ends[:, -1], loops)
     assert (np.diff(ends, axis=1) >= 0).all()
 

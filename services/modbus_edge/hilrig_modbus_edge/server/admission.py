@@ -31,11 +31,11 @@ _TCP_OPTIONS: Final = (
 class Limits:
     """Limits and allow-list for the connections of a rig."""
 
-    connections: int = 32
-    connections_per_host: int = 16
-    idle_ns: int = 60_000_000_000
+    connections: int
+    connections_per_host: int
+    idle_ns: int
     """Time without a request after which a connection is closed, ns; 0: never."""
-    allow: tuple[IPv4Network | IPv6Network, ...] = ()
+    allow: tuple[IPv4Network | IPv6Network, ...]
     """Networks that may connect; empty: all."""
 
 

@@ -25,6 +25,7 @@ from hilrig_cli.local.local_lab import running_lab
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import TRANSPORT
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
@@ -71,7 +72,8 @@ def measure_timing(
     set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
-        ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}
+        default = LabConfig()
+        ports = {"modbus_port": free_ports(default.edge.first_port), "bus_port": free_ports(default.bus.first_port, 3)}
         config.write_text(LAB_TEMPLATE.format(step_ms=step_ms, folder=folder, **ports))
         lab = load_lab(config)
         processors = os.cpu_count() or 1
@@ -112,7 +114,7 @@ def _evaluate(
         overruns=overruns,
         missed_steps=missed,
         tick_lateness_ms=report.jitter_ms.tick_lateness,
-        bus_ms=report.stages_ms["transport"],
+        bus_ms=report.stages_ms[TRANSPORT.key],
         modbus_ms=Statistics.of(round_trips_ns),
         loop_ms=report.loop_ms,
         stolen=stolen,
