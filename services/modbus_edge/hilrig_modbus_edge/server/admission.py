@@ -9,8 +9,8 @@ from typing import Final, Protocol
 
 from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_runtime.counters import Counters
+from hilrig_runtime.timing.rate_limiter import RateLimiter
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events about refused connections of one host and reason, ns."""
@@ -58,7 +58,7 @@ class Admission:
         self._limits = limits
         self._monotonic_ns = monotonic_ns
         self._counters = counters
-        self._rate_limiter = RateLimiter(REFUSED_EVENT_PERIOD_NS)
+        self._rate_limiter: RateLimiter[tuple[str, str]] = RateLimiter(REFUSED_EVENT_PERIOD_NS)
 
     def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
         """Return host and port of an admitted connection; else close the connection and return None."""

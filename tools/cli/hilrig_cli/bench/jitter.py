@@ -22,6 +22,9 @@ from hilrig_cli.bench.cpu_stress import cpu_stress
 from hilrig_cli.bench.timing_benchmark import TimingResult
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
+from hilrig_modbus_edge.protocol.functions import FunctionCode
+from hilrig_modbus_edge.protocol.mbap import encode_frame
+from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
@@ -46,9 +49,11 @@ folder = '{folder}'
 MIN_POLL_PERIOD_NS: Final = 1_000_000
 POLLS_PER_STEP: Final = 4
 RESPONSE_TIMEOUT_S: Final = 5.0
-READ_REQUEST: Final = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
+READ_REQUEST: Final = encode_frame(1, 1, struct.pack(">BHH", FunctionCode.READ_HOLDING_REGISTERS, POSITION_ADDRESS, 4))
 """Modbus request that reads the four positions."""
-WRITE_REQUEST: Final = struct.pack(">HHHBBHHB8x", 2, 0, 15, 1, 16, 0, 4, 8)
+WRITE_REQUEST: Final = encode_frame(
+    2, 1, struct.pack(">BHHB8x", FunctionCode.WRITE_MULTIPLE_REGISTERS, TORQUE_ADDRESS, 4, 8)
+)
 """Modbus request that writes four torques of zero."""
 READ_RESPONSE_BYTES: Final = 17
 WRITE_RESPONSE_BYTES: Final = 12

@@ -26,7 +26,7 @@ from hilrig_runtime.errors import InputError
 from hilrig_runtime.process.process_pool import process_pool
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
-ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
+ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "LEASE_REFUSED")
 """Event kinds that count as alarms in the overview."""
 _MIN_RUNS_FOR_PROCESSES: Final = 4
 """Fewer runs take less time than the start of worker processes."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
-from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
+from hilrig_replay.analysis.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_replay.analysis.samples import CommandMatcher, join_commands
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
@@ -54,7 +54,7 @@ _UNKNOWN_PART_SIZE_M: Final = (0.03, 0.03, 0.03)
 _OTHER_EVENT_COLOR: Final = "#9aa5b1"
 _NOT_IN_PATH: Final = re.compile(r"[^\w.-]")
 """Characters that an entity path must not contain."""
-_REQUEST_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
+_REQUEST_COLORS: Final = dict(zip(KINDS, ("#4c78a8", "#f58518", "#e45756"), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
