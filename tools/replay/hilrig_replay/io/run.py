@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile, open_recording
 from hilrig_replay.io.records import Decoder, Records, concatenate_records
+from hilrig_replay.io.sequence_order import Repairs, in_sequence
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError
 
@@ -205,8 +206,9 @@ class Run:
         rows: int = BLOCK_ROWS,
         from_ns: int | None = None,
         until_ns: int | None = None,
+        repairs: Repairs | None = None,
     ) -> Iterator[Records]:
-        """Iterate over the run in blocks of about `rows` messages, in file order.
+        """Iterate over the run in blocks of about `rows` messages; each sender's in the order in which it sent them.
 
         Messages of different senders are in their order of arrival, so the command of a state can be in the block
         before or after it.
@@ -216,10 +218,16 @@ class Run:
             rows: messages per block.
             from_ns: start of the range of arrival times at the recorder, wall clock; None: the beginning.
             until_ns: end of the range, excluded; None: the end.
+            repairs: counts the messages that are not in this order in the file.
 
         Raises:
             InputError: the file is damaged.
         """
+        return in_sequence(self._in_file_order(topics, rows, from_ns, until_ns), repairs or Repairs())
+
+    def _in_file_order(
+        self, topics: frozenset[str], rows: int, from_ns: int | None, until_ns: int | None
+    ) -> Iterator[Records]:
         decoder = Decoder(self.names, self.timebase)
         count = 0
         try:
