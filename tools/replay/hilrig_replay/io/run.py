@@ -37,7 +37,7 @@ class Losses:
     recorder: int
     """Messages that arrived and could not be written."""
     file: int = 0
-    """Messages of a damaged file that could not be recovered."""
+    """Messages that were written, but are not in the file: it was damaged, truncated or edited."""
 
 
 class Run:
@@ -132,7 +132,7 @@ class Run:
         if transport is None or recorder is None:
             return None
         written = self.number("summary", "messages") or 0
-        missing = max(0, written - sum(self.file.counts.values())) if self.damaged else 0
+        missing = max(0, written - sum(self.file.counts.values()))
         return Losses(transport, recorder, missing)
 
     @property
@@ -141,6 +141,12 @@ class Run:
         damaged_bytes = self.number("recovered", "damaged_bytes") or 0
         truncated_bytes = self.number("recovered", "torn_bytes") or 0
         return damaged_bytes > truncated_bytes or bool(self.number("recovered", "orphans"))
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the file was recovered without its last bytes."""
+        ended = self._metadata_text("summary", "ended")
+        return self.recovered and (ended == "recovered" or bool(self.number("recovered", "torn_bytes")))
 
     @property
     def recovered(self) -> bool:
