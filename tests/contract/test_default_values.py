@@ -10,8 +10,22 @@ import pytest
 
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
+from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
+from hilrig_modbus_edge.server.tls import HANDSHAKE_TIMEOUT_S
+from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentSetting
-from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig, TlsConfig
+from hilrig_runtime.config.lab import (
+    ArmConfig,
+    EdgeConfig,
+    LabConfig,
+    RecorderConfig,
+    RigSettings,
+    SimConfig,
+    TlsConfig,
+)
+from hilrig_runtime.config.scene import MagnetConfig, PartConfig, SceneConfig, TableConfig, TrayConfig
+from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.config.template import lab_template
 from hilrig_sim.arm.integrators import TABLEAUS
 from hilrig_sim.arm.model import RigParameters
@@ -49,7 +63,10 @@ DOCUMENTED = [
     ("docs/operations.md", r"^\| (\d+), \d+, \d+ \| simulation, edge, recorder", [(BUS_PORT, 1)]),
     ("docs/operations.md", r"`sim\.command_timeout_ms` \((\d+) ms\)", [("sim.command_timeout_ms", 1)]),
     ("docs/operations.md", r"the bus: can't listen on 127\.0\.0\.1:(\d+)", [(BUS_PORT, 1)]),
-    ("docs/operations.md", r"to `rig64`, at ports (\d+) to", [(PORT, 1)]),
+    *(
+        (page, r"to `rig64`,? at ports (\d+) to", [(PORT, 1)])
+        for page in ("docs/operations.md", "docs/configuration.md")
+    ),
     ("docs/adr/0002-mesh-on-one-host.md", r"\(simulation (\d+), edge", [(BUS_PORT, 1)]),
     ("docs/model.md", r"^\| θ1 .* l1 = (\S+) m .*, l2 = (\S+) m", [("arm.l1_m", 1), ("arm.l2_m", 1)]),
     ("docs/model.md", r"^\| θ2 .* l3 = (\S+) m", [("arm.l3_m", 1)]),
@@ -94,6 +111,15 @@ DOCUMENTED = [
 ]
 
 
+CONSTANTS = [
+    # Page, pattern of a statement with a group for the value, and the value in the unit of the page.
+    ("docs/adr/0044-commands-are-throttled-with-a-deadline.md", r"within the last (\S+) ms", COALESCE_WINDOW_NS / 1e6),
+    ("docs/adr/0044-commands-are-throttled-with-a-deadline.md", r"beyond (\S+) ms before", DEADLINE_MARGIN_NS / 1e6),
+    ("docs/modbus-conformance.md", r"incomplete after (\S+) s is aborted", HANDSHAKE_TIMEOUT_S),
+    ("docs/recordings.md", r"in chunks of at most (\S+) KiB", CHUNK_BYTES / 1024),
+]
+
+
 def default(key: str) -> float:
     """Return the default of a key of `lab.toml`; `arm` is the one of a rig, a number the index in a tuple."""
     value: Any = ArmConfig() if key.startswith("arm.") else LabConfig()
@@ -111,13 +137,21 @@ def number(text: str) -> float:
     return {"two": 2.0}.get(text) or float(text.replace("−", "-").replace(",", ""))
 
 
-@pytest.mark.parametrize(("page", "pattern", "keys"), DOCUMENTED)
+@pytest.mark.parametrize(
+    ("page", "pattern", "keys"), DOCUMENTED, ids=[f"{keys[0][0]} in {page}" for page, _, keys in DOCUMENTED]
+)
 def test_documented_default_equals_the_configuration(page: str, pattern: str, keys: list[tuple[str, float]]) -> None:
     stated = list(re.finditer(pattern, (ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE))
     assert stated, f"{page} has no statement {pattern!r}: change the list DOCUMENTED with the page"
     for statement in stated:
         for text, (key, unit) in zip(statement.groups(), keys, strict=True):
             assert number(text) * unit == pytest.approx(default(key)), f"{page}: {statement.group()!r} states {key}"
+
+
+@pytest.mark.parametrize(("page", "pattern", "value"), CONSTANTS, ids=[pattern for _, pattern, _ in CONSTANTS])
+def test_documented_constant_equals_the_code(page: str, pattern: str, value: float) -> None:
+    stated = re.findall(pattern, (ROOT / page).read_text(encoding="utf-8"))
+    assert [number(text) for text in stated] == [value], f"{page}: {pattern!r} must state {value:g}"
 
 
 def test_rig_parameters_have_the_defaults_of_the_lab_file() -> None:
@@ -182,3 +216,15 @@ def test_example_controller_knows_the_default_arm_and_scene() -> None:
         )
         assert task.table == rig.scene.table_height
     assert example.Task((), ()).table == rig.scene.table_height
+
+
+def test_every_key_of_the_lab_file_is_used() -> None:
+    sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
+    text = "".join(path.read_text(encoding="utf-8") for path in sources if not path.stem.endswith("_pb2"))
+    models = [LabConfig, SimConfig, EdgeConfig, TlsConfig, RecorderConfig, BusConfig, BusTlsConfig, RigSettings]
+    assert [
+        f"{model.__name__}.{key}"
+        for model in [*models, ArmConfig, SceneConfig, TableConfig, MagnetConfig, PartConfig, TrayConfig, TaskConfig]
+        for key in model.model_fields
+        if not re.search(rf"\.{key}\b", text)
+    ] == []

@@ -153,6 +153,8 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     from rich.console import Console
     from rich.table import Table
 
+    from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+
     if not entries:
         print(f"no matching recordings in {folder}" if read else f"no recordings in {folder}")
         return
@@ -174,7 +176,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
         lost = _lost(entry)
         start = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
         table.add_row(
-            Path(entry.path).name.removesuffix(".mcap"),
+            Path(entry.path).name.removesuffix(MCAP_SUFFIX),
             *([entry.rig, start] if wide else []),
             _duration(entry.duration_s),
             _size(entry.size),

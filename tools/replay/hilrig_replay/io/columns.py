@@ -22,6 +22,9 @@ from hilrig_schemas import JointState, TorqueCommand
 Rows: TypeAlias = NDArray[np.void]
 """A structured array: one row per message, fields by name."""
 
+JointValues: TypeAlias = tuple[float, float, float, float]
+"""One number a joint."""
+
 _STRUCT_CODES: Final = {
     "<i8": "q",
     "<u8": "Q",
@@ -306,3 +309,9 @@ def _vector(packed: bytes) -> bytes:
 def concatenate_rows(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     """Concatenate arrays; shape (sum of their lengths,)."""
     return np.concatenate(pieces) if pieces else np.empty(0, dtype)
+
+
+def joint_values(values: NDArray[np.float64]) -> JointValues:
+    """Return an array of shape (4,) as numbers of Python."""
+    theta1, theta2, d3, theta4 = values.tolist()
+    return theta1, theta2, d3, theta4

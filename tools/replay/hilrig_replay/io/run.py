@@ -235,10 +235,13 @@ class Run:
         self, topics: frozenset[str], rows: int, from_ns: int | None, until_ns: int | None
     ) -> Iterator[Records]:
         decoder = Decoder(self.names, self.timebase)
+        topic_of = self.file.topics
         count = 0
         try:
-            for topic, sequence, log_ns, _, payload in self.file.messages(topics, from_ns=from_ns, until_ns=until_ns):
-                decoder.add(topic, payload, sequence, log_ns)
+            for channel_id, sequence, log_ns, _, payload in self.file.messages(
+                topics, from_ns=from_ns, until_ns=until_ns
+            ):
+                decoder.add(topic_of[channel_id], payload, sequence, log_ns)
                 count += 1
                 if count >= rows:
                     count = 0
