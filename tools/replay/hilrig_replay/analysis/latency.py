@@ -85,6 +85,31 @@ class LatencyReport:
         """Copy without the samples and ages, to save memory when many reports are kept."""
         return replace(self, table=SampleTable(), ages=None)
 
+    def notes(self) -> list[str]:
+        """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
+        notes = []
+        if self.age_ms is not None and self.control_period_ms is not None and self.longest_hold_ms is not None:
+            older = ", ".join(f"{share:.1%} > {steps}" for steps, share in self.older_than_steps.items())
+            notes.append(
+                f"control period {self.control_period_ms:.1f} ms, longest hold {self.longest_hold_ms:.0f} ms; "
+                f"age in steps: {older}; uncontrolled {self.uncontrolled_share or 0.0:.1%}"
+            )
+        if self.network is not None and str(self.network):
+            notes.append(str(self.network))
+        if self.loop_ms is not None and self.read_on_other_connection:
+            notes.append("read on another connection: positions and torques of the controller have one each")
+        if self.loop_ms is not None and not self.kernel_timestamps:
+            notes.append("without kernel timestamps: controller includes the wake-up of the edge")
+        if self.repaired.duplicates:
+            notes.append(f"dropped duplicate messages: {self.repaired.duplicates}")
+        if self.repaired.reordered:
+            notes.append(f"messages put in order by their sequence number: {self.repaired.reordered}")
+        return notes
+
+    def reason_text(self) -> str:
+        """Reasons why the recording is not valid, as one text; empty: it is valid."""
+        return "; ".join(reason.text for reason in self.reasons)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples."""
         plain = asdict(self.without_table())
