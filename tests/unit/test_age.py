@@ -181,7 +181,7 @@ def test_zero_torque_of_the_simulation_is_uncontrolled(tmp_path: Path) -> None:
     assert report.uncontrolled_share == pytest.approx(60 / 595, abs=0.002)
 
 
-def test_steps_after_lost_states_have_no_age_until_the_next_command(tmp_path: Path) -> None:
+def test_steps_after_lost_states_have_no_age(tmp_path: Path) -> None:
     script = Script(seconds=6.0, poll_ms=100.0)
     run = open_run(write(tmp_path / "run.mcap", make(script), script=script, missing={"state": set(range(100, 106))}))
     report = measure(run)

@@ -101,7 +101,7 @@ class AgeTable:
 
     def _in_use(self, states: Rows) -> NDArray[np.bool_]:
         # A restarted simulation does not know the session until it receives a command.
-        return self._in_session(states) | ((states["session"] == 0) & bool(self._run.controller))
+        return np.asarray(self._in_session(states) | ((states["session"] == 0) & bool(self._run.controller)))
 
     def _add_states(self, states: Rows) -> None:
         changed, hidden = self._changes(states)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from hilrig_replay.analysis.age import AgeTable, LoopAge
+from hilrig_replay.analysis.age import AgeTable
 from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
 from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose, edge_stalls
 from hilrig_replay.analysis.distribution import Statistics, percentiles

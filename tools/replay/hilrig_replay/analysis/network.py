@@ -48,7 +48,6 @@ def network_share(evidence: Evidence) -> NetworkShare | None:
     min_ms = int(measured_us.min()) / 1e3 if len(measured_us) else None
     controller = evidence.stages_ms.get("controller")
     controller_max_ms = None if controller is None or min_ms is None else max(controller.p50 - min_ms, 0.0)
-    retransmissions = sum(
-        int(figures["retransmissions"][figures["controller"] == code].max()) for code in np.unique(figures["controller"])
-    )
+    by_connection = [figures[figures["controller"] == code] for code in np.unique(figures["controller"])]
+    retransmissions = sum(int(rows["retransmissions"].max()) for rows in by_connection)
     return NetworkShare(min_ms, controller_max_ms, retransmissions)
