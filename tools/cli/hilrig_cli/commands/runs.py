@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AsJson, Config, format_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -179,7 +179,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             Path(entry.path).name.removesuffix(MCAP_SUFFIX),
             *([entry.rig, start] if wide else []),
             _duration(entry.duration_s),
-            _size(entry.size),
+            format_size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
             _number(entry.age_p99_ms),
@@ -213,14 +213,6 @@ def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-def _size(size: float) -> str:
-    for unit in ("B", "KiB", "MiB"):
-        if size < 1024:
-            return f"{size:.0f} {unit}"
-        size /= 1024
-    return f"{size:.1f} GiB"
 
 
 def _number(value: float | None) -> str:
