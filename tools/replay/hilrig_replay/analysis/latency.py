@@ -17,7 +17,7 @@ from hilrig_replay.analysis.age import AgeTable
 from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
 from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose, edge_stalls
 from hilrig_replay.analysis.distribution import Statistics, percentiles
-from hilrig_replay.analysis.feedback_test import follows_positions
+from hilrig_replay.analysis.feedback import follows_positions
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import STAGES

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.feedback_test import contains_rounding_errors, follows_positions, is_restoring_law
+from hilrig_replay.analysis.feedback import contains_rounding_errors, follows_positions, is_restoring_law
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
 from hilrig_sim.plant.plant import Plant
 from support.recordings import PARAMETERS, REGISTER_SCALE
