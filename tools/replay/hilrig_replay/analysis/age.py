@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import Blocks, DiskTable
 from hilrig_replay.analysis.distribution import Statistics, median
 from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.disk_table import Blocks, DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 

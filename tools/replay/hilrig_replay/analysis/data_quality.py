@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.age import LoopAge
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, median
 from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Losses, Run
 from hilrig_replay.io.sequence_order import Repairs

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.data_quality import Stalls
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles
 from hilrig_replay.analysis.stages import CONTROLLER, EDGE, INJECTED, TICK_WAIT
 from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_sim.arm.model import JOINT_SCALE

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.stages import LOOP_STAGES, STAGES, fill_stages
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
+from hilrig_replay.io.disk_table import DiskTable
 
 SAMPLE_DTYPE: Final = np.dtype(
     [
