@@ -188,10 +188,11 @@ def _print_gains(evaluation: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    latency = evaluation["latency"]
+    latency, age = evaluation["latency"], evaluation["age_ms"]
     title = (
         f"{evaluation['session']}: loop latency p50 {latency['p50_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
-        f"max {latency['max_ms']:.1f} ms; step {evaluation['step_ms']:g} ms"
+        f"max {latency['max_ms']:.1f} ms; age p50 {age['p50']:.1f}, p99 {age['p99']:.1f} ms; "
+        f"step {evaluation['step_ms']:g} ms"
     )
     table = Table(title=title, title_justify="left", title_style="bold")
     for column in ("controller", "gain", "stable", "mean-square growth", "expected cost", "delay margin, ms"):
