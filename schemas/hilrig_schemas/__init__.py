@@ -18,6 +18,7 @@ from hilrig_schemas.v1.lease_pb2 import LeaseRequest as LeaseRequest
 from hilrig_schemas.v1.lease_pb2 import LeaseStatus as LeaseStatus
 from hilrig_schemas.v1.log_batch_pb2 import LogBatch as LogBatch
 from hilrig_schemas.v1.log_batch_pb2 import OpenSession as OpenSession
+from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusConnection as ModbusConnection
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusKind as ModbusKind
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusRequest as ModbusRequest
 from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusTraffic as ModbusTraffic

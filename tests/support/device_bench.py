@@ -102,8 +102,8 @@ class Bench:
         if self.arrive is not None:
             self.arrive(self.arrival)
 
-    def connect(self, host: str = "10.0.0.1", port: int = 1000, **permissions: bool) -> Client:
-        return self.device.connect(host, port, **permissions)
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **identity: Any) -> Client:
+        return self.device.connect(host, port, **identity)
 
     def read(
         self, client: Client, address: int, count: int, table: RegisterTable = RegisterTable.HOLDING_REGISTER

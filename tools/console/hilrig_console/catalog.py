@@ -177,6 +177,6 @@ def _row(entry: RunEntry) -> dict[str, Any]:
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = recording_stem(Path(entry.path).name)
-    row["unfit"] = "; ".join(entry.unfit_reasons)
+    row["unfit"] = "; ".join(reason.text for reason in entry.unfit_reasons)
     row["open"] = entry.ended == IN_PROGRESS
     return row

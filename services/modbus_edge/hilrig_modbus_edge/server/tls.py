@@ -22,8 +22,9 @@ from hilrig_runtime.errors import InputError
 Role = Literal["operator", "observer", "refuse"]
 """Permission of a client: write and read, read only, or no connection."""
 
-Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
-"""Serves a client: its transport, host and port, whether it may write, and the data that it has already sent."""
+Serve = Callable[[asyncio.Transport, str, int, bool, str, bytes], None]
+"""Serves a client: its transport, host and port, whether it may write, the name in its certificate, and the data that
+it has already sent."""
 
 HANDSHAKE_TIMEOUT_S: Final = 5.0
 """Timeout of the TLS handshake and of the TLS shutdown, s."""
@@ -39,9 +40,10 @@ class TlsPolicy:
 
     def __init__(self, tls: TlsConfig) -> None:
         # Imported here: an edge without TLS does not load the certificate library.
-        from hilrig_runtime.security.x509 import role_of
+        from hilrig_runtime.security.x509 import common_name_of, role_of
 
         self._role_of = role_of
+        self.name_of = common_name_of
         self._no_role: Role = tls.no_role
         self.context = context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -125,7 +127,8 @@ class TlsHandshake(asyncio.Protocol):
             self._admission.pending_handshakes.discard(self)
         if secured.is_closing():
             return
-        role = self._policy.role_of(secret.getpeercert(binary_form=True) or b"")
+        certificate = secret.getpeercert(binary_form=True) or b""
+        role = self._policy.role_of(certificate)
         if role == "refuse":
             self._admission.refuse(
                 host,
@@ -134,7 +137,7 @@ class TlsHandshake(asyncio.Protocol):
             )
             secured.abort()
             return
-        self._serve(secured, host, port, role == "operator", bytes(self._early))
+        self._serve(secured, host, port, role == "operator", self._policy.name_of(certificate), bytes(self._early))
 
 
 def _reason(error: Exception) -> str:

@@ -23,6 +23,7 @@ def play(
 ) -> None:
     """Publish a recording on the bus with its original timing, for tools that subscribe to a running rig."""
     from hilrig_replay.export.player import Player, publish_recording, rig_config
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
@@ -31,7 +32,8 @@ def play(
     from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
 
     lab = load_lab(config)
-    opened = open_run(run)
+    with isolated(run):
+        opened = open_run(run)
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
         raise InputError(f"--rig: {name!r} is not a valid rig name")

@@ -60,7 +60,10 @@ def runs(
     rebuild: Annotated[bool, typer.Option("--rebuild", help="Rebuild the index: read every file again.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason."""
+    """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason.
+
+    Exit code 1: a listed recording is unusable.
+    """
     from hilrig_replay.analysis.index import RunIndex
     from hilrig_runtime.config.lab import load_lab
 
@@ -90,6 +93,8 @@ def runs(
         _print_json(index.folder, entries, total)
     else:
         _print_table(index.folder, entries, total, read)
+    if any(entry.error for entry in entries):
+        raise typer.Exit(1)
 
 
 def _wall_ns(option: str, text: str) -> int | None:
@@ -165,7 +170,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     if wide:
         table.add_column("rig", no_wrap=True)
         table.add_column("start (UTC)", no_wrap=True)
-    for column in ("duration", "size", "p50 ms", "p99 ms", "lost"):
+    for column in ("duration", "size", "p50 ms", "p99 ms", "age p99", "lost"):
         table.add_column(column, justify="right", no_wrap=True)
     if wide:
         table.add_column("controller", no_wrap=True)
@@ -182,6 +187,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             format_size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
+            _number(entry.age_p99_ms),
             f"[red]{lost}[/]" if lost else "0",
             *([entry.controller, _yes_no(entry.verified)] if wide else []),
             _yes_no(entry.fit),

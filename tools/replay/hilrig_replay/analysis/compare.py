@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.summary import RunSummary, Trajectory, summarize, under_command
 from hilrig_replay.io.columns import JointValues, joint_values
+from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.run import Run
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import HilrigError, InputError
 
 MOTION_THRESHOLD: Final = (0.01, 0.01, 0.005, 0.01)
 """Minimum speed of a moving joint; rad/s, rad/s, m/s, rad/s."""
@@ -40,6 +41,9 @@ class Difference:
     loop_p50_ms: float | None
     """Median loop latency minus that of the reference, ms; None: one of the runs has no samples."""
     loop_p99_ms: float | None
+    age_p50_ms: float | None
+    """Median age of the acting torque's basis minus that of the reference, ms; None: one of the runs has no age."""
+    age_p99_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +97,17 @@ def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
     """
     if len(runs) < 2:
         raise InputError(f"a comparison requires at least two runs, got {len(runs)}")
-    reference, origin = _aligned(runs[0], align)
+    with isolated(runs[0].path):
+        reference, origin = _aligned(runs[0], align)
     kept, summaries, origins = [runs[0]], [reference], [origin]
     differences: list[Difference] = []
     left_out: list[str] = []
     for run in runs[1:]:
         try:
-            summary, origin = _aligned(run, align)
-            differences.append(_difference(reference, summary))
-        except InputError as error:
+            with isolated(run.path):
+                summary, origin = _aligned(run, align)
+                differences.append(_difference(reference, summary))
+        except HilrigError as error:
             left_out.append(str(error))
             continue
         kept.append(run)
@@ -167,6 +173,7 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
     effort = _at(theirs, theirs.effort, at) - _at(ours, ours.effort, at)
     apart_mm = np.linalg.norm(_at(theirs, theirs.tip, at) - _at(ours, ours.tip, at), axis=1) * 1e3
     mine, its = reference.latency.loop_ms, other.latency.loop_ms
+    my_age, its_age = reference.latency.age_ms, other.latency.age_ms
     return Difference(
         session=other.session,
         overlap_s=float(high - low),
@@ -177,6 +184,8 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
         effort_rms=joint_values(np.sqrt((effort**2).mean(axis=0))),
         loop_p50_ms=None if mine is None or its is None else its.p50 - mine.p50,
         loop_p99_ms=None if mine is None or its is None else its.p99 - mine.p99,
+        age_p50_ms=None if my_age is None or its_age is None else its_age.p50 - my_age.p50,
+        age_p99_ms=None if my_age is None or its_age is None else its_age.p99 - my_age.p99,
     )
 
 
