@@ -271,9 +271,7 @@ class FileStore:
     def _report(self, recording: Recording, text: str) -> None:
         self._raise_alert(recording.rig, text, Event.ERROR, rig=recording.rig, session=recording.session)
 
-    def _raise_alert(
-        self, key: str, text: str, severity: Event.Severity, *, rig: str = "", session: str = ""
-    ) -> None:
+    def _raise_alert(self, key: str, text: str, severity: Event.Severity, *, rig: str = "", session: str = "") -> None:
         """Set the alert `key`, and emit an event if it changed."""
         if self._alerts.get(key) != text:
             self._alerts[key] = text
