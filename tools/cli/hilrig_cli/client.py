@@ -1,5 +1,6 @@
 """Client side of a running lab: discovers its services and queries its edges."""
 
+import sys
 import time
 from collections.abc import Sequence, Set
 from importlib.metadata import version
@@ -7,7 +8,6 @@ from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
-from hilrig_cli.options import log
 from hilrig_cli.service_kinds import RIG_SERVICES
 from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
@@ -108,7 +108,9 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         if waited_s > WAIT_MESSAGE_AFTER_S and not message_printed:
             message_printed = True
             where = "for a service that it was added to"
-            log(f"rig {rig!r} is not in lab.toml; waiting up to {QUERY_TIMEOUT_S:g} s {where}")
+            print(
+                f"hilrig: rig {rig!r} is not in lab.toml; waiting up to {QUERY_TIMEOUT_S:g} s {where}", file=sys.stderr
+            )
         time.sleep(0.05)
 
 
