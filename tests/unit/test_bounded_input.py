@@ -17,7 +17,7 @@ from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
-from hilrig_runtime.config.toml_file import MAX_TEXT_BYTES, read_text
+from hilrig_runtime.config.validation import MAX_TEXT_BYTES, read_text
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import MAX_JSON_CHARACTERS, RigParameters
 from hilrig_study.study_config import load_study

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from hilrig_runtime.config.toml_file import read_text
 from hilrig_runtime.config.types import NotNegative, Section
+from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError
 
 MAX_DELAY_MS: Final = 10_000.0

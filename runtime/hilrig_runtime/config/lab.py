@@ -15,7 +15,6 @@ from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.toml_file import parse_toml, read_text
 from hilrig_runtime.config.types import (
     Flag,
     Name,
@@ -27,8 +26,9 @@ from hilrig_runtime.config.types import (
     Section,
     TableForm,
     Vector4,
+    check_distinct,
 )
-from hilrig_runtime.config.validation import format_validation_error
+from hilrig_runtime.config.validation import format_validation_error, parse_toml, read_text, validate
 from hilrig_runtime.errors import InputError, list_names
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
@@ -211,9 +211,7 @@ class RigsTable(Section):
 
     @model_validator(mode="after")
     def _names_are_distinct(self) -> "RigsTable":
-        for name, times in Counter(rig.name for rig in self.single).items():
-            if times > 1:
-                raise ValueError(f"duplicate rig name {name!r}")
+        check_distinct("rig name", (rig.name for rig in self.single))
         return self
 
 
@@ -247,9 +245,7 @@ class LabConfig(Section):
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
-        for name, times in Counter(rig.name for rig in self.rigs).items():
-            if times > 1:
-                raise ValueError(f"duplicate rig name {name!r}")
+        check_distinct("rig name", (rig.name for rig in self.rigs))
         all_ports = [*self.ports.items(), *self.tls_ports.items()]
         ports = Counter(port for _, port in all_ports)
         for rig, port in all_ports:
@@ -352,9 +348,6 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
     Raises:
         InputError: as `load_lab`.
     """
-    try:
-        lab = LabConfig.model_validate(parse_toml(text, where))
-    except ValidationError as error:
-        raise InputError("\n".join(f"{where}: {text}" for text in format_validation_error(error))) from error
+    lab = validate(LabConfig, parse_toml(text, where), where)
     lab._source = text
     return lab

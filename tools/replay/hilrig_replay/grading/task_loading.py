@@ -8,8 +8,7 @@ from pydantic import ValidationError
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.toml_file import parse_toml
-from hilrig_runtime.config.validation import format_validation_error
+from hilrig_runtime.config.validation import format_validation_error, parse_toml
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import RigParameters
