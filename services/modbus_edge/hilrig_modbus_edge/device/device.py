@@ -10,7 +10,7 @@ from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.device.client import Client, Controller, address_of, controller_of
+from hilrig_modbus_edge.device.client import Client, ConnectedController, address_of, controller_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import EventEmitter
@@ -63,7 +63,7 @@ class Device:
     ) -> None:
         self.rig = rig
         self.clients: set[Client] = set()
-        self._controllers: dict[str, Controller] = {}
+        self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
         self._monotonic_ns = clock.monotonic_ns
         self._session = SessionState()
@@ -101,7 +101,7 @@ class Device:
         now_ns = self._monotonic_ns()
         client = Client(host, address_of(host, port), certificate, may_write, last_request_ns=now_ns)
         name = controller_of(client, self._lease_setting)
-        client.controller = self._controllers.setdefault(name, Controller(name))
+        client.controller = self._controllers.setdefault(name, ConnectedController(name))
         client.controller.clients.add(client)
         self.clients.add(client)
         return client
@@ -125,6 +125,17 @@ class Device:
         """Emit an event for `count` refused connections of a host."""
         text = f"{address}: connection to {self.rig} refused: {reason}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
+
+    def report_stalls(self, count: int, longest_ns: int) -> None:
+        """Emit an event for `count` stalls of the edge, the longest of `longest_ns`, if a session is open."""
+        if self.session is None:
+            return
+        times = "once" if count == 1 else f"{count} times, at most"
+        text = f"the edge stalled {times} for {longest_ns / MS:.0f} ms: its host was overloaded, or it was stopped"
+        event = self._events.event(Event.OVERRUN, Event.WARNING, text)
+        event.overrun_data.lateness_ns = longest_ns
+        event.overrun_data.stalls = count
+        self._events.emit(event)
 
     def connections_of(self, host: str) -> int:
         """Return the number of connections of a host."""
@@ -196,8 +207,17 @@ class Device:
         if end > POSITION_ADDRESS and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
-    def write_registers(self, client: Client, address: int, words: bytes, arrived_ns: int) -> None:
+    def write_registers(
+        self, client: Client, address: int, words: bytes, arrived_ns: int, received_ns: int = 0
+    ) -> None:
         """Write holding registers, all or none; torques are published at once.
+
+        Args:
+            client: connection that writes.
+            address: first register.
+            words: values, big-endian.
+            arrived_ns: arrival of the write at this process, ns, monotonic clock.
+            received_ns: kernel's receive timestamp of the write, ns, monotonic clock; 0: unavailable.
 
         Raises:
             ModbusError: 02 a register does not exist or is read-only, 04 the watchdog timeout is outside the bounds
@@ -207,7 +227,7 @@ class Device:
         if end <= POSITION_ADDRESS:
             self._write_access.authorize_write(client, arrived_ns)
             self._commands.torque[2 * address : 2 * end] = words
-            self._publish_write(client, arrived_ns)
+            self._publish_write(client, arrived_ns, received_ns)
             return
         self.check_writable(address, len(words) // 2)
         if end == EXTENDED_END:
@@ -222,8 +242,8 @@ class Device:
         self._commands.publish_session()
         self._write_access.feed_watchdog(client, arrived_ns)
 
-    def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int) -> None:
-        """Switch the magnet, or reset the rig.
+    def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int, received_ns: int = 0) -> None:
+        """Switch the magnet, or reset the rig; arguments as `write_registers`.
 
         Raises:
             ModbusError: as `write_registers`.
@@ -239,11 +259,11 @@ class Device:
             self._commands.magnet = on
         else:
             self._commands.reset()
-        self._publish_write(client, arrived_ns)
+        self._publish_write(client, arrived_ns, received_ns)
 
-    def _publish_write(self, client: Client, arrived_ns: int) -> None:
+    def _publish_write(self, client: Client, arrived_ns: int, received_ns: int) -> None:
         """Publish the written registers; a command that the emulated network drops does not feed the watchdog."""
-        if self._commands.publish_write(client, arrived_ns):
+        if self._commands.publish_write(client, arrived_ns, received_ns):
             self._write_access.feed_watchdog(client, arrived_ns)
 
     # -- time

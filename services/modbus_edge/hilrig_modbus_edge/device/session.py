@@ -6,7 +6,7 @@ or a sequence of one-shot commands, is one recording. Time is passed in.
 
 from dataclasses import dataclass
 
-from hilrig_modbus_edge.device.client import Controller
+from hilrig_modbus_edge.device.client import ConnectedController
 from hilrig_schemas import OpenSession
 
 
@@ -20,8 +20,8 @@ class Session:
     """Number among the rig's sessions since the edge started, from 1."""
     address: str
     """Address of the client that started it, "host:port"."""
-    controller: Controller
-    """Controller of that client."""
+    controller: ConnectedController
+    """The controller of that client."""
     start_wall_ns: int
     released_ns: int | None = None
     """Time at which the lease was released, ns, monotonic clock; None: the lease is held."""
