@@ -333,7 +333,7 @@ class SocketTransport(asyncio.Transport):
 
 
 def set_receive_timestamps(listening: socket.socket) -> None:
-    """Let the kernel stamp what the connections of a listening socket receive, on systems that can."""
+    """Let the kernel stamp received data on the connections of a listening socket, on systems that can."""
     if sys.platform == "linux":
         with suppress(OSError):
             listening.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, _RECEIVE_SOFTWARE)
