@@ -6,7 +6,17 @@ import pytest
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
-from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, INPUT_END, MAGNET_COIL, RESET_COIL, Status, address_of
+from hilrig_modbus_edge.registers.map import (
+    ECHO_ADDRESS,
+    EXTENDED_END,
+    INPUT_END,
+    MAGNET_COIL,
+    PAPER_END,
+    POSITION_ADDRESS,
+    RESET_COIL,
+    Status,
+    address_of,
+)
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
@@ -332,7 +342,7 @@ def test_first_writer_acquires_lease_and_others_get_06(bench: Bench) -> None:
 
 def test_invalid_write_acquires_no_lease(bench: Bench) -> None:
     client = bench.connect()
-    for address in (4, 8, 99, 102):
+    for address in (POSITION_ADDRESS, PAPER_END, ECHO_ADDRESS - 1, EXTENDED_END):
         with pytest.raises(ModbusError) as refusal:
             bench.write(client, address, 1)
         assert refusal.value.code == 2

@@ -12,7 +12,7 @@ from hilrig_sim.commands import CommandLatch
 from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 
-LIMIT_EVENT_PERIOD_NS: Final = 250_000_000
+LIMIT_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events of one limit of a rig, ns: a joint may chatter at its stop."""
 MAX_LIMITS: Final = 4096
 """Number of limits whose events are rate-limited; a rig has 9."""

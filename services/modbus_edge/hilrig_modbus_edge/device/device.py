@@ -33,6 +33,7 @@ from hilrig_modbus_edge.registers.map import (
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
+    WATCHDOG_ADDRESS,
     Status,
     struct_of,
 )
@@ -230,13 +231,15 @@ class Device:
             self._publish_write(client, arrived_ns, received_ns)
             return
         self.check_writable(address, len(words) // 2)
-        if end == EXTENDED_END:
-            timeout_ns = int.from_bytes(words[-2:], "big") * MS
+        sets_timeout = address <= WATCHDOG_ADDRESS < end
+        if sets_timeout:
+            at = 2 * (WATCHDOG_ADDRESS - address)
+            timeout_ns = int.from_bytes(words[at : at + 2], "big") * MS
             self._write_access.check_timeout(timeout_ns)
         self._write_access.authorize_write(client, arrived_ns)
         if address == ECHO_ADDRESS:
             self._commands.echo = int.from_bytes(words[:2], "big")
-        if end == EXTENDED_END:
+        if sets_timeout:
             self._write_access.set_timeout(timeout_ns)
         # These are registers of the edge, so the emulated network does not drop the write.
         self._commands.publish_session()
