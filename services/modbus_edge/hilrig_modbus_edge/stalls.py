@@ -26,7 +26,7 @@ class StallReporter:
         """Longest stall that was not reported yet, ns; 0: all were."""
 
     def on_tick(self, tick: Tick, now_ns: int) -> None:
-        """Record a tick that starts at `now_ns`, monotonic clock, and report what is due."""
+        """Record a tick that starts at `now_ns`, monotonic clock, and report stalls if that is due."""
         # Lateness against the original deadline: `lateness_ns` is against the one after the skipped periods.
         late_ns = tick.lateness_ns + tick.missed_steps * self._period_ns
         count = 0
