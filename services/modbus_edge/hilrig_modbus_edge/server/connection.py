@@ -34,6 +34,10 @@ _TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
 _pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
 
 
+def _not_stamped(earliest_ns: int, latest_ns: int) -> int:  # noqa: ARG001
+    return 0
+
+
 class ConnectionOwner(Protocol):
     """The server of a connection, as far as the connection uses it."""
 
@@ -55,7 +59,8 @@ class Connection(asyncio.BufferedProtocol):
         self.socket: socket.socket = transport.get_extra_info("socket")
         self._server = server
         self._transport = transport
-        self._timestamps = transport if isinstance(transport, SocketTransport) else None
+        self._kernel_received_ns = transport.received_ns if isinstance(transport, SocketTransport) else _not_stamped
+        """Returns when the kernel received the newest bytes, within two bounds; 0: unavailable, as with TLS."""
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._log_request = server.request_log.record
@@ -93,8 +98,9 @@ class Connection(asyncio.BufferedProtocol):
             transaction, protocol, length, unit = _unpack_header(self._buffer)
             if nbytes == 6 + length and not protocol:
                 pdu = self._view[_PDU:nbytes].tobytes()
-                received_ns = self._kernel_received_ns(now_ns) if pdu[0] in _WRITES else 0
-                self.client.record_request(now_ns)
+                client = self.client
+                received_ns = self._kernel_received_ns(client.last_request_ns, now_ns) if pdu[0] in _WRITES else 0
+                client.record_request(now_ns)
                 self._transport.write(self._reply(transaction, unit, pdu, now_ns, received_ns))
                 return
         if self._transport.is_closing():
@@ -108,7 +114,7 @@ class Connection(asyncio.BufferedProtocol):
         received_ns = 0
         if requests:
             if any(request.pdu[0] in _WRITES for request in requests):
-                received_ns = self._kernel_received_ns(now_ns)
+                received_ns = self._kernel_received_ns(self.client.last_request_ns, now_ns)
             self.client.record_request(now_ns)
         if len(requests) <= MAX_REQUESTS_PER_TURN and not self._backlog:
             self._answer(requests, now_ns, received_ns)
@@ -164,12 +170,6 @@ class Connection(asyncio.BufferedProtocol):
             self._close_malformed(self._malformed)
         else:
             asyncio.get_running_loop().call_soon(self._drain_backlog)
-
-    def _kernel_received_ns(self, now_ns: int) -> int:
-        """Return when the kernel received the newest bytes, ns, monotonic clock; 0: unavailable, as with TLS."""
-        if self._timestamps is None:
-            return 0
-        return self._timestamps.received_ns(self.client.last_request_ns, now_ns)
 
     def _answer(self, requests: list[Request], arrived_ns: int, received_ns: int) -> None:
         if requests:
