@@ -52,7 +52,7 @@ class Write:
 
 
 class Witness:
-    """What the packets of one connection show; times in ns on the wall clock."""
+    """The loop as the packets of one connection show it; times in ns on the wall clock."""
 
     def __init__(self, packets: list[Packet]) -> None:
         self.packets = packets

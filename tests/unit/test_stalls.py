@@ -36,7 +36,9 @@ def test_event_names_the_stalls_of_a_rig_with_a_session() -> None:
     bench.state(3)
     bench.device.report_stalls(1, 60 * MS)
     assert bench.events == []
-    bench.write(bench.connect(), 0, 1)
+    client = bench.connect()
+    bench.read(client, 4, 4)
+    bench.write(client, 0, 1)
     bench.device.report_stalls(1, 187 * MS)
     bench.device.report_stalls(12, 201 * MS)
     one, more = bench.events[-2:]
