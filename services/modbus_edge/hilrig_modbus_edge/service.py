@@ -14,7 +14,6 @@ from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.control_api import handle_impairment_query, handle_lease_query
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop
-from hilrig_modbus_edge.stalls import StallReporter
 from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.control import Handlers, handle_control_request
@@ -69,7 +68,6 @@ class EdgeService:
         for number, endpoint in enumerate(self._endpoints.values()):
             # Staggered: encoding the request logs of all rigs in one tick would delay requests.
             endpoint.request_log_due_ns = now_ns + number * TICK_NS
-        self._stalls = StallReporter(TICK_NS, self._report_stalls)
         service.counters.rigs = len(service.rigs)
         service.health.rig_reports = lambda: [endpoint.report() for endpoint in self._endpoints.values()]
         service.addresses = self._address_of
@@ -227,17 +225,17 @@ class EdgeService:
             await asyncio.sleep(rate.remaining_s)
             tick = rate.tick(monotonic_ns())
             service.counters.count_tick(tick, TICK_NS)
-            self._stalls.on_tick(tick, monotonic_ns())
+            # Lateness against the original deadline: `lateness_ns` is against the one after the skipped periods.
+            late_ns = tick.lateness_ns + tick.missed_steps * TICK_NS
+            if late_ns > TICK_NS:
+                for endpoint in self._endpoints.values():
+                    endpoint.device.report_stall(late_ns, monotonic_ns())
             for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)
                 endpoint.on_tick(monotonic_ns())
             service.beat(monotonic_ns())
             rate.next_ns = self._middle_of_step(rate.next_ns)
-
-    def _report_stalls(self, count: int, longest_ns: int) -> None:
-        for endpoint in self._endpoints.values():
-            endpoint.device.report_stalls(count, longest_ns)
 
     def _middle_of_step(self, deadline_ns: int) -> int:
         """Return the time nearest to a deadline that is half a step after a state arrived, ns, monotonic clock.

@@ -127,16 +127,10 @@ class Device:
         text = f"{address}: connection to {self.rig} refused: {reason}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
 
-    def report_stalls(self, count: int, longest_ns: int) -> None:
-        """Emit an event for `count` stalls of the edge, the longest of `longest_ns`, if a session is open."""
-        if self.session is None:
-            return
-        times = "once" if count == 1 else f"{count} times, at most"
-        text = f"the edge stalled {times} for {longest_ns / MS:.0f} ms: its host was overloaded, or it was stopped"
-        event = self._events.event(Event.OVERRUN, Event.WARNING, text)
-        event.overrun_data.lateness_ns = longest_ns
-        event.overrun_data.stalls = count
-        self._events.emit(event)
+    def report_stall(self, late_ns: int, now_ns: int) -> None:
+        """Report a tick of the edge that is late by more than its period, if a session is open; ns, monotonic clock."""
+        if self.session is not None:
+            self._write_access.stalls.record(late_ns, now_ns)
 
     def connections_of(self, host: str) -> int:
         """Return the number of connections of a host."""
