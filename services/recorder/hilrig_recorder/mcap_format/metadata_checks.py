@@ -1,4 +1,4 @@
-"""Checks of metadata records, which have no checksum: the numbers in them, and the copies at the end of a file. Pure."""
+"""Checks of metadata records, which have no checksum: their numbers, and the copies at the end of a file. Pure."""
 
 from typing import Final
 
