@@ -8,7 +8,7 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 from hilrig_runtime.errors import InputError
 
@@ -18,6 +18,9 @@ LARGEST_REGISTER_FORCE: Final = 32.767
 """Largest force in the paper's force register, N."""
 LARGEST_EFFORT: Final = 32.768
 """Largest effort of the drives, N·m or N: the absolute limit of a torque register."""
+
+AUTO: Final = "auto"
+"""Value of `StepParameters.substeps`: the number of integration steps is chosen for each rig and step."""
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -139,7 +142,8 @@ class StepParameters:
     """Step length and integration method."""
 
     step_ns: int = 20_000_000
-    substeps: int = 1
+    substeps: int | Literal["auto"] = AUTO
+    """Integration steps of a step of the loop: a fixed number, or `AUTO`."""
     integrator: str = "rkf45"
 
     @property

@@ -12,10 +12,14 @@ import numpy as np
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import ArmParameters, RigParameters
+from hilrig_sim.arm.model import ArmParameters, RigParameters, StepParameters
 
 STABILITY_MARGIN: Final = 0.2
 """Required safety margin, as a fraction of the limit."""
+
+RESOLVED_DECAY: Final = {"euler": 0.05, "rk4": 0.8, "rkf45": 1.3}
+"""Largest λh with which a method resolves a decaying mode: the error of its speed in a step is below 0.5 % of its
+amplitude."""
 
 
 def fastest_mode(arm: ArmParameters, theta2: float | None = None, payload: float = 0.0) -> float:
@@ -35,6 +39,11 @@ def largest_safe_step(arm: ArmParameters, integrator: str) -> float:
     """Return the longest integration step with the margin, s; infinity without a decaying mode."""
     rate = fastest_mode(arm)
     return math.inf if rate == 0 else (1 - STABILITY_MARGIN) * TABLEAUS[integrator].negative_real_limit() / rate
+
+
+def base_substeps(arm: ArmParameters, sim: StepParameters) -> int:
+    """Return the number of integration steps that resolve the fastest mode of the arm in a step of the loop."""
+    return max(1, math.ceil(fastest_mode(arm) * sim.step / RESOLVED_DECAY[sim.integrator] - 1e-9))
 
 
 def check_stable(parameters: RigParameters) -> None:
