@@ -33,6 +33,7 @@ from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
 from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, Supervisor
 from hilrig_replay.analysis import latency
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.bus import BusConfig
@@ -138,7 +139,7 @@ def add_loop(report: Report, step_ms: float, runs: list[RigRun]) -> None:
         for name, quantile in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999), ("max", 1.0)):
             loop[name] = float(np.quantile(selected["loop"], quantile)) / 1e6 if len(selected) else float("nan")
             report.add(case, f"loop {name}, {selection}", loop[name], "ms")
-    for stage in latency.STAGES:
+    for stage in STAGES:
         report.add(case, f"stage {stage} p50", float(np.median(samples[stage])) / 1e6, "ms")
     report.add(case, "lost", max(run.lost for run in runs), "count")
     report.add(case, "Modbus cycles", statistics.median(run.figures["cycles_per_s"] for run in runs), "1/s")

@@ -179,8 +179,9 @@ def protocol_code_us(frame: bytes, times: int = 30_000) -> float:
         state = JointState(rig="rig1", step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
         arrival = TimestampedPayload(state.SerializeToString(), service.clock.monotonic_ns())
         output = Mock(send_command=service.rig_publisher(topics.COMMAND, "rig1").publish)
-        device = Device("rig1", DeviceSettings(), service.clock, output, lambda: arrival)
-        server = RigServer(device, Limits(), service.clock, service.counters)
+        settings = DeviceSettings.of(service.lab.edge, service.lab.impairment)
+        device = Device("rig1", settings, service.clock, output, lambda: arrival)
+        server = RigServer(device, Limits(32, 16, 0, ()), service.clock, service.counters)
         transport = Mock(write=lambda _: None)
         connection = ModbusConnection(server, transport, device.connect("127.0.0.1", 1))
         for _ in range(2):

@@ -7,6 +7,9 @@ magnet off.
 from dataclasses import dataclass
 from itertools import groupby
 
+from hilrig_modbus_edge.protocol.functions import FunctionCode
+from hilrig_modbus_edge.registers.export import TABLE_NAMES
+
 
 @dataclass(frozen=True)
 class Rule:
@@ -344,6 +347,16 @@ The specifications leave three points open. hilrig implements them as follows:
 - A write by a client that does not hold the lease gets exception 06. A write by a client with a read-only role gets
   exception 01, as specified by MODBUS/TCP Security.
 
+## Functions
+
+A request counts as a read, a write, or, if it is answered with an exception response, an error. Function 23 writes
+torques and counts as a write.
+
+| code | function | accesses | counts as |
+|---:|---|---|---|
+"""
+
+SINGLE_REQUESTS = """
 ## Single requests
 
 Requests and responses are PDUs in hex; `*n` means that the preceding byte is repeated n times.
@@ -356,6 +369,11 @@ Requests and responses are PDUs in hex; `*n` means that the preceding byte is re
 def as_markdown() -> str:
     """Return the page `docs/modbus-conformance.md`."""
     lines = [HEADER]
+    for function in FunctionCode:
+        name, kind = function.name.lower().replace("_", " "), "write" if function.is_write else "read"
+        table = "" if function.table is None else f"{TABLE_NAMES[function.table]}s"
+        lines.append(f"| {function} | {name} | {table} | {kind} |\n")
+    lines.append(SINGLE_REQUESTS)
     for rule in RULES:
         before = "".join(f"after `{_short(one)}`: " for one in rule.before)
         lines.append(f"| {rule.clause} | {rule.text} | {before}`{_short(rule.request)}` | `{rule.answer}` |\n")

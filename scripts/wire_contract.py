@@ -35,7 +35,7 @@ class Contract:
     lines: frozenset[str]
     messages: frozenset[str]
     reserved: frozenset[tuple[str, str]]
-    """Pairs of message and number, and of message and name."""
+    """Pairs of message or enum and number, and of message or enum and name."""
 
 
 def files() -> list[FileDescriptorProto]:
@@ -55,15 +55,22 @@ def contract(schemas: Iterable[FileDescriptorProto]) -> Contract:
     messages: set[str] = set()
     reserved: set[tuple[str, str]] = set()
     for file in schemas:
-        lines.update(_enums(file.package, file.enum_type))
+        enums = list(_all_enums(file.package, file.enum_type))
         for name, message in _all_messages(file.package, file.message_type):
             messages.add(name)
             lines.update(f"field {name} {field.number} {field.name} {_type(field)}" for field in message.field)
-            lines.update(_enums(name, message.enum_type))
+            enums += _all_enums(name, message.enum_type)
             reserved.update(
                 (name, str(number)) for span in message.reserved_range for number in range(span.start, span.end)
             )
             reserved.update((name, text) for text in message.reserved_name)
+        for name, enum in enums:
+            lines.update(f"enum {name} {value.number} {value.name}" for value in enum.value)
+            # The last number of an enum's range is inclusive, unlike that of a message.
+            reserved.update(
+                (name, str(number)) for span in enum.reserved_range for number in range(span.start, span.end + 1)
+            )
+            reserved.update((name, text) for text in enum.reserved_name)
     return Contract(frozenset(lines), frozenset(messages), frozenset(reserved))
 
 
@@ -74,6 +81,8 @@ def topic_lines() -> Iterator[str]:
         channel = f" in {topic.channel}" if topic.channel else ""
         key = topic.key(*parts)  # type: ignore[attr-defined]
         yield f"topic {key} {topic.message.DESCRIPTOR.full_name} {topic.traffic.value}{channel}"
+        if topic.request is not None:
+            yield f"request {key} {topic.request.DESCRIPTOR.full_name}"
     yield f"alive {topics.alive_key('<lab>', '<service>', '<instance>')}"
 
 
@@ -86,9 +95,9 @@ def _violation(line: str, now: Contract) -> str:
     if line in now.lines:
         return ""
     kind, owner, *rest = line.split(" ")
-    if kind != "field":
+    if kind not in ("field", "enum"):
         return "changed or removed"
-    if owner not in now.messages:
+    if kind == "field" and owner not in now.messages:
         # Messages that are used are covered by the entries of topics and fields.
         return ""
     number, name, *_ = rest
@@ -117,9 +126,9 @@ def _all_messages(package: str, messages: Iterable[DescriptorProto]) -> Iterator
         yield from _all_messages(name, message.nested_type)
 
 
-def _enums(owner: str, enums: Iterable[EnumDescriptorProto]) -> Iterator[str]:
+def _all_enums(owner: str, enums: Iterable[EnumDescriptorProto]) -> Iterator[tuple[str, EnumDescriptorProto]]:
     for enum in enums:
-        yield from (f"enum {owner}.{enum.name} {value.number} {value.name}" for value in enum.value)
+        yield f"{owner}.{enum.name}", enum
 
 
 def _type(field: FieldDescriptorProto) -> str:

@@ -1,5 +1,14 @@
 """Messages on the bus and in files (`v1/*.proto`), and the registry of topics (`topics`)."""
 
+from hilrig_schemas.v1.control_pb2 import (
+    AddRig,
+    ControlReply,
+    ControlRequest,
+    RemoveRig,
+    ResetRig,
+    StartSession,
+    StopSession,
+)
 from hilrig_schemas.v1.event_pb2 import Event
 from hilrig_schemas.v1.health_pb2 import Health, RigReport
 from hilrig_schemas.v1.impairment_pb2 import ImpairmentRequest, ImpairmentStatus
@@ -13,6 +22,9 @@ from hilrig_schemas.v1.service_info_pb2 import ServiceInfo
 from hilrig_schemas.v1.torque_command_pb2 import TorqueCommand
 
 __all__ = [
+    "AddRig",
+    "ControlReply",
+    "ControlRequest",
     "Event",
     "Health",
     "ImpairmentRequest",
@@ -26,9 +38,13 @@ __all__ = [
     "ModbusTraffic",
     "OpenSession",
     "PartState",
+    "RemoveRig",
+    "ResetRig",
     "RigBatch",
     "RigConfig",
     "RigReport",
     "ServiceInfo",
+    "StartSession",
+    "StopSession",
     "TorqueCommand",
 ]

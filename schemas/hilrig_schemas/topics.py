@@ -15,10 +15,14 @@ from typing import Final, Generic, TypeVar
 from google.protobuf.message import Message
 
 from hilrig_schemas import (
+    ControlReply,
+    ControlRequest,
     Event,
     Health,
+    ImpairmentRequest,
     ImpairmentStatus,
     JointState,
+    LeaseRequest,
     LeaseStatus,
     LogBatch,
     ModbusTraffic,
@@ -57,6 +61,8 @@ class Topic(Generic[MessageT]):
     traffic: Traffic
     channel: str | None = None
     """Channel in a recording; None: not recorded."""
+    request: type[Message] | None = None
+    """Type of the queries that `message` replies to; None: published, or queried without a payload."""
 
     def decode(self, payload: bytes) -> MessageT:
         """Decode one message.
@@ -90,11 +96,11 @@ COMMAND: Final = RigTopic("command", TorqueCommand, Traffic.CONTROL, channel="/c
 EVENT: Final = RigTopic("event", Event, Traffic.REPORT, channel="/event")
 TRAFFIC: Final = RigTopic("traffic", ModbusTraffic, Traffic.REPORT, channel="/traffic")
 CONFIG: Final = RigTopic("config", RigConfig, Traffic.QUERY)
-LEASE: Final = RigTopic("lease", LeaseStatus, Traffic.QUERY)
-IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY)
+LEASE: Final = RigTopic("lease", LeaseStatus, Traffic.QUERY, request=LeaseRequest)
+IMPAIRMENT: Final = RigTopic("impairment", ImpairmentStatus, Traffic.QUERY, request=ImpairmentRequest)
 LOG: Final = ServiceTopic("log", LogBatch, Traffic.RECORDING)
 HEALTH: Final = ServiceTopic("health", Health, Traffic.REPORT)
-CONTROL: Final = ServiceTopic("control", Event, Traffic.QUERY)
+CONTROL: Final = ServiceTopic("control", ControlReply, Traffic.QUERY, request=ControlRequest)
 """Requests of an operator: manual sessions (recorder), adding and removing rigs (simulation and edge)."""
 SERVICE_INFO: Final = ServiceTopic("service_info", ServiceInfo, Traffic.QUERY)
 """Identity, host and rigs of a running service."""

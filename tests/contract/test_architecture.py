@@ -73,6 +73,16 @@ def test_module_names_are_unique_within_a_package() -> None:
     assert {name: stems for name, stems in found.items() if stems} == {}
 
 
+def test_pymodbus_is_imported_by_the_edge_and_live_studies() -> None:
+    users = {
+        str(path.relative_to(package).parent)
+        for package in PACKAGES.values()
+        for path in modules(package)
+        if re.search(r"^ *(from|import) pymodbus", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    }
+    assert users == {"protocol", "device", "server", "live"}
+
+
 def test_test_names_have_at_most_sixty_characters() -> None:
     names = {
         name

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_schemas import topics
+from hilrig_schemas import Event, topics
 from hilrig_schemas.topics import RigKey, RigTopic, Traffic
 
 ROOT = Path(__file__).parents[2]
@@ -56,6 +56,12 @@ def test_topic_names_and_channels_are_unique() -> None:
     assert set(channels) == {"/state", "/command", "/event", "/traffic"}
 
 
+def test_every_topic_is_in_the_registry() -> None:
+    assert {topic.name for topic in vars(topics).values() if isinstance(topic, topics.Topic)} == {
+        topic.name for topic in topics.all_topics()
+    }
+
+
 @pytest.mark.parametrize("topic", topics.RIG_TOPICS, ids=lambda topic: topic.name)
 def test_rig_key_can_be_parsed(topic: RigTopic) -> None:  # type: ignore[type-arg]
     assert topics.parse_rig_key(topic.key("lab", "rig1")) == RigKey("lab", "rig1", topic)
@@ -90,3 +96,9 @@ def test_keys_are_only_in_the_registry() -> None:
     sources = [path for folder in ("runtime", "services", "tools") for path in (ROOT / folder).rglob("*.py")]
     offenders = [str(path) for path in sources if re.search(r"""["']hil/""", path.read_text())]
     assert offenders == []
+
+
+def test_every_event_kind_is_emitted_by_a_service() -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "services").rglob("*.py"))
+    kinds = [kind for kind in Event.Kind.keys() if kind != "KIND_UNSPECIFIED"]  # noqa: SIM118 (not a mapping)
+    assert [kind for kind in kinds if not re.search(rf"\bEvent\.{kind}\b", sources)] == []

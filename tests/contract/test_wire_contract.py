@@ -84,8 +84,19 @@ def test_change_of_enum_value_is_reported() -> None:
     assert (kinds.name, kinds.value[1].name) == ("Kind", "SESSION_START")
     kinds.value[1].number = 99
     assert wire_contract.violations(before.lines, wire_contract.contract(files)) == [
-        "enum hilrig.v1.Event.Kind 1 SESSION_START: changed or removed"
+        'enum hilrig.v1.Event.Kind 1 SESSION_START: removed: reserve 1 and "SESSION_START"'
     ]
+
+
+def test_removed_enum_value_must_be_reserved() -> None:
+    files = wire_contract.files()
+    before = wire_contract.contract(files)
+    kinds = next(enum for file in files for message in file.message_type for enum in message.enum_type)
+    del kinds.value[1]
+    assert len(wire_contract.violations(before.lines, wire_contract.contract(files))) == 1
+    kinds.reserved_name.append("SESSION_START")
+    kinds.reserved_range.add(start=1, end=1)
+    assert wire_contract.violations(before.lines, wire_contract.contract(files)) == []
 
 
 def test_change_of_topic_key_is_reported() -> None:
@@ -95,3 +106,8 @@ def test_change_of_topic_key_is_reported() -> None:
 
 def test_removed_field_stays_in_contract() -> None:
     assert "field hilrig.v1.LogBatch 4 entries repeated hilrig.v1.LogEntry" in wire_contract.recorded_entries()
+
+
+def test_removed_event_kind_stays_in_contract() -> None:
+    assert "enum hilrig.v1.Event.Kind 12 SATURATION" in wire_contract.recorded_entries()
+    assert "field hilrig.v1.Event 22 saturation_data hilrig.v1.SaturationData" in wire_contract.recorded_entries()

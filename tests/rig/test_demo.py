@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.run import open_run
 from support.labs import hilrig
 

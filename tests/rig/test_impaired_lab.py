@@ -18,7 +18,7 @@ from scipy import stats
 
 from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_replay.analysis.latency import LatencyReport, measure
-from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.config.impairment import LinkImpairment
 from support.edge_rig import RawClient

@@ -16,8 +16,9 @@ from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
-from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, TorqueCommand, topics
+from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, ServiceInfo, TorqueCommand, topics
 from support.edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
+from support.foreign_requests import assert_refuses_foreign_requests
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -344,6 +345,14 @@ def test_rigs_are_independent() -> None:
         right.write(0, 200)
         assert (left.read(0, 1), right.read(0, 1)) == ([100], [200])
         assert {command.rig: command.effort[0] for command in rig.commands} == {"left": 0.1, "right": 0.2}
+
+
+def test_requests_of_other_versions_are_refused() -> None:
+    with running_edge() as rig, MemoryBus(rig.hub) as bus:
+        assert_refuses_foreign_requests(bus, rig.lab.name, ServiceInfo(service="edge", instance="1"))
+        for topic, name in ((topics.LEASE, "LeaseRequest"), (topics.IMPAIRMENT, "ImpairmentRequest")):
+            (reply,) = bus.query(topic.key(rig.lab.name, "rig1"), b"\xff\x00rubbish")
+            assert reply.error == f"not a valid {name}: 9 bytes can't be decoded"
 
 
 def test_early_client_is_served_after_the_first_state() -> None:

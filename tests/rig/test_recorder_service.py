@@ -17,8 +17,9 @@ from hilrig_runtime.config.lab import LabConfig, RecorderConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from hilrig_schemas import Event, RigConfig
+from hilrig_schemas import Event, RigConfig, ServiceInfo
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
+from support.foreign_requests import assert_refuses_foreign_requests
 from support.log_streams import FakeSource
 from support.waiting import LONG_TIMEOUT_S, eventually
 
@@ -276,3 +277,9 @@ def test_restarted_recorder_ignores_ended_sessions(tmp_path: Path) -> None:
     with lab.recorder() as service:
         eventually(lambda: service.counters.received >= 3)
     assert [path.read_bytes() for path in lab.recordings()] == before
+
+
+def test_requests_of_other_versions_are_refused(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    with lab.recorder():
+        assert_refuses_foreign_requests(lab.bus, "lab", ServiceInfo(service="recorder", instance="1"))

@@ -3,12 +3,15 @@
 import random
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
-from hilrig_modbus_edge.registers.map import RegisterTable
+from hilrig_modbus_edge.protocol.functions import RegisterTable
+from hilrig_runtime.config.impairment import ImpairmentConfig
+from hilrig_runtime.config.lab import EdgeConfig
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
@@ -29,9 +32,8 @@ class Bench:
         self.sends: list[int] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
-        self.device = Device(
-            "rig1", DeviceSettings(**settings), self.clock, self, lambda: self.arrival, random.Random(4)
-        )
+        device_settings = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
+        self.device = Device("rig1", device_settings, self.clock, self, lambda: self.arrival, random.Random(4))
 
     def send_command(self, command: TorqueCommand) -> None:
         self.commands.append(TorqueCommand.FromString(command.SerializeToString()))

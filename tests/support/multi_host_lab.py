@@ -80,15 +80,15 @@ class MultiHostLab:
         command = [sys.executable, str(_CONTROLLER), rig.edge, str(rig.port)]
         return self.network.popen("pc", command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    def status(self, rig: RigAddress) -> Status:
+    def status(self, rig: RigAddress) -> int:
         """Status word of the rig, read by Modbus; 0 if the edge does not answer."""
         command = [sys.executable, "-c", _STATUS, rig.edge, str(rig.port)]
         done = self.network.run("pc", command, check=False, capture_output=True, text=True, timeout=10)
-        return Status(int(done.stdout)) if done.returncode == 0 else Status(0)
+        return int(done.stdout) if done.returncode == 0 else 0
 
     def receives_states(self, rig: RigAddress = RigAddress()) -> bool:
         """Whether the edge receives states."""
-        return Status.SIMULATION_ALIVE in self.status(rig)
+        return bool(self.status(rig) & Status.SIMULATION_ALIVE)
 
     def loop_is_closed(self, rig: RigAddress = RigAddress()) -> bool:
         """Whether the edge receives states and the simulation receives commands."""

@@ -6,7 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
+from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_modbus_edge.registers import codec
+from hilrig_modbus_edge.registers.map import address_of
+from support.device_bench import Bench
 
 COUNT = st.integers(-32767, 32767)
 NUMBER = st.floats(allow_nan=True, allow_infinity=True)
@@ -52,12 +55,13 @@ def test_any_position_is_encoded(position: tuple[float, ...]) -> None:
             assert (count, saturated) == (math.copysign(32767, value), True)
         else:
             assert abs(value * scale - count) <= 0.5
-    assert len(codec.floats_of(position)) == len(codec.floats_of_joints(position)) == 16
 
 
 @given(st.tuples(*[st.floats(width=32, allow_nan=False)] * 4))
-def test_float_registers_are_decoded_by_pymodbus(values: tuple[float, ...]) -> None:
-    registers = list(struct.unpack(">8H", codec.floats_of(values)))
-    for index, value in enumerate(values):
+def test_float_registers_are_decoded_by_pymodbus(efforts: tuple[float, ...]) -> None:
+    bench = Bench()
+    bench.state(1, effort=efforts)
+    registers = bench.read(bench.connect(), address_of("applied_tau1"), 8, RegisterTable.INPUT_REGISTER)
+    for index, effort in enumerate(efforts):
         pair = registers[2 * index : 2 * index + 2]
-        assert ModbusTcpClient.convert_from_registers(pair, ModbusTcpClient.DATATYPE.FLOAT32) == value
+        assert ModbusTcpClient.convert_from_registers(pair, ModbusTcpClient.DATATYPE.FLOAT32) == effort

@@ -8,7 +8,8 @@ import pytest
 from mcap.reader import make_reader
 
 from hilrig_replay.analysis.latency import LatencyReport, measure
-from hilrig_replay.analysis.samples import STAGES, CommandMatcher, SampleTable
+from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_runtime.errors import InputError

@@ -79,3 +79,20 @@ def test_next_deadline_is_known_before_wait() -> None:
         expected_ns = rate.next_ns
         assert rate.wait().deadline_ns == expected_ns
         clock.advance(5_000_000)
+
+
+def test_setting_the_next_deadline_shifts_the_grid() -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    first = rate.wait().deadline_ns
+    rate.next_ns += PERIOD // 4
+    assert [rate.wait().deadline_ns - first for _ in range(2)] == [PERIOD * 5 // 4, PERIOD * 9 // 4]
+
+
+def test_restart_sets_the_deadline_one_period_from_now() -> None:
+    clock = ManualClock()
+    rate = Rate(PERIOD, clock)
+    clock.advance(7 * PERIOD + 3)
+    rate.restart()
+    assert rate.remaining_s == PERIOD * 1e-9
+    assert rate.tick(rate.next_ns).missed_steps == 0

@@ -20,12 +20,7 @@ from hilrig_schemas import LogBatch, OpenSession
 class Collecting(Publisher):
     def __init__(self) -> None:
         self.batches: list[LogBatch] = []
-
-    def put(self, payload: bytes) -> None:
-        self.batches.append(decode_batch(payload))
-
-    def close(self) -> None:
-        pass
+        super().__init__(lambda payload: self.batches.append(decode_batch(payload)))
 
 
 def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
@@ -46,7 +41,7 @@ def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
 def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
     sent: list[bytes] = []
     out = Collecting()
-    out.put = sent.append  # type: ignore[method-assign]
+    out.put = sent.append
     log = RecordingStream(out, "sim/1", incarnation=7)
     log.append("hil/lab/rig1/state", 1, 100, b"payload")
     log.flush(0)

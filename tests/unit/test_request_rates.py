@@ -1,16 +1,18 @@
 """Request rates: independent of the block size, with a bounded number of controllers."""
 
 import numpy as np
+import pytest
 
 from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, RequestRates
 from hilrig_replay.io.columns import TRAFFIC_DTYPE, Rows, StringTable
 
 
-def requests(names: StringTable, at_ms: list[float], *, controller: str = "a:1", function: int = 3) -> Rows:
+def requests(names: StringTable, at_ms: list[float], *, controller: str = "a:1", **values: int) -> Rows:
     rows = np.zeros(len(at_ms), TRAFFIC_DTYPE)
     rows["wall_ns"] = np.array(at_ms) * 1e6
     rows["controller"] = names.code(controller)
-    rows["function"] = function
+    for name, value in ({"function": 3} | values).items():
+        rows[name] = value
     return rows
 
 
@@ -40,6 +42,26 @@ def test_counts_requests_by_controller_and_kind() -> None:
         ("a:1", "writes"): {0: 1},
         ("b:2", "reads"): {0: 1},
     }
+
+
+@pytest.mark.parametrize("function", [1, 2, 3, 4, 43])
+def test_reads_are_counted_as_reads(function: int) -> None:
+    names = StringTable()
+    assert counted([requests(names, [0], function=function)], names) == {("a:1", "reads"): {0: 1}}
+
+
+@pytest.mark.parametrize("function", [5, 6, 15, 16, 22, 23])
+def test_writes_are_counted_as_writes(function: int) -> None:
+    """Function 23 writes torques: a controller that uses nothing else must not be shown as a reader."""
+    names = StringTable()
+    assert counted([requests(names, [0], function=function)], names) == {("a:1", "writes"): {0: 1}}
+
+
+@pytest.mark.parametrize(("function", "exception"), [(8, 1), (17, 1), (8, 0), (3, 2), (16, 6), (23, 4)])
+def test_refused_and_unknown_requests_are_errors(function: int, exception: int) -> None:
+    names = StringTable()
+    rows = requests(names, [0], function=function, exception=exception)
+    assert counted([rows], names) == {("a:1", "errors"): {0: 1}}
 
 
 def test_counts_do_not_depend_on_the_block_size() -> None:

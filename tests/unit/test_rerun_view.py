@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.run import open_run
 from hilrig_replay.rerun_view.view import root_names, save_rrd
 from hilrig_runtime.errors import InputError, OperationError
+from hilrig_schemas import ModbusTraffic
 from support.recordings import PARAMETERS, Script, make, record, write
 from support.rrd_files import RrdFile
 
@@ -32,7 +34,7 @@ def test_stages_sum_to_the_loop_latency(tmp_path: Path) -> None:
     shown = RrdFile(tmp_path / "run.rrd")
     ends = shown.column("/stages", "scalars")
     loops = measure(run).table["loop"] / 1e6
-    assert ends.shape == (len(loops), 7)
+    assert ends.shape == (len(loops), 1 + len(STAGES))
     assert np.allclose(ends[:, -1], loops)
     assert (np.diff(ends, axis=1) >= 0).all()
 
@@ -59,6 +61,20 @@ def test_file_has_arm_parts_events_and_requests(tmp_path: Path) -> None:
     ]
     reads = shown.column("/modbus/192.0.2.7_40001/reads", "scalars")
     assert reads.sum() / 10 == pytest.approx((run.traffic["function"] == 3).sum())
+
+
+def test_requests_panel_has_reads_writes_and_errors(tmp_path: Path) -> None:
+    made = list(make(Script(seconds=2.0)))
+    batches = [one.message for one in made if isinstance(one.message, ModbusTraffic)]
+    # The first batch is from a controller that is refused the lease.
+    batches[0].kinds[1].exception = 6
+    run = open_run(write(tmp_path / "run.mcap", made, script=Script(seconds=2.0)))
+    save_rrd(run, tmp_path / "run.rrd")
+    shown = RrdFile(tmp_path / "run.rrd")
+    errors, writes = run.traffic["exception"] > 0, run.traffic["function"] == 16
+    assert errors.any()
+    for kind, count in (("reads", (~writes).sum()), ("writes", (writes & ~errors).sum()), ("errors", errors.sum())):
+        assert shown.column(f"/modbus/192.0.2.7_40001/{kind}", "scalars").sum() / 10 == pytest.approx(count)
 
 
 def test_state_timelines_contain_changes_only(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hilrig_replay.analysis.compare import Origin, compare, find_origin
+from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
 from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.paths import display_names
@@ -218,7 +219,7 @@ def test_report_is_a_self_contained_page(tmp_path: Path) -> None:
     assert not re.search(r"https?://|@import|url\(|<script|<link", html)
     for expected in (
         "run-1",
-        "register wait",
+        *(stage.title for stage in LOOP_STAGES),
         "controlled by 192.0.2.7:40001",
         "0 of 4",
         "Not valid for latency measurements",

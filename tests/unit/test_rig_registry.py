@@ -4,15 +4,17 @@ import json
 from collections.abc import Callable
 
 import numpy as np
-import pytest
+from google.protobuf.message import Message
 
+from hilrig_cli.client import send_control_request
 from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
-from hilrig_schemas import Event, RigConfig, topics
+from hilrig_schemas import AddRig, ControlRequest, RemoveRig, RigConfig, ServiceInfo, StartSession, topics
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.rig_registry import RigRegistry
+from support.foreign_requests import OWN, assert_refuses_foreign_requests
 from support.virtual_rig import VirtualRig
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
@@ -100,19 +102,18 @@ def test_copied_state_includes_falling_and_held_parts() -> None:
 
 
 class RegistryRig(VirtualRig):
-    """A simulation with a rig registry on the bus, whose mailbox executes calls at once."""
+    """A simulation with a rig registry on the bus, whose executor runs calls at once."""
 
     def __init__(self) -> None:
         super().__init__(LAB)
-        turns = OwnerThreadExecutor()
-        turns.call = lambda work: work()  # type: ignore[method-assign]
-        self.registry = RigRegistry(self.service, self.simulation, turns)
+        self.registry = RigRegistry(self.service, self.simulation, OwnerThreadExecutor(lambda run: run()))
 
-    def ask(self, kind: Event.Kind, rig: str, settings: str = "") -> str:
-        request = Event(kind=kind, rig=rig)
-        request.configuration_data.text = settings
-        (answer,) = self.service.bus.query(topics.CONTROL.key(LAB.name, "sim", "1"), request.SerializeToString())
-        return answer.error or Event.FromString(answer.payload).text
+    def ask(self, **request: Message) -> str:
+        info = ServiceInfo(service="sim", instance="1", software_version=OWN)
+        try:
+            return send_control_request(self.service.bus, LAB, info, ControlRequest(**request)).text
+        except OperationError as error:
+            return str(error).partition(" refused: ")[2]
 
 
 def test_start_event_has_the_step_parameters() -> None:
@@ -126,11 +127,11 @@ def test_start_event_has_the_step_parameters() -> None:
 
 def test_rig_is_added_described_and_removed_by_query() -> None:
     with RegistryRig() as lab:
-        assert lab.ask(Event.RIG_ADDED, "guest", GUEST.model_dump_json()) == "guest is simulated"
+        assert lab.ask(add_rig=AddRig(settings_json=GUEST.model_dump_json())) == "guest is simulated"
         (answer,) = lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest"))
         assert RigConfig.FromString(answer.payload).rig == "guest"
         assert [rig.name for rig in lab.service.rigs] == ["rig1", "rig2", "rig3", "guest"]
-        assert lab.ask(Event.RIG_REMOVED, "guest") == "guest is no longer simulated"
+        assert lab.ask(remove_rig=RemoveRig(rig="guest")) == "guest is no longer simulated"
         assert lab.service.bus.query(topics.CONFIG.key(LAB.name, "guest")) == []
         assert lab.kinds()[-2:] == ["RIG_ADDED", "RIG_REMOVED"]
 
@@ -138,28 +139,26 @@ def test_rig_is_added_described_and_removed_by_query() -> None:
 def test_invalid_requests_are_rejected_without_effect() -> None:
     with RegistryRig() as lab:
         assert (
-            lab.ask(Event.RIG_ADDED, "rig1", RigSettings(name="rig1").model_dump_json())
+            lab.ask(add_rig=AddRig(settings_json=RigSettings(name="rig1").model_dump_json()))
             == "rig 'rig1' is already simulated here; choose another name"
         )
-        assert "must be > 0" in lab.ask(Event.RIG_ADDED, "x", '{"name": "x", "arm": {"l2_m": -1}}')
+        assert "must be > 0" in lab.ask(add_rig=AddRig(settings_json='{"name": "x", "arm": {"l2_m": -1}}'))
         assert (
-            lab.ask(Event.RIG_REMOVED, "nobody") == "rig 'nobody' is not simulated here; hilrig rig list shows all rigs"
+            lab.ask(remove_rig=RemoveRig(rig="nobody"))
+            == "rig 'nobody' is not simulated here; hilrig rig list shows all rigs"
         )
-        assert "unknown control request" in lab.ask(Event.SESSION_START, "rig1")
-        assert lab.ask(Event.RIG_REMOVED, "rig1").endswith("no longer simulated")
-        lab.ask(Event.RIG_REMOVED, "rig2")
-        assert "the only rig" in lab.ask(Event.RIG_REMOVED, "rig3")
+        assert "does not execute start_session" in lab.ask(start_session=StartSession(rig="rig1"))
+        assert lab.ask(remove_rig=RemoveRig(rig="rig1")).endswith("no longer simulated")
+        lab.ask(remove_rig=RemoveRig(rig="rig2"))
+        assert "the only rig" in lab.ask(remove_rig=RemoveRig(rig="rig3"))
         lab.tick()
         assert lab.states[-1].rig == "rig3"
 
 
-def test_timed_out_call_fails_and_is_not_executed_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hilrig_runtime.process.mailbox.CALL_TIMEOUT_S", 0.01)
-    turns, done = OwnerThreadExecutor(), []
-    with pytest.raises(OperationError, match="too busy"):
-        turns.call(lambda: done.append(1))
-    turns.run_pending()
-    assert done == []
+def test_requests_of_other_versions_are_refused() -> None:
+    with RegistryRig() as lab:
+        assert_refuses_foreign_requests(lab.service.bus, LAB.name, ServiceInfo(service="sim", instance="1"))
+        assert [rig.name for rig in lab.service.rigs] == ["rig1", "rig2", "rig3"]
 
 
 def test_nan_in_one_rig_does_not_change_the_others() -> None:

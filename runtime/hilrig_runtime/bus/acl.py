@@ -41,8 +41,7 @@ RULES: Final[dict[str, Rule]] = {
     topics.SERVICE_INFO.name: Rule(SERVICES, (*SERVICES, *TOOL_ROLES)),
     topics.STATES.name: Rule(("sim",), ("edge", *TOOL_ROLES)),
     topics.COMMANDS.name: Rule(("edge",), ("sim", *TOOL_ROLES)),
-    # A recorder checks for another recorder of the lab.
-    topics.CONTROL.name: Rule(SERVICES, ("recorder", "operator")),
+    topics.CONTROL.name: Rule(SERVICES, ("operator",)),
 }
 """Rule of each topic, by the topic's name."""
 

@@ -25,11 +25,11 @@ OnLiveliness = Callable[[str, bool], None]
 
 
 class Handle(ABC):
-    """A declaration on the bus that can be withdrawn."""
+    """A resource that must be closed, as a declaration on the bus; a context manager."""
 
     @abstractmethod
     def close(self) -> None:
-        """Withdraw the declaration; a second call does nothing."""
+        """Release the resource, or withdraw the declaration; a second call does nothing."""
 
     def __enter__(self) -> Self:
         return self
@@ -43,9 +43,16 @@ class Handle(ABC):
 class Publisher(Handle):
     """Publishes on one key."""
 
-    @abstractmethod
-    def put(self, payload: bytes) -> None:
-        """Publish one message; succeeds without a subscriber, because subscribers check age and sequence."""
+    def __init__(self, put: Callable[[bytes], None], declaration: Handle | None = None) -> None:
+        self.put = put
+        """Publishes one message; succeeds without a subscriber, because subscribers check age and sequence. It is the
+        transport's function itself, which saves a Python call on the control path."""
+        self._declaration = declaration
+
+    def close(self) -> None:
+        """See `Handle.close`."""
+        if self._declaration is not None:
+            self._declaration.close()
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,21 +61,6 @@ class _Undo(Handle):
             undo()
 
 
-class _MemoryPublisher(Publisher):
-    def __init__(self, hub: MemoryHub, key: str, traffic: Traffic) -> None:
-        self._hub = hub
-        self._key = key
-        self._has_cache = traffic is Traffic.RECORDING
-
-    def put(self, payload: bytes) -> None:
-        if self._has_cache:
-            self._hub.history.setdefault(self._key, []).append(payload)
-        self._hub.deliver(self._key, payload)
-
-    def close(self) -> None:
-        """Do nothing: there is no resource to release."""
-
-
 class MemoryBus(Bus):
     """Implements `hilrig_runtime.bus.api.Bus` within one process."""
 
@@ -85,7 +70,13 @@ class MemoryBus(Bus):
 
     def publisher(self, key: str, traffic: Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:  # noqa: ARG002
         """See `Bus.publisher`."""
-        return _MemoryPublisher(self.hub, key, traffic)
+
+        def put(payload: bytes) -> None:
+            if traffic is Traffic.RECORDING:
+                self.hub.history.setdefault(key, []).append(payload)
+            self.hub.deliver(key, payload)
+
+        return Publisher(put)
 
     def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
         """See `Bus.subscribe`."""

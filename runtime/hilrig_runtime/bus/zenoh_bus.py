@@ -81,22 +81,6 @@ class _NewestReader(Handle):
             self._thread.join(timeout=1.0)
 
 
-class _ZenohPublisher(Publisher):
-    def __init__(self, publisher: Any) -> None:
-        self._publisher = publisher
-        # The instance's put is zenoh's own method, which saves a Python call on the control path.
-        self.put = publisher.put  # type: ignore[method-assign]
-
-    def put(self, payload: bytes) -> None:
-        """See `Publisher.put`."""
-        self._publisher.put(payload)
-
-    def close(self) -> None:
-        publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            publisher.undeclare()
-
-
 class ZenohBus(Bus):
     """Implements `hilrig_runtime.bus.api.Bus` over zenoh; raises `OperationError` if the session can't be opened."""
 
@@ -120,15 +104,15 @@ class ZenohBus(Bus):
     def publisher(self, key: str, traffic: Traffic, cache_depth: int = CACHE_DEPTH) -> Publisher:
         """See `Bus.publisher`."""
         if traffic is Traffic.RECORDING:
-            return _ZenohPublisher(declare_recording_publisher(self.session, key, _PRIORITIES[traffic], cache_depth))
-        return _ZenohPublisher(
-            self.session.declare_publisher(
+            publisher: Any = declare_recording_publisher(self.session, key, _PRIORITIES[traffic], cache_depth)
+        else:
+            publisher = self.session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=_PRIORITIES[traffic],
                 express=self._express and traffic is Traffic.CONTROL,
             )
-        )
+        return Publisher(publisher.put, _Declared(publisher))
 
     def subscribe(self, key_expr: str, on_message: OnMessage) -> Handle:
         """See `Bus.subscribe`."""

@@ -87,18 +87,6 @@ class TrayConfig(Section):
                 raise ValueError(f"tray {self.name!r} is {length:g} mm {along}, but its places need {span:g} mm")
         return self
 
-    @property
-    def places_mm(self) -> tuple[tuple[float, float], ...]:
-        """World x, y of each place, row by row, mm."""
-        c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
-        places = []
-        for row in range(self.rows):
-            for column in range(self.columns):
-                u = (row - (self.rows - 1) / 2) * self.pitch_mm
-                v = (column - (self.columns - 1) / 2) * self.pitch_mm
-                places.append((self.position_mm[0] + c * u - s * v, self.position_mm[1] + s * u + c * v))
-        return tuple(places)
-
 
 DEFAULT_PARTS = (
     PartConfig(name="red", colour="#d6453d", mass_kg=0.20, position_mm=(376.0, 137.0)),

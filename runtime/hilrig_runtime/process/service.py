@@ -8,8 +8,8 @@ publishers and caches of `messaging`.
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from types import MappingProxyType, TracebackType
-from typing import Final, Self, TypeVar
+from types import MappingProxyType
+from typing import Final, TypeVar
 
 from google.protobuf.message import Message
 
@@ -31,7 +31,7 @@ EXTRA_QUEUED_BATCHES: Final = 64
 """Capacity of the queue of received batches beyond one batch per rig."""
 
 
-class Service:
+class Service(Handle):
     """The resources of a running service; a context manager."""
 
     def __init__(
@@ -104,6 +104,11 @@ class Service:
             self.claim()
             token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
+
+    def set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
+        """Replace the rigs of this service, because one was added or removed."""
+        self.rigs = rigs
+        self.counters.rigs = len(rigs)
 
     def rig_publisher(
         self,
@@ -178,14 +183,6 @@ class Service:
 
     def _rigs_reached(self) -> list[tuple[str, str]]:
         return [(rig.name, self.addresses(rig.name)) for rig in self.rigs]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Flush the recording stream, then close everything in reverse order; a second call does nothing."""

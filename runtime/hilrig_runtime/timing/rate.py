@@ -22,34 +22,38 @@ class Tick:
 
 
 class Rate:
-    """A sequence of deadlines every `period_ns`; the first one is one period after the first `wait`."""
+    """A sequence of deadlines every `period_ns`; the first one is one period after the construction.
+
+    A thread sleeps in `wait`; a loop that waits otherwise waits for `remaining_s` and calls `tick` or `restart`.
+    """
 
     def __init__(self, period_ns: int, clock: Clock = SYSTEM_CLOCK) -> None:
         if period_ns <= 0:
             raise ValueError(f"the period must be > 0 ns, got {period_ns}")
         self.period_ns = period_ns
         self._clock = clock
-        self._deadline_ns: int | None = None
+        self.next_ns = 0
+        """The next deadline, ns, monotonic clock, if no whole period is missed; setting it shifts the grid."""
+        self.restart()
 
     @property
-    def next_ns(self) -> int:
-        """The next deadline, ns, monotonic clock, if no whole period is missed."""
-        return (self._clock.monotonic_ns() if self._deadline_ns is None else self._deadline_ns) + self.period_ns
+    def remaining_s(self) -> float:
+        """Time until the next deadline, s, never negative."""
+        return max(0.0, (self.next_ns - self._clock.monotonic_ns()) * 1e-9)
+
+    def restart(self) -> None:
+        """Set the next deadline to one period from now."""
+        self.next_ns = self._clock.monotonic_ns() + self.period_ns
 
     def wait(self) -> Tick:
         """Sleep until the next deadline whose period has not ended, and return the tick."""
-        period = self.period_ns
-        now = self._clock.monotonic_ns()
-        deadline = now + period if self._deadline_ns is None else self._deadline_ns + period
+        self._clock.sleep_until_ns(self.next_ns)
+        return self.tick(self._clock.monotonic_ns())
+
+    def tick(self, now_ns: int) -> Tick:
+        """Return the tick that starts at `now_ns`, and advance to the next deadline."""
         # A deadline at least one period old is skipped: its step is over.
-        missed = max(0, (now - deadline) // period)
-        deadline += missed * period
-        if now < deadline:
-            self._clock.sleep_until_ns(deadline)
-            now = self._clock.monotonic_ns()
-            # The sleep may have lasted several periods.
-            overslept = max(0, (now - deadline) // period)
-            missed += overslept
-            deadline += overslept * period
-        self._deadline_ns = deadline
-        return Tick(deadline, max(0, now - deadline), missed)
+        missed = max(0, (now_ns - self.next_ns) // self.period_ns)
+        deadline_ns = self.next_ns + missed * self.period_ns
+        self.next_ns = deadline_ns + self.period_ns
+        return Tick(deadline_ns, max(0, now_ns - deadline_ns), missed)

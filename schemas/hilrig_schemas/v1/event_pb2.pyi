@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("rig", "session", "kind", "severity", "text", "wall_ns", "source", "step", "session_data", "controller_data", "watchdog_data", "limit_data", "part_data", "overrun_data", "saturation_data", "configuration_data")
+    __slots__ = ("rig", "session", "kind", "severity", "text", "wall_ns", "source", "step", "session_data", "controller_data", "watchdog_data", "limit_data", "part_data", "overrun_data", "configuration_data")
     class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         KIND_UNSPECIFIED: _ClassVar[Event.Kind]
@@ -22,7 +22,6 @@ class Event(_message.Message):
         PART_PICKED: _ClassVar[Event.Kind]
         PART_DROPPED: _ClassVar[Event.Kind]
         OVERRUN: _ClassVar[Event.Kind]
-        SATURATION: _ClassVar[Event.Kind]
         IMPAIRMENT_CHANGED: _ClassVar[Event.Kind]
         CONFIGURATION: _ClassVar[Event.Kind]
         COMMAND_LOST: _ClassVar[Event.Kind]
@@ -44,7 +43,6 @@ class Event(_message.Message):
     PART_PICKED: Event.Kind
     PART_DROPPED: Event.Kind
     OVERRUN: Event.Kind
-    SATURATION: Event.Kind
     IMPAIRMENT_CHANGED: Event.Kind
     CONFIGURATION: Event.Kind
     COMMAND_LOST: Event.Kind
@@ -78,7 +76,6 @@ class Event(_message.Message):
     LIMIT_DATA_FIELD_NUMBER: _ClassVar[int]
     PART_DATA_FIELD_NUMBER: _ClassVar[int]
     OVERRUN_DATA_FIELD_NUMBER: _ClassVar[int]
-    SATURATION_DATA_FIELD_NUMBER: _ClassVar[int]
     CONFIGURATION_DATA_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
@@ -94,9 +91,8 @@ class Event(_message.Message):
     limit_data: LimitData
     part_data: PartData
     overrun_data: OverrunData
-    saturation_data: SaturationData
     configuration_data: ConfigurationData
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., severity: _Optional[_Union[Event.Severity, str]] = ..., text: _Optional[str] = ..., wall_ns: _Optional[int] = ..., source: _Optional[str] = ..., step: _Optional[int] = ..., session_data: _Optional[_Union[SessionData, _Mapping]] = ..., controller_data: _Optional[_Union[ControllerData, _Mapping]] = ..., watchdog_data: _Optional[_Union[WatchdogData, _Mapping]] = ..., limit_data: _Optional[_Union[LimitData, _Mapping]] = ..., part_data: _Optional[_Union[PartData, _Mapping]] = ..., overrun_data: _Optional[_Union[OverrunData, _Mapping]] = ..., saturation_data: _Optional[_Union[SaturationData, _Mapping]] = ..., configuration_data: _Optional[_Union[ConfigurationData, _Mapping]] = ...) -> None: ...
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., severity: _Optional[_Union[Event.Severity, str]] = ..., text: _Optional[str] = ..., wall_ns: _Optional[int] = ..., source: _Optional[str] = ..., step: _Optional[int] = ..., session_data: _Optional[_Union[SessionData, _Mapping]] = ..., controller_data: _Optional[_Union[ControllerData, _Mapping]] = ..., watchdog_data: _Optional[_Union[WatchdogData, _Mapping]] = ..., limit_data: _Optional[_Union[LimitData, _Mapping]] = ..., part_data: _Optional[_Union[PartData, _Mapping]] = ..., overrun_data: _Optional[_Union[OverrunData, _Mapping]] = ..., configuration_data: _Optional[_Union[ConfigurationData, _Mapping]] = ...) -> None: ...
 
 class SessionData(_message.Message):
     __slots__ = ("reason", "controller")
@@ -155,16 +151,6 @@ class OverrunData(_message.Message):
     lateness_ns: int
     missed_steps: int
     def __init__(self, lateness_ns: _Optional[int] = ..., missed_steps: _Optional[int] = ...) -> None: ...
-
-class SaturationData(_message.Message):
-    __slots__ = ("joint", "requested", "applied")
-    JOINT_FIELD_NUMBER: _ClassVar[int]
-    REQUESTED_FIELD_NUMBER: _ClassVar[int]
-    APPLIED_FIELD_NUMBER: _ClassVar[int]
-    joint: int
-    requested: float
-    applied: float
-    def __init__(self, joint: _Optional[int] = ..., requested: _Optional[float] = ..., applied: _Optional[float] = ...) -> None: ...
 
 class ConfigurationData(_message.Message):
     __slots__ = ("text",)

@@ -7,14 +7,12 @@ that moment.
 
 from typing import Final
 
+from hilrig_modbus_edge.protocol.functions import FunctionCode, RequestLayout
 from hilrig_schemas import ModbusTraffic
 
 MAX_REQUESTS_PER_MESSAGE: Final = 256
 """Number of requests after which a message is published before its period has passed: it bounds the memory."""
-_SINGLE_FUNCTIONS: Final = frozenset({0x05, 0x06, 0x16})
-"""Functions with an address, but without a quantity."""
-_QUANTITY_FUNCTIONS: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x0F, 0x10, 0x17})
-"""Functions with an address and a quantity."""
+_LAYOUTS: Final = {int(function): function.layout for function in FunctionCode}
 
 _RequestKind = tuple[int, int, int]
 """Function, address, quantity."""
@@ -76,8 +74,8 @@ class RequestLog:
 
 def _kind_of(head: bytes) -> _RequestKind:
     function = head[0]
-    if len(head) == 5 and function in _QUANTITY_FUNCTIONS:
-        return function, (head[1] << 8) | head[2], (head[3] << 8) | head[4]
-    if len(head) == 5 and function in _SINGLE_FUNCTIONS:
-        return function, (head[1] << 8) | head[2], 1
-    return function, 0, 0
+    layout = _LAYOUTS.get(function, RequestLayout.UNADDRESSED)
+    if layout is RequestLayout.UNADDRESSED or len(head) < 5:
+        return function, 0, 0
+    count = int.from_bytes(head[3:]) if layout is RequestLayout.QUANTITY else 1
+    return function, int.from_bytes(head[1:3]), count

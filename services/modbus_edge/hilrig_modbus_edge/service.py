@@ -11,20 +11,17 @@ from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
-from hilrig_modbus_edge.control_api import (
-    handle_control_query,
-    handle_impairment_query,
-    handle_lease_query,
-    serve_on_loop,
-)
+from hilrig_modbus_edge.control_api import handle_impairment_query, handle_lease_query
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop
-from hilrig_runtime.config.lab import RigSettings
+from hilrig_runtime.config.lab import RigSettings, read_rig
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.process.control import Handlers, handle_control_request
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.timing.rate import Tick
+from hilrig_runtime.timing.rate import Rate
 from hilrig_runtime.timing.realtime import freeze_gc
-from hilrig_schemas import topics
+from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, ResetRig, topics
 
 TICK_NS: Final = 20_000_000
 """Period of the edge tick, ns."""
@@ -55,6 +52,8 @@ class EdgeService:
     def __init__(self, service: Service, loop: asyncio.AbstractEventLoop) -> None:
         self._service = service
         self._loop = loop
+        # A query arrives on a thread of the bus and is handled on the event loop.
+        self._executor = OwnerThreadExecutor(loop.call_soon_threadsafe)
         self._states = service.latest_value_cache(topics.STATES)
         self._commands = CommandScheduler(
             service.source,
@@ -97,9 +96,14 @@ class EdgeService:
             for endpoint in self._endpoints.values():
                 endpoint.device.start()
                 self._declare_queries(endpoint)
-            handler = partial(handle_control_query, self, service.emit)
+            handlers: Handlers = {
+                "add_rig": self._add_rig,
+                "remove_rig": self._remove_rig,
+                "reset_rig": self._reset_rig,
+            }
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
-            self._closing.enter_context(serve_on_loop(service.bus, key, self._loop, handler))
+            handler = partial(handle_control_request, handlers)
+            self._closing.enter_context(self._executor.serve(service.bus, key, handler))
             await self._wait_for_first_states()
             for endpoint in self._endpoints.values():
                 await endpoint.listen()
@@ -109,14 +113,15 @@ class EdgeService:
         finally:
             self._close()
 
-    # -- rigs added and removed at run time
+    # -- control requests
 
-    def add(self, rig: RigSettings) -> str:
-        """Start to serve a rig, at the next free port if it has none; return a human-readable result.
+    def _add_rig(self, request: AddRig) -> ControlReply:
+        """Start to serve a rig, at the next free port if it has none.
 
         Raises:
-            OperationError: it is already served, or its address is unavailable.
+            HilrigError: its settings are invalid, it is already served, or its address is unavailable.
         """
+        rig = read_rig(request.settings_json)
         if rig.name in self._endpoints:
             raise OperationError(f"rig {rig.name!r} is already served by this edge; choose another name")
         endpoint = self._new_endpoint(rig)
@@ -132,29 +137,34 @@ class EdgeService:
         endpoint.device.start()
         listening = self._loop.create_task(endpoint.listen())
         endpoint.closing.callback(listening.cancel)
-        self._set_rigs((*self._service.rigs, rig))
-        return f"{rig.name} is served at {endpoint.address}"
+        self._service.set_rigs((*self._service.rigs, rig))
+        return self._emit_result(Event.RIG_ADDED, rig.name, f"{rig.name} is served at {endpoint.address}")
 
-    def remove(self, rig: str) -> str:
-        """Stop serving a rig; return a human-readable result.
+    def _remove_rig(self, request: RemoveRig) -> ControlReply:
+        """Stop serving a rig.
 
         Raises:
             OperationError: it is not served by this edge.
         """
+        rig = request.rig
         self._endpoint_of(rig).stop("rig removed")
         del self._endpoints[rig]
         self._announce_sessions()
-        self._set_rigs(tuple(other for other in self._service.rigs if other.name != rig))
-        return f"{rig} is no longer served"
+        self._service.set_rigs(tuple(other for other in self._service.rigs if other.name != rig))
+        return self._emit_result(Event.RIG_REMOVED, rig, f"{rig} is no longer served")
 
-    def reset(self, rig: str) -> str:
-        """Move a rig to its start pose; return a human-readable result.
+    def _reset_rig(self, request: ResetRig) -> ControlReply:
+        """Move a rig to its start pose; the simulation emits the event when it has executed the reset.
 
         Raises:
             OperationError: it is not served by this edge.
         """
-        self._endpoint_of(rig).device.reset()
-        return f"{rig} is reset to its start pose"
+        self._endpoint_of(request.rig).device.reset()
+        return ControlReply(text=f"{request.rig} is reset to its start pose")
+
+    def _emit_result(self, kind: Event.Kind, rig: str, text: str) -> ControlReply:
+        self._service.emit(Event(kind=kind, severity=Event.INFO, rig=rig, text=text))
+        return ControlReply(text=text)
 
     def _bind_next_free_port(self, endpoint: RigEndpoint) -> None:
         """Bind the first free port above all ports of lab.toml.
@@ -178,10 +188,6 @@ class EdgeService:
             raise OperationError(f"rig {rig!r} is not served by this edge; hilrig rig list shows all rigs")
         return self._endpoints[rig]
 
-    def _set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
-        self._service.rigs = rigs
-        self._service.counters.rigs = len(rigs)
-
     # -- queries
 
     def _address_of(self, rig: str) -> str:
@@ -192,7 +198,7 @@ class EdgeService:
         bus, lab, device = self._service.bus, self._service.lab, endpoint.device
         for topic, handler in ((topics.LEASE, handle_lease_query), (topics.IMPAIRMENT, handle_impairment_query)):
             key = topic.key(lab.name, device.rig)
-            endpoint.closing.enter_context(serve_on_loop(bus, key, self._loop, partial(handler, device)))
+            endpoint.closing.enter_context(self._executor.serve(bus, key, partial(handler, device)))
 
     def _announce_sessions(self) -> None:
         """Announce the open sessions to the recorder."""
@@ -213,20 +219,17 @@ class EdgeService:
             await asyncio.sleep(TICK_NS * 1e-9)
 
     async def _run_ticks(self) -> None:
-        service, counters = self._service, self._service.counters
+        service, rate = self._service, Rate(TICK_NS, self._service.clock)
         monotonic_ns = service.clock.monotonic_ns
-        deadline_ns = monotonic_ns() + TICK_NS
         while not service.stopping.is_set():
-            await asyncio.sleep((deadline_ns - monotonic_ns()) * 1e-9)
-            now_ns = monotonic_ns()
-            missed = max(0, (now_ns - deadline_ns) // TICK_NS)
-            counters.count_tick(Tick(deadline_ns, max(0, now_ns - deadline_ns), missed), TICK_NS)
+            await asyncio.sleep(rate.remaining_s)
+            service.counters.count_tick(rate.tick(monotonic_ns()), TICK_NS)
             for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)
                 endpoint.on_tick(monotonic_ns())
             service.beat(monotonic_ns())
-            deadline_ns = self._middle_of_step(deadline_ns + (missed + 1) * TICK_NS)
+            rate.next_ns = self._middle_of_step(rate.next_ns)
 
     def _middle_of_step(self, deadline_ns: int) -> int:
         """Return the time nearest to a deadline that is half a step after a state arrived, ns, monotonic clock.

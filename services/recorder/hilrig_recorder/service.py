@@ -3,12 +3,10 @@
 import contextlib
 import logging
 import random
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Final
 
 from google.protobuf.message import DecodeError
@@ -19,22 +17,23 @@ from hilrig_recorder.ingest.recording import SECOND_NS, Recording
 from hilrig_recorder.ingest.rig_partition import RigPartition
 from hilrig_recorder.ingest.sessions import SessionTracker
 from hilrig_recorder.mcap_format.recover import read_session_metadata
-from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_recorder.storage.folder_lock import FolderLock
 from hilrig_recorder.storage.maintenance import MaintenanceWorker, find_unfinished
 from hilrig_recorder.storage.store import FileStore
 from hilrig_recorder.storage.sync_worker import SyncWorker
 from hilrig_runtime.errors import HilrigError, OperationError
 from hilrig_runtime.messaging.recording_stream import FLUSH_PERIOD_NS
+from hilrig_runtime.process.control import Handlers, handle_control_request
+from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
-from hilrig_schemas import Event, OpenSession, RigConfig, RigReport
+from hilrig_runtime.timing.rate import Rate
+from hilrig_schemas import ControlReply, Event, OpenSession, RigConfig, RigReport, StartSession, StopSession
 from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
 TICK_PERIOD_NS: Final = SECOND_NS // 10
 """Period of the housekeeping between received batches."""
 _CONFIG_TIMEOUT_S: Final = 0.8
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
-_REPLY_TIMEOUT_S: Final = 1.0
 _LAST_BATCHES_TIMEOUT_NS: Final = 3 * SECOND_NS // 10
 """Time after the stop request in which the recorder still receives the last batches of other services."""
 _QUEUE_DRAIN_TIMEOUT_NS: Final = SECOND_NS // 2
@@ -75,16 +74,6 @@ def _lock_folder(service: Service) -> FolderLock:
         ) from error
 
 
-@dataclass(slots=True)
-class _Request:
-    """A control request, passed to the recorder's thread and back."""
-
-    event: Event
-    reply: Event = field(default_factory=Event)
-    error: str = ""
-    done: threading.Event = field(default_factory=threading.Event)
-
-
 class Recorder:
     """A running recorder."""
 
@@ -92,18 +81,16 @@ class Recorder:
         self._service = service
         self._clock = service.clock
         lab, config = service.lab, service.lab.recorder
-        # Results of other threads, processed by the recorder's thread.
-        self._errors: SimpleQueue[tuple[RecordingWriter, OSError] | str] = SimpleQueue()
-        self._finished: SimpleQueue[tuple[RecordingWriter, OSError | None]] = SimpleQueue()
-        self._configs: SimpleQueue[tuple[str, RigConfig | None]] = SimpleQueue()
-        self._requests: SimpleQueue[_Request] = SimpleQueue()
+        self._ticks = Rate(TICK_PERIOD_NS, service.clock)
+        self._executor = OwnerThreadExecutor()
+        """Processes control requests and the results of other threads on the recorder's thread."""
         self._config_due_ns: dict[str, int] = {}
         self._config_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
         self._queue = IngestQueue(config.queue_entries, service.clock)
         self._sync_worker = SyncWorker(
             service.clock,
-            on_sync_error=lambda writer, error: self._errors.put((writer, error)),
-            on_finished=lambda writer, error: self._finished.put((writer, error)),
+            on_sync_error=lambda writer, error: self._executor.post(lambda: self._store.fail(writer, error)),
+            on_finished=lambda writer, error: self._executor.post(lambda: self._store.finished(writer, error)),
         )
         self._store = FileStore(
             lab.name,
@@ -129,11 +116,20 @@ class Recorder:
         self._stream = service.bus.subscribe_recording(
             LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batch_cache_depth
         )
-        self._control = service.bus.declare_queryable(
-            CONTROL.key(lab.name, service.name, service.instance), self._handle_control
+        handlers: Handlers = {"start_session": self._start_session, "stop_session": self._stop_session}
+        self._control = self._executor.serve(
+            service.bus,
+            CONTROL.key(lab.name, service.name, service.instance),
+            partial(handle_control_request, handlers),
         )
         service.health.rig_reports = self._rig_reports
-        self._maintenance = MaintenanceWorker(self._store.folder, unfinished, config, service.clock, self._errors.put)
+        self._maintenance = MaintenanceWorker(
+            self._store.folder,
+            unfinished,
+            config,
+            service.clock,
+            lambda text: self._executor.post(lambda: self._emit_error(text)),
+        )
 
     def _restore(self, unfinished: list[Path]) -> None:
         for path in unfinished:
@@ -150,58 +146,38 @@ class Recorder:
     def run(self) -> None:
         """Record until the service is stopped, then record the messages published before."""
         service, clock = self._service, self._clock
-        due_ns = clock.monotonic_ns()
         service.recording_stream.set_sessions(self._manual_sessions.sessions)
         service.ready()
         while not service.stopping.is_set():
-            due_ns = self._run_once(due_ns)
+            self._run_once()
         # Receive the last batches for a short time, then write the messages in the queue.
         deadline_ns = clock.monotonic_ns() + _LAST_BATCHES_TIMEOUT_NS
         while self._sessions.recordings and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._run_once(due_ns)
+            self._run_once()
         self._stream.close()
         deadline_ns = clock.monotonic_ns() + _QUEUE_DRAIN_TIMEOUT_NS
         while self._queue.depth > 0 and clock.monotonic_ns() < deadline_ns:
-            due_ns = self._run_once(due_ns)
+            self._run_once()
 
-    def _run_once(self, due_ns: int) -> int:
+    def _run_once(self) -> None:
         now_ns = self._clock.monotonic_ns()
-        if now_ns >= due_ns:
+        if now_ns >= self._ticks.next_ns:
             self._tick(now_ns)
             # The next tick is due one period after this one ends, so that a long tick does not delay received batches.
+            self._ticks.restart()
             now_ns = self._clock.monotonic_ns()
-            due_ns = now_ns + TICK_PERIOD_NS
-        received = self._queue.get(max(0.0, (due_ns - now_ns) * 1e-9))
+        received = self._queue.get(self._ticks.remaining_s)
         if received is not None:
             self._sessions.accept(received, now_ns)
-        return due_ns
 
     def _tick(self, now_ns: int) -> None:
         self._sessions.tick(now_ns, self._clock.wall_ns())
-        self._process_results()
+        self._executor.run_pending()
         self._store.tick(now_ns)
         for rig in self._store.unconfigured():
             if now_ns >= self._config_due_ns.get(rig, 0):
                 self._request_config(rig)
         self._report(now_ns)
-
-    def _process_results(self) -> None:
-        with contextlib.suppress(Empty):
-            while True:
-                item = self._errors.get_nowait()
-                if isinstance(item, str):
-                    self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=item))
-                else:
-                    self._store.fail(*item)
-        with contextlib.suppress(Empty):
-            while True:
-                self._store.finished(*self._finished.get_nowait())
-        with contextlib.suppress(Empty):
-            while True:
-                self._accept_config(*self._configs.get_nowait())
-        with contextlib.suppress(Empty):
-            while True:
-                self._execute(self._requests.get_nowait())
 
     def _report(self, now_ns: int) -> None:
         counters, queue, sessions = self._service.counters, self._queue, self._sessions
@@ -224,6 +200,9 @@ class Recorder:
         logger.warning("%s", event.text)
         self._service.emit(event)
 
+    def _emit_error(self, text: str) -> None:
+        self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
+
     def _on_failed(self, recording: Recording) -> None:
         self._sessions.drop(recording)
 
@@ -234,35 +213,16 @@ class Recorder:
 
     # -- manual sessions --------------------------------------------------------------------------------------------
 
-    def _handle_control(self, payload: bytes) -> bytes:
-        """Handle a control request on a bus thread: pass it to the recorder's thread and wait for the reply."""
-        try:
-            request = _Request(Event.FromString(payload))
-        except DecodeError as error:
-            raise OperationError("control request can't be decoded") from error
-        self._requests.put(request)
-        if not request.done.wait(_REPLY_TIMEOUT_S):
-            raise OperationError(
-                f"the recorder did not reply within {_REPLY_TIMEOUT_S:g} s: it is overloaded; try again"
-            )
-        if request.error:
-            raise OperationError(request.error)
-        return request.reply.SerializeToString()
+    def _start_session(self, request: StartSession) -> ControlReply:
+        return self._publish_session(self._manual_sessions.start(request.rig, self._clock.wall_ns()))
 
-    def _execute(self, request: _Request) -> None:
-        event = request.event
-        try:
-            if event.kind == Event.SESSION_START:
-                request.reply = self._manual_sessions.start(event.rig, self._clock.wall_ns())
-            elif event.kind == Event.SESSION_END:
-                request.reply = self._manual_sessions.stop(event.rig)
-            else:
-                raise OperationError(f"unknown control request {event.kind}; expected SESSION_START or SESSION_END")
-            self._service.emit(request.reply)
-            self._service.recording_stream.set_sessions(self._manual_sessions.sessions)
-        except HilrigError as error:
-            request.error = str(error)
-        request.done.set()
+    def _stop_session(self, request: StopSession) -> ControlReply:
+        return self._publish_session(self._manual_sessions.stop(request.rig))
+
+    def _publish_session(self, event: Event) -> ControlReply:
+        self._service.emit(event)
+        self._service.recording_stream.set_sessions(self._manual_sessions.sessions)
+        return ControlReply(text=event.text, session=event.session)
 
     # -- configuration of rigs --------------------------------------------------------------------------------------
 
@@ -283,7 +243,7 @@ class Recorder:
         except (DecodeError, OperationError) as error:
             logger.warning("%s: configuration can't be read: %s", rig, error)
         finally:
-            self._configs.put((rig, config))
+            self._executor.post(lambda: self._accept_config(rig, config))
 
     def _accept_config(self, rig: str, config: RigConfig | None) -> None:
         if config is None:

@@ -5,15 +5,18 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from hilrig_runtime.timing.rate import Tick
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 from hilrig_schemas.v1.event_pb2 import LimitData, OverrunData, PartData, WatchdogData
 from hilrig_sim.commands import CommandLatch
 from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 
-LIMIT_QUIET_PERIOD_NS: Final = 250_000_000
-"""Time without an impact after which a limit is reported again, ns: a joint may chatter at its stop."""
-OVERRUN_PERIOD_NS: Final = 1_000_000_000
+LIMIT_EVENT_PERIOD_NS: Final = 250_000_000
+"""Shortest time between two events of one limit of a rig, ns: a joint may chatter at its stop."""
+MAX_LIMITS: Final = 4096
+"""Number of limits whose events are rate-limited; a rig has 9."""
+OVERRUN_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two overrun events, ns."""
 
 
@@ -24,8 +27,8 @@ class SimulationEvents:
         self._emit = emit
         self._rigs = tuple(rigs)
         self._plant = plant
-        self._last_impact_ns: dict[tuple[int, int, bool], int] = {}
-        self._overrun_reported_ns = -OVERRUN_PERIOD_NS
+        self._limits: RateLimiter[tuple[str, int, bool]] = RateLimiter(LIMIT_EVENT_PERIOD_NS, MAX_LIMITS)
+        self._overruns: RateLimiter[None] = RateLimiter(OVERRUN_EVENT_PERIOD_NS)
         self.overran = False
         """Whether there are overruns that were not reported yet."""
         self._overrun_step = 0
@@ -36,7 +39,6 @@ class SimulationEvents:
         """Replace the rigs, because one was added or removed."""
         self._rigs = tuple(rigs)
         self._plant = plant
-        self._last_impact_ns.clear()
 
     def report_plant_events(
         self, events: Sequence[PlantEvent], step: int, now_ns: int, sessions: Sequence[str]
@@ -80,32 +82,33 @@ class SimulationEvents:
         )
         self._emit(event)
 
-    def record_overrun(self, tick: Tick, step: int, step_ns: int) -> None:
-        """Record a tick that was more than a step late, or skipped steps; `report_overruns` reports it."""
-        self.overran = True
+    def record_overrun(self, tick: Tick, step: int, step_ns: int, now_ns: int) -> None:
+        """Record a tick that was more than a step late, or skipped steps, and emit it, rate-limited."""
         self._overrun_step = step
         self._missed += tick.missed_steps
         # Lateness against the original deadline: `lateness_ns` is against the one after the skipped steps.
         self._worst_ns = max(self._worst_ns, tick.lateness_ns + tick.missed_steps * step_ns)
+        self.overran = True
+        if self._overruns.record(None, now_ns):
+            self._emit_overruns()
 
     def report_overruns(self, now_ns: int) -> None:
-        """Emit one event for all recorded overruns, rate-limited; call it while `overran` is set."""
-        if now_ns - self._overrun_reported_ns < OVERRUN_PERIOD_NS:
-            return
+        """Emit one event for the overruns that were not reported, if its period has ended; call it while `overran`."""
+        for _ in self._overruns.pop_remainders(now_ns):
+            self._emit_overruns()
+
+    def _emit_overruns(self) -> None:
         data = OverrunData(lateness_ns=self._worst_ns, missed_steps=self._missed)
         steps = f"{self._missed} step{'' if self._missed == 1 else 's'}"
         text = f"simulation overrun: up to {self._worst_ns / 1e6:.1f} ms late, {steps} skipped"
         step = self._overrun_step
         self._emit(Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data))
-        self._overrun_reported_ns = now_ns
         self._missed = self._worst_ns = 0
         self.overran = False
 
     def _limit(self, hit: PlantEvent, now_ns: int) -> Event | None:
-        limit = (hit.rig, hit.joint, hit.upper)
-        previous_ns = self._last_impact_ns.get(limit)
-        self._last_impact_ns[limit] = now_ns
-        if previous_ns is not None and now_ns - previous_ns < LIMIT_QUIET_PERIOD_NS:
+        count = self._limits.record((self._rigs[hit.rig], hit.joint, hit.upper), now_ns)
+        if not count:
             return None
         linear = hit.joint in (0, 3)
         speed = f"{hit.speed * 1e3:.0f} mm/s" if linear else f"{math.degrees(hit.speed):.0f} °/s"
@@ -113,6 +116,7 @@ class SimulationEvents:
             text = f"the tool hit an object below it at {speed}"
         else:
             text = f"joint {hit.joint} hit its {'upper' if hit.upper else 'lower'} stop at {speed}"
+        text += repeat_suffix(count)
         data = LimitData(joint=hit.joint, upper=hit.upper, speed=hit.speed)
         return Event(kind=Event.LIMIT_HIT, severity=Event.INFO, text=text, limit_data=data)
 

@@ -110,8 +110,8 @@ class Simulation:
         self._update_motion()
         self._counters.count_tick(tick, self._step_ns)
         if overrun:
-            self._events.record_overrun(tick, step, self._step_ns)
-        if self._events.overran:
+            self._events.record_overrun(tick, step, self._step_ns, sampled_ns)
+        elif self._events.overran:
             self._events.report_overruns(sampled_ns)
 
     def _apply_commands(self, latencies_ns: Mapping[int, int]) -> None:

@@ -3,7 +3,7 @@
 import math
 
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings
-from hilrig_runtime.config.scene import SceneConfig
+from hilrig_runtime.config.scene import SceneConfig, TrayConfig
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import (
     ArmParameters,
@@ -13,7 +13,7 @@ from hilrig_sim.arm.model import (
     StepParameters,
     TrayParameters,
     Vector3,
-    Vector4,
+    joints_si,
 )
 from hilrig_sim.arm.stability import check_stable
 
@@ -44,9 +44,9 @@ def _arm(config: ArmConfig) -> ArmParameters:
         masses=config.masses_kg,
         j4=config.j4_kgm2,
         friction=config.friction,
-        lower=_joints_si(config.lower_limits),
-        upper=_joints_si(config.upper_limits),
-        start=_joints_si(config.start_position),
+        lower=joints_si(config.lower_limits),
+        upper=joints_si(config.upper_limits),
+        start=joints_si(config.start_position),
         external_force_z=config.external_force_z_n,
         external_torque_z=config.external_torque_z_nm,
     )
@@ -61,7 +61,7 @@ def _scene(config: SceneConfig) -> SceneParameters:
             position=(tray.position_mm[0] / 1000, tray.position_mm[1] / 1000, table),
             yaw=math.radians(tray.yaw_deg),
             colour=tray.colour,
-            places=tuple((x / 1000, y / 1000, table + tray.size_mm[2] / 1000) for x, y in tray.places_mm),
+            places=tuple((x / 1000, y / 1000, table + tray.size_mm[2] / 1000) for x, y in _places_mm(tray)),
         )
         for tray in config.trays
     )
@@ -94,6 +94,18 @@ def _scene(config: SceneConfig) -> SceneParameters:
     )
 
 
+def _places_mm(tray: TrayConfig) -> list[tuple[float, float]]:
+    """Return world x, y of each place, row by row, mm."""
+    c, s = math.cos(math.radians(tray.yaw_deg)), math.sin(math.radians(tray.yaw_deg))
+    places = []
+    for row in range(tray.rows):
+        for column in range(tray.columns):
+            u = (row - (tray.rows - 1) / 2) * tray.pitch_mm
+            v = (column - (tray.columns - 1) / 2) * tray.pitch_mm
+            places.append((tray.position_mm[0] + c * u - s * v, tray.position_mm[1] + s * u + c * v))
+    return places
+
+
 def on_tray(tray: TrayParameters, x: float, y: float, radius: float) -> bool:
     """Return whether a disc of `radius` about (x, y), m, overlaps a tray."""
     c, s = math.cos(tray.yaw), math.sin(tray.yaw)
@@ -101,10 +113,6 @@ def on_tray(tray: TrayParameters, x: float, y: float, radius: float) -> bool:
     u = max(abs(c * dx + s * dy) - tray.size[0] / 2, 0.0)
     v = max(abs(c * dy - s * dx) - tray.size[1] / 2, 0.0)
     return u * u + v * v <= radius * radius
-
-
-def _joints_si(joints: Vector4) -> Vector4:
-    return (math.radians(joints[0]), math.radians(joints[1]), joints[2] / 1000, math.radians(joints[3]))
 
 
 def _meters3(lengths_mm: Vector3) -> Vector3:

@@ -6,19 +6,18 @@ changes are active until the simulation stops; the next one starts with the rigs
 """
 
 import json
+import threading
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
-from types import TracebackType
-from typing import Self
-
-from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Handle
-from hilrig_runtime.config.lab import RigSettings, read_rig
+from hilrig_runtime.config.lab import read_rig
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
-from hilrig_schemas import Event, RigConfig, topics
+from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, RigConfig, topics
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.arm.urdf import urdf
 from hilrig_sim.loop import Simulation
@@ -40,26 +39,25 @@ class StaticReply:
 
 
 class RigRegistry:
-    """Registry of the simulated rigs; a context manager."""
+    """Registry of the simulated rigs."""
 
     def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
         self._service = service
         self._simulation = simulation
         self._turns = turns
+        self._changing = threading.Lock()
+        """Serializes the threads of the bus: a change takes more than one call of the simulation's thread."""
         self._served: dict[str, Handle] = {}
         for rig, parameters in zip(service.rigs, simulation.parameters, strict=True):
             self._serve(rig.name, parameters)
             self._emit_start(rig.name, parameters)
         key = topics.CONTROL.key(service.lab.name, service.name, service.instance)
-        self._control = service.bus.declare_queryable(key, self._handle_control)
+        handlers: Handlers = {"add_rig": self._add_rig, "remove_rig": self._remove_rig}
+        self._control = service.bus.declare_queryable(key, partial(handle_control_request, handlers))
         service.counters.rigs = len(service.rigs)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Withdraw the queries."""
         self._control.close()
         for handle in self._served.values():
             handle.close()
@@ -78,59 +76,41 @@ class RigRegistry:
         event.configuration_data.text = json.dumps(asdict(sim))
         self._service.emit(event)
 
-    def _handle_control(self, payload: bytes) -> bytes:
-        try:
-            request = Event.FromString(payload)
-        except DecodeError as error:
-            raise OperationError(
-                "the control request can't be decoded: client and simulation must have the same hilrig version"
-            ) from error
-        with self._turns.exclusive:
-            if request.kind == Event.RIG_ADDED:
-                text = self._add(read_rig(request.configuration_data.text))
-            elif request.kind == Event.RIG_REMOVED:
-                text = self._remove(request.rig)
-            else:
+    def _add_rig(self, request: AddRig) -> ControlReply:
+        service, simulation, rig = self._service, self._simulation, read_rig(request.settings_json)
+        with self._changing:
+            if rig.name in self._served:
+                raise OperationError(f"rig {rig.name!r} is already simulated here; choose another name")
+            parameters = rig_parameters(service.lab, rig)
+            plant = Plant([*simulation.parameters, parameters])
+            self._turns.call(lambda: simulation.add(rig.name, plant))
+            self._serve(rig.name, parameters)
+            service.set_rigs((*service.rigs, rig))
+        return self._emit_result(Event.RIG_ADDED, rig.name, f"{rig.name} is simulated", request.settings_json)
+
+    def _remove_rig(self, request: RemoveRig) -> ControlReply:
+        service, simulation, name = self._service, self._simulation, request.rig
+        with self._changing:
+            names = [rig.name for rig in service.rigs]
+            if name not in names:
+                raise OperationError(f"rig {name!r} is not simulated here; hilrig rig list shows all rigs")
+            if len(names) == 1:
                 raise OperationError(
-                    f"unknown control request of kind {request.kind}: client and simulation must have the same hilrig "
-                    "version"
+                    f"rig {name!r} is the only rig of this simulation, and can't be removed; stop the simulation "
+                    "instead"
                 )
-        reply = Event(kind=request.kind, severity=Event.INFO, rig=request.rig, text=text)
-        reply.configuration_data.text = request.configuration_data.text
-        self._turns.call(lambda: self._service.emit(reply))
-        return reply.SerializeToString()
+            index = names.index(name)
+            plant = Plant([parameters for number, parameters in enumerate(simulation.parameters) if number != index])
+            self._turns.call(lambda: simulation.remove(index, plant))
+            self._served.pop(name).close()
+            service.set_rigs(tuple(rig for rig in service.rigs if rig.name != name))
+        return self._emit_result(Event.RIG_REMOVED, name, f"{name} is no longer simulated")
 
-    def _add(self, rig: RigSettings) -> str:
-        service, simulation = self._service, self._simulation
-        if rig.name in self._served:
-            raise OperationError(f"rig {rig.name!r} is already simulated here; choose another name")
-        parameters = rig_parameters(service.lab, rig)
-        plant = Plant([*simulation.parameters, parameters])
-        self._turns.call(lambda: simulation.add(rig.name, plant))
-        self._serve(rig.name, parameters)
-        self._set_rigs((*service.rigs, rig))
-        return f"{rig.name} is simulated"
-
-    def _remove(self, name: str) -> str:
-        service, simulation = self._service, self._simulation
-        names = [rig.name for rig in service.rigs]
-        if name not in names:
-            raise OperationError(f"rig {name!r} is not simulated here; hilrig rig list shows all rigs")
-        if len(names) == 1:
-            raise OperationError(
-                f"rig {name!r} is the only rig of this simulation, and can't be removed; stop the simulation instead"
-            )
-        index = names.index(name)
-        others = [parameters for number, parameters in enumerate(simulation.parameters) if number != index]
-        plant = Plant(others)
-        self._turns.call(lambda: simulation.remove(index, plant))
-        self._served.pop(name).close()
-        self._set_rigs(tuple(rig for rig in service.rigs if rig.name != name))
-        return f"{name} is no longer simulated"
-
-    def _set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
-        self._service.rigs = rigs
-        self._service.counters.rigs = len(rigs)
+    def _emit_result(self, kind: Event.Kind, rig: str, text: str, settings_json: str = "") -> ControlReply:
+        event = Event(kind=kind, severity=Event.INFO, rig=rig, text=text)
+        event.configuration_data.text = settings_json
+        self._turns.call(lambda: self._service.emit(event))
+        return ControlReply(text=text)
 
 
 def configuration(service: Service, rig: str, parameters: RigParameters) -> RigConfig:

@@ -1,5 +1,7 @@
 """Simulation service: a tick at each absolute deadline, and queued calls between two ticks."""
 
+from contextlib import closing
+
 import numpy as np
 
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
@@ -20,13 +22,11 @@ def run(service: Service) -> None:
     lab = service.lab
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
-    step_ns = lab.sim.step_ns
     turns = OwnerThreadExecutor()
-    with RigRegistry(service, simulation, turns):
-        rate = Rate(step_ns, service.clock)
+    with closing(RigRegistry(service, simulation, turns)):
         freeze_gc()
         service.ready()
-        stopping = service.stopping
+        rate, stopping = Rate(lab.sim.step_ns, service.clock), service.stopping
         # Non-finite numbers are detected and handled by the simulation, without warnings.
         with np.errstate(all="ignore"):
             while not stopping.is_set():

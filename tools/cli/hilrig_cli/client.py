@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Sequence, Set
+from importlib.metadata import version
 from typing import Final, TypeVar
 
 from google.protobuf.message import Message
@@ -12,9 +13,10 @@ from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.process.control import check_versions
 from hilrig_runtime.process.discovery import list_services
-from hilrig_schemas import ServiceInfo
-from hilrig_schemas.topics import RigTopic, parse_rig_key
+from hilrig_schemas import ControlReply, ControlRequest, ServiceInfo
+from hilrig_schemas.topics import CONTROL, RigTopic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -52,6 +54,24 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
     by_rig = {parse_rig_key(reply.key).rig: reply.payload for reply in replies}
     order = sorted(by_rig, key=lambda rig: (positions.get(rig, len(positions)), rig))
     return [topic.decode(by_rig[rig]) for rig in order]
+
+
+def send_control_request(bus: Bus, lab: LabConfig, info: ServiceInfo, request: ControlRequest) -> ControlReply:
+    """Send a control request to a discovered service; return its reply.
+
+    Raises:
+        OperationError: the service has another version, does not reply, or refuses the request.
+    """
+    request.software_version = version("hilrig")
+    check_versions(info.software_version, request.software_version)
+    key = CONTROL.key(lab.name, info.service, info.instance)
+    replies = bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S)
+    name = f"{info.service}/{info.instance} on {info.host}"
+    if not replies:
+        raise OperationError(f"{name} does not reply within {QUERY_TIMEOUT_S:g} s: see its log")
+    if replies[0].error:
+        raise OperationError(f"{name} refused: {replies[0].error}")
+    return CONTROL.decode(replies[0].payload)
 
 
 def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[ServiceInfo]:

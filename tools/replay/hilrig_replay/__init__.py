@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from hilrig_replay.analysis.latency import measure
-    from hilrig_replay.analysis.samples import STAGES
+    from hilrig_replay.analysis.stages import STAGES
     from hilrig_replay.analysis.summary import summarize
     from hilrig_replay.io.run import open_run
 
 __all__ = ["STAGES", "measure", "open_run", "summarize"]
 
 _MODULES: Final = {
-    "STAGES": "hilrig_replay.analysis.samples",
+    "STAGES": "hilrig_replay.analysis.stages",
     "measure": "hilrig_replay.analysis.latency",
     "open_run": "hilrig_replay.io.run",
     "summarize": "hilrig_replay.analysis.summary",

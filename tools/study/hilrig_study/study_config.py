@@ -47,7 +47,7 @@ _LABELS: Final[dict[str, str]] = {
 class LoopConfig(Section):
     """Timing of the loop without injected delays."""
 
-    step_ms: Annotated[float, Field(ge=0.5, le=1000)] = 20.0
+    step_ms: Annotated[float, Field(ge=0.5, le=1000)] = SimConfig().step_ms
     """Step of the simulation, ms."""
     poll_ms: Positive = 20.0
     """Poll period of the controller, ms."""

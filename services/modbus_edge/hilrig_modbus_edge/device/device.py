@@ -13,7 +13,7 @@ from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client, Host, address_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, repeat_suffix
+from hilrig_modbus_edge.device.events import EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session
@@ -21,6 +21,7 @@ from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import WatchdogState
 from hilrig_modbus_edge.device.write_access import WriteAccess
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
+from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_modbus_edge.registers.map import (
     DISCRETE_END,
@@ -31,15 +32,17 @@ from hilrig_modbus_edge.registers.map import (
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
-    RegisterTable,
     Status,
+    struct_of,
 )
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate_limiter import repeat_suffix
 from hilrig_schemas import Event, LeaseStatus
 
 # Looking up an enumeration member is a function call: the one that each request needs is looked up once.
 _INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER
+_EXTENDED: Final = struct_of(RegisterTable.HOLDING_REGISTER, ECHO_ADDRESS)
 MAX_REMEMBERED_HOSTS: Final = 64
 """Number of hosts above which those without a connection are removed."""
 
@@ -129,7 +132,7 @@ class Device:
                 return positions[2 * (address - POSITION_ADDRESS) : 2 * (end - POSITION_ADDRESS)]
             return bytes(self._commands.torque[2 * address :]) + positions[: 2 * (end - POSITION_ADDRESS)]
         if address >= ECHO_ADDRESS and end <= EXTENDED_END:
-            image = self._commands.echo.to_bytes(2, "big") + (self.watchdog.timeout_ns // MS).to_bytes(2, "big")
+            image = _EXTENDED.pack(self._commands.echo, self.watchdog.timeout_ns // MS)
             return image[2 * (address - ECHO_ADDRESS) : 2 * (end - ECHO_ADDRESS)]
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
@@ -311,4 +314,4 @@ class Device:
             status |= Status.WATCHDOG_TRIPPED
         if not client.may_write:
             status |= Status.READ_ONLY
-        return int(status)
+        return status

@@ -4,8 +4,8 @@ from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_modbus_edge.device.settings import MS
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
@@ -60,8 +60,8 @@ class LeaseEventReporter:
     def __init__(self, rig: str, events: EventEmitter) -> None:
         self._rig = rig
         self._events = events
-        self._acquisitions = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._denials = RateLimiter(LEASE_EVENT_PERIOD_NS)
+        self._acquisitions: RateLimiter[str] = RateLimiter(LEASE_EVENT_PERIOD_NS)
+        self._denials: RateLimiter[tuple[str, bool]] = RateLimiter(LEASE_EVENT_PERIOD_NS)
         self._pending_acquire: tuple[str, int] | None = None
         """Address of the lease holder and time of the acquisition (ns), if it was suppressed."""
 
@@ -101,8 +101,3 @@ class LeaseEventReporter:
     def _emit_acquired(self, address: str, count: int = 1) -> None:
         text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
-
-
-def repeat_suffix(count: int) -> str:
-    """Return " (N times)" for the end of a message; empty for one occurrence."""
-    return f" ({count} times)" if count > 1 else ""

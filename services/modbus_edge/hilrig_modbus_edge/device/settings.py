@@ -1,6 +1,6 @@
 """Settings of a device, converted from lab.toml to nanoseconds."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -12,15 +12,15 @@ MS: Final = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """Times and impairment of a device; times in ns."""
+    """Times and impairment of a device; times in ns. The defaults are in `EdgeConfig`."""
 
-    watchdog_ns: int = 1_000 * MS
-    watchdog_min_ns: int = 100 * MS
-    watchdog_max_ns: int = 10_000 * MS
-    lease_ns: int = 5_000 * MS
-    grace_ns: int = 5_000 * MS
-    repeat_ns: int = 200 * MS
-    impairment: ImpairmentConfig = field(default_factory=ImpairmentConfig)
+    watchdog_ns: int
+    watchdog_min_ns: int
+    watchdog_max_ns: int
+    lease_ns: int
+    grace_ns: int
+    repeat_ns: int
+    impairment: ImpairmentConfig
 
     @classmethod
     def of(cls, edge: EdgeConfig, impairment: ImpairmentConfig) -> "DeviceSettings":

@@ -14,7 +14,7 @@ from pymodbus.constants import DeviceInformation, ExcCodes
 from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
-from hilrig_modbus_edge.registers.map import RegisterTable
+from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
 
 ClientT = TypeVar("ClientT", contravariant=True)
 """The device's description of a client; the protocol only passes it on."""
@@ -205,16 +205,18 @@ def _unpack(layout: struct.Struct, request: bytes) -> tuple[int, ...]:
     return layout.unpack(request)
 
 
-_HANDLERS: Final[dict[int, Handler]] = {
-    0x01: _read_bits,
-    0x02: _read_bits,
-    0x03: _read_registers,
-    0x04: _read_registers,
-    0x05: _write_coil,
-    0x06: _write_register,
-    0x0F: _write_coils,
-    0x10: _write_registers,
-    0x16: _mask_register,
-    0x17: _read_write,
-    0x2B: _identify,
+_HANDLER_OF: Final[dict[FunctionCode, Handler]] = {
+    FunctionCode.READ_COILS: _read_bits,
+    FunctionCode.READ_DISCRETE_INPUTS: _read_bits,
+    FunctionCode.READ_HOLDING_REGISTERS: _read_registers,
+    FunctionCode.READ_INPUT_REGISTERS: _read_registers,
+    FunctionCode.WRITE_SINGLE_COIL: _write_coil,
+    FunctionCode.WRITE_SINGLE_REGISTER: _write_register,
+    FunctionCode.WRITE_MULTIPLE_COILS: _write_coils,
+    FunctionCode.WRITE_MULTIPLE_REGISTERS: _write_registers,
+    FunctionCode.MASK_WRITE_REGISTER: _mask_register,
+    FunctionCode.READ_WRITE_MULTIPLE_REGISTERS: _read_write,
+    FunctionCode.READ_DEVICE_IDENTIFICATION: _identify,
 }
+# Plain integers are found faster than members of an enumeration; a missing handler is an error at import.
+_HANDLERS: Final[dict[int, Handler]] = {int(function): _HANDLER_OF[function] for function in FunctionCode}

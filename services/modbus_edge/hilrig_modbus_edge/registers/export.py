@@ -4,15 +4,10 @@ import csv
 import io
 from typing import Final
 
-from hilrig_modbus_edge.registers.map import MAP, UNIT_IDS, Register, RegisterTable
+from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
+from hilrig_modbus_edge.registers.map import UNIT_IDS, rows_of
 
-_TITLES: Final = {
-    RegisterTable.HOLDING_REGISTER: ("Holding registers", "read with 3, written with 6, 16, 22 and 23"),
-    RegisterTable.COIL: ("Coils", "read with 1, written with 5 and 15"),
-    RegisterTable.INPUT_REGISTER: ("Input registers", "read with 4"),
-    RegisterTable.DISCRETE_INPUT: ("Discrete inputs", "read with 2"),
-}
-_NAMES: Final = {
+TABLE_NAMES: Final = {
     RegisterTable.HOLDING_REGISTER: "holding register",
     RegisterTable.COIL: "coil",
     RegisterTable.INPUT_REGISTER: "input register",
@@ -41,16 +36,15 @@ def as_markdown() -> str:
     parts = [_INTRODUCTION]
     units = ", ".join(str(unit) for unit in sorted(UNIT_IDS))
     parts.append(f"\nAccepted unit identifiers: {units}; a request to another one gets exception 0B.\n")
-    for table, (title, functions) in _TITLES.items():
-        parts.append(f"\n## {title}\n\nFunctions: {functions}.\n")
+    for table, name in TABLE_NAMES.items():
+        parts.append(f"\n## {name.capitalize()}s\n\nFunctions: {_functions(table)}.\n")
         parts.append("\n| number | address | name | type | unit | scale | written by | description |")
         parts.append("\n|---:|---:|---|---|---|---:|---|---|\n")
-        for row in _rows(table):
-            last = row.number + row.type.words - 1
-            number = str(row.number) if last == row.number else f"{row.number}-{last}"
+        for row in rows_of(table):
+            number = str(row.number) if row.type.words == 1 else f"{row.number}-{row.end}"
             scale = str(row.scale) if row.scale > 1 else ""
             owner = "controller" if row.writable else "rig"
-            cells = (number, row.address, f"`{row.name}`", row.type.value, row.unit, scale, owner, row.text)
+            cells = (number, row.address, f"`{row.name}`", row.type.name.lower(), row.unit, scale, owner, row.text)
             parts.append("| " + " | ".join(map(str, cells)) + " |\n")
     return "".join(parts)
 
@@ -69,20 +63,20 @@ def as_rows() -> list[dict[str, str | int | bool]]:
     """Return the map as plain values, in the order of the tables above."""
     return [
         {
-            "table": _NAMES[row.table],
+            "table": TABLE_NAMES[row.table],
             "number": row.number,
             "address": row.address,
             "classic": row.classic,
             "name": row.name,
-            "type": row.type.value,
+            "type": row.type.name.lower(),
             "words": row.type.words,
             "unit": row.unit,
             "scale": row.scale,
             "writable": row.writable,
             "text": row.text,
         }
-        for table in _TITLES
-        for row in _rows(table)
+        for table in TABLE_NAMES
+        for row in rows_of(table)
     ]
 
 
@@ -93,5 +87,13 @@ def _with_access(row: dict[str, str | int | bool]) -> dict[str, str | int | bool
     }
 
 
-def _rows(table: RegisterTable) -> list[Register]:
-    return sorted((row for row in MAP if row.table is table), key=lambda row: row.number)
+def _functions(table: RegisterTable) -> str:
+    """Return the functions that access a table: "read with 1, written with 5 and 15"."""
+    mine = [function for function in FunctionCode if function.table is table]
+    reads, writes = [f for f in mine if f.is_read], [f for f in mine if f.is_write]
+    parts = [f"{verb} with {_join(codes)}" for verb, codes in (("read", reads), ("written", writes)) if codes]
+    return ", ".join(parts)
+
+
+def _join(codes: list[FunctionCode]) -> str:
+    return " and ".join(", ".join(map(str, part)) for part in (codes[:-1], codes[-1:]) if part)

@@ -3,13 +3,15 @@
 A read is served from one image, so that no 32-bit value is torn and no block mixes two steps.
 """
 
-import struct
+from array import array
+from collections.abc import Sequence
 from typing import Final
 
 from google.protobuf.message import DecodeError
 
+from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_modbus_edge.registers import codec
-from hilrig_modbus_edge.registers.map import MAP_VERSION, Status
+from hilrig_modbus_edge.registers.map import MAP_VERSION, Status, struct_of
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState
 
@@ -23,7 +25,7 @@ injected delay (ns). The tuple is shared by all clients that were served the sam
 NO_STATE_REF: Final[StateRef] = (0, 0, 0, 0)
 """Reference to no state."""
 
-_HEAD: Final = struct.Struct(">HHIIHHHHHH")
+_INPUTS: Final = struct_of(RegisterTable.INPUT_REGISTER)
 
 
 class StateImage:
@@ -40,7 +42,7 @@ class StateImage:
         self._message = JointState()
         self._saturated = False
         self._latency_us = 0
-        self._floats = b""
+        self._floats: Sequence[float] = ()
 
     def update(self, arrival: TimestampedPayload) -> None:
         """Compute the image of a received state; an invalid message is ignored."""
@@ -60,12 +62,12 @@ class StateImage:
         self.position_words, self._saturated = codec.words_of_position(position)
         if message.loop_latency_ns:
             self._latency_us = min(message.loop_latency_ns // 1000, 0xFFFFFFFF)
-        self._floats = b""
+        self._floats = ()
 
-    def status(self, now_ns: int) -> Status:
+    def status(self, now_ns: int) -> int:
         """Return the status bits that depend on the simulation; ns, monotonic clock."""
         message = self._message
-        status = Status(0)
+        status = 0
         if self.arrival is None:
             return status
         if now_ns - self.arrived_ns < MAX_STATE_AGE_NS:
@@ -85,15 +87,14 @@ class StateImage:
     def input_words(
         self, *, status: int, lease: int, watchdog: int, timeout_ms: int, session: int, age_ms: int
     ) -> bytes:
-        """Return all input registers, big-endian."""
+        """Return all input registers, big-endian: the values in the order of the map."""
         message = self._message
         if not self._floats:
-            self._floats = (
-                codec.floats_of_joints(message.position)
-                + codec.floats_of_joints(message.velocity)
-                + codec.floats_of(message.effort)
+            # An array of 32-bit floats converts a number beyond their range to infinity.
+            self._floats = array(
+                "f", (*codec.display_of(message.position), *codec.display_of(message.velocity), *message.effort)
             )
-        head = _HEAD.pack(
+        return _INPUTS.pack(
             MAP_VERSION,
             status,
             self.step & 0xFFFFFFFF,
@@ -104,5 +105,5 @@ class StateImage:
             session & 0xFFFF,
             message.limit_flags & 0xFFFF,
             min(age_ms, 0xFFFF),
+            *self._floats,
         )
-        return head + self._floats

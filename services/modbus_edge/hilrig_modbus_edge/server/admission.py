@@ -9,8 +9,8 @@ from typing import Final, Protocol
 
 from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_runtime.counters import Counters
+from hilrig_runtime.timing.rate_limiter import RateLimiter
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events about refused connections of one host and reason, ns."""
@@ -31,11 +31,11 @@ _TCP_OPTIONS: Final = (
 class Limits:
     """Limits and allow-list for the connections of a rig."""
 
-    connections: int = 32
-    connections_per_host: int = 16
-    idle_ns: int = 60_000_000_000
+    connections: int
+    connections_per_host: int
+    idle_ns: int
     """Time without a request after which a connection is closed, ns; 0: never."""
-    allow: tuple[IPv4Network | IPv6Network, ...] = ()
+    allow: tuple[IPv4Network | IPv6Network, ...]
     """Networks that may connect; empty: all."""
 
 
@@ -58,7 +58,7 @@ class Admission:
         self._limits = limits
         self._monotonic_ns = monotonic_ns
         self._counters = counters
-        self._rate_limiter = RateLimiter(REFUSED_EVENT_PERIOD_NS)
+        self._rate_limiter: RateLimiter[tuple[str, str]] = RateLimiter(REFUSED_EVENT_PERIOD_NS)
 
     def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
         """Return host and port of an admitted connection; else close the connection and return None."""

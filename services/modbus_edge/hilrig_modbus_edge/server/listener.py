@@ -9,8 +9,6 @@ from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.events import repeat_suffix
-from hilrig_modbus_edge.device.rate_limiter import RateLimiter
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
@@ -19,6 +17,7 @@ from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 
 BACKLOG: Final = 128
 """Connections that the system queues until they are accepted."""
@@ -39,7 +38,7 @@ class RigServer:
         self.connections: set[Connection] = set()
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters)
-        self._rate_limiter = RateLimiter(MALFORMED_LOG_PERIOD_NS)
+        self._rate_limiter: RateLimiter[str] = RateLimiter(MALFORMED_LOG_PERIOD_NS)
         self._acceptors: list[asyncio.Task[None]] = []
         self._tls_servers: list[asyncio.Server] = []
 

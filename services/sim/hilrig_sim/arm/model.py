@@ -1,7 +1,7 @@
 """Parameters of a rig in SI units, for simulation, visualization and grading.
 
-They are computed from the lab's configuration, published as JSON in `RigConfig.parameters_json`, and read from a
-recording without loss.
+They are computed from the lab's configuration, which has their defaults, published as JSON in
+`RigConfig.parameters_json`, and read from a recording without loss.
 """
 
 import dataclasses
@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
+from hilrig_runtime.config.lab import ArmConfig, SimConfig
+from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.errors import InputError
 
 GRAVITY: Final = 9.81
@@ -31,6 +33,19 @@ JOINT_SCALE: Final = (math.degrees(1.0), math.degrees(1.0), 1e3, math.degrees(1.
 """Factors from rad and m to the displayed ° and mm."""
 
 
+_ARM: Final = ArmConfig()
+_SIM: Final = SimConfig()
+_SCENE: Final = SceneConfig()
+
+
+def joints_si(joints: Vector4) -> Vector4:
+    """Convert joint coordinates from the units of `lab.toml` (°, °, mm, °) to rad, rad, m, rad."""
+    return (math.radians(joints[0]), math.radians(joints[1]), joints[2] / 1000, math.radians(joints[3]))
+
+
+_LOWER, _UPPER, _START = map(joints_si, (_ARM.lower_limits, _ARM.upper_limits, _ARM.start_position))
+
+
 def _positive(**values: float) -> None:
     for name, value in values.items():
         if not (value > 0 and math.isfinite(value)):
@@ -41,27 +56,27 @@ def _positive(**values: float) -> None:
 class ArmParameters:
     """Parameters of the arm (docs/model.md); point masses at the distal ends of the links (17)–(19)."""
 
-    l1: float = 0.139
+    l1: float = _ARM.l1_m
     """Height of the arm's plane above the base plane, m."""
-    l2: float = 0.300
+    l2: float = _ARM.l2_m
     """Length of link 1, m."""
-    l3: float = 0.300
+    l3: float = _ARM.l3_m
     """Length of link 2, m."""
-    masses: Vector3 = (1.0, 1.0, 0.5)
+    masses: Vector3 = _ARM.masses_kg
     """m1, m2, m3, kg."""
-    j4: float = 0.005
+    j4: float = _ARM.j4_kgm2
     """Inertia of joint 4, kg·m²."""
-    friction: Vector4 = (2.0, 2.0, 5.0, 0.05)
+    friction: Vector4 = _ARM.friction
     """b1…b4; N·m·s, N·m·s, N·s/m, N·m·s."""
-    lower: Vector4 = (math.radians(-133.0), math.radians(-153.0), 0.0, math.radians(-360.0))
+    lower: Vector4 = _LOWER
     """Lower stops; rad, rad, m, rad."""
-    upper: Vector4 = (math.radians(133.0), math.radians(153.0), 0.200, math.radians(360.0))
+    upper: Vector4 = _UPPER
     """Upper stops; rad, rad, m, rad."""
-    start: Vector4 = (0.0, 0.0, 0.0, 0.0)
+    start: Vector4 = _START
     """Start pose; rad, rad, m, rad."""
-    external_force_z: float = 0.0
+    external_force_z: float = _ARM.external_force_z_n
     """f_z, force of the environment on the tool, along world z, N."""
-    external_torque_z: float = 0.0
+    external_torque_z: float = _ARM.external_torque_z_nm
     """n_z, torque of the environment on the tool, about world z, N·m."""
 
     def __post_init__(self) -> None:
@@ -124,14 +139,14 @@ class TrayParameters:
 class SceneParameters:
     """Objects around the arm."""
 
-    table_height: float = -0.060
+    table_height: float = _SCENE.table.height_mm / 1000
     """World z of the table's top, m."""
-    table_centre: Vector2 = (0.0, 0.0)
-    table_size: Vector2 = (1.3, 1.3)
+    table_centre: Vector2 = (_SCENE.table.centre_mm[0] / 1000, _SCENE.table.centre_mm[1] / 1000)
+    table_size: Vector2 = (_SCENE.table.size_mm[0] / 1000, _SCENE.table.size_mm[1] / 1000)
     """Extent along x and y, m."""
-    magnet_reach: float = 0.015
+    magnet_reach: float = _SCENE.magnet.reach_mm / 1000
     """Largest horizontal distance from the tip to the center of a part's top, m."""
-    magnet_gap: float = 0.005
+    magnet_gap: float = _SCENE.magnet.gap_mm / 1000
     """Largest vertical distance between the tip and a part's top, m."""
     trays: tuple[TrayParameters, ...] = ()
     parts: tuple[PartParameters, ...] = ()
@@ -141,10 +156,10 @@ class SceneParameters:
 class StepParameters:
     """Step length and integration method."""
 
-    step_ns: int = 20_000_000
-    substeps: int | Literal["auto"] = AUTO
+    step_ns: int = _SIM.step_ns
+    substeps: int | Literal["auto"] = _SIM.substeps
     """Integration steps of a step of the loop: a fixed number, or `AUTO`."""
-    integrator: str = "rkf45"
+    integrator: str = _SIM.integrator
 
     @property
     def step(self) -> float:

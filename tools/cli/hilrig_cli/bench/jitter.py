@@ -22,9 +22,13 @@ from hilrig_cli.bench.cpu_stress import cpu_stress
 from hilrig_cli.bench.timing_benchmark import TimingResult
 from hilrig_cli.local.demo import free_ports
 from hilrig_cli.local.local_lab import running_lab
+from hilrig_modbus_edge.protocol.functions import FunctionCode
+from hilrig_modbus_edge.protocol.mbap import encode_frame
+from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import TRANSPORT
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.lab import LabConfig, load_lab
@@ -45,9 +49,11 @@ folder = '{folder}'
 MIN_POLL_PERIOD_NS: Final = 1_000_000
 POLLS_PER_STEP: Final = 4
 RESPONSE_TIMEOUT_S: Final = 5.0
-READ_REQUEST: Final = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 4, 4)
+READ_REQUEST: Final = encode_frame(1, 1, struct.pack(">BHH", FunctionCode.READ_HOLDING_REGISTERS, POSITION_ADDRESS, 4))
 """Modbus request that reads the four positions."""
-WRITE_REQUEST: Final = struct.pack(">HHHBBHHB8x", 2, 0, 15, 1, 16, 0, 4, 8)
+WRITE_REQUEST: Final = encode_frame(
+    2, 1, struct.pack(">BHHB8x", FunctionCode.WRITE_MULTIPLE_REGISTERS, TORQUE_ADDRESS, 4, 8)
+)
 """Modbus request that writes four torques of zero."""
 READ_RESPONSE_BYTES: Final = 17
 WRITE_RESPONSE_BYTES: Final = 12
@@ -71,7 +77,8 @@ def measure_timing(
     set_short_slice()
     with tempfile.TemporaryDirectory(prefix="hilrig-jitter-") as folder:
         config = Path(folder) / "lab.toml"
-        ports = {"modbus_port": free_ports(5020), "bus_port": free_ports(7447, 3)}
+        default = LabConfig()
+        ports = {"modbus_port": free_ports(default.edge.first_port), "bus_port": free_ports(default.bus.first_port, 3)}
         config.write_text(LAB_TEMPLATE.format(step_ms=step_ms, folder=folder, **ports))
         lab = load_lab(config)
         processors = os.cpu_count() or 1
@@ -112,7 +119,7 @@ def _evaluate(
         overruns=overruns,
         missed_steps=missed,
         tick_lateness_ms=report.jitter_ms.tick_lateness,
-        bus_ms=report.stages_ms["transport"],
+        bus_ms=report.stages_ms[TRANSPORT.key],
         modbus_ms=Statistics.of(round_trips_ns),
         loop_ms=report.loop_ms,
         stolen=stolen,

@@ -30,7 +30,7 @@ def latency(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the loop latency of recordings: six stages, percentiles, jitter, losses, and a diagnosis.
+    """Measure the loop latency of recordings: its stages, percentiles, jitter, losses, and a diagnosis.
 
     Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
@@ -86,7 +86,7 @@ def print_report(report: "LatencyReport") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_replay.plots.palette import STAGE_NAMES
+    from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = Console()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
@@ -97,8 +97,8 @@ def print_report(report: "LatencyReport") -> None:
         table.add_column(column.replace("p999", "p99.9"), justify="right", no_wrap=True)
     if report.loop_ms is not None:
         table.add_row("loop", *_figures(report.loop_ms), style="bold", end_section=True)
-        for stage, statistics in report.stages_ms.items():
-            table.add_row(f"  {STAGE_NAMES[stage]}", *_figures(statistics))
+        for stage in LOOP_STAGES:
+            table.add_row(f"  {stage.title}", *_figures(report.stages_ms[stage.key]))
         table.add_section()
     table.add_row("tick lateness", *_figures(report.jitter_ms.tick_lateness))
     console.print(table)

@@ -11,7 +11,7 @@ from hilrig_cli.options import AsJson, Config, config_for_commands
 if TYPE_CHECKING:
     from hilrig_runtime.bus.api import Bus
     from hilrig_runtime.config.lab import LabConfig, RigSettings
-    from hilrig_schemas import Event, ServiceInfo
+    from hilrig_schemas import ServiceInfo
 
 app = typer.Typer(
     help="List, add, remove or reset rigs of a running lab.",
@@ -67,10 +67,11 @@ def add(
 
     The rig exists until the lab stops, or its simulation or edge restarts. To keep it, add it to lab.toml too.
     """
+    from hilrig_cli.client import send_control_request
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import HilrigError, OperationError
-    from hilrig_schemas import Event
+    from hilrig_schemas import AddRig, ControlRequest, RemoveRig
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
@@ -78,14 +79,13 @@ def add(
         new = _settings(services, rig, port, settings)
         simulation = _least_loaded(services, "sim", lab)
         edge = _least_loaded(services, "edge", lab)
-        request = Event(kind=Event.RIG_ADDED, rig=rig)
-        request.configuration_data.text = new.model_dump_json()
-        _request(bus, lab, simulation, request)
+        request = ControlRequest(add_rig=AddRig(settings_json=new.model_dump_json()))
+        send_control_request(bus, lab, simulation, request)
         try:
-            reply = _request(bus, lab, edge, request)
+            reply = send_control_request(bus, lab, edge, request)
         except HilrigError as error:
             # Atomic: if the edge refuses the rig, the simulation must not keep it.
-            _request(bus, lab, simulation, Event(kind=Event.RIG_REMOVED, rig=rig))
+            send_control_request(bus, lab, simulation, ControlRequest(remove_rig=RemoveRig(rig=rig)))
             raise OperationError(f"rig {rig!r} was not added: {error}") from error
     print(reply.text)
 
@@ -93,12 +93,12 @@ def add(
 @app.command()
 def remove(rig: Name, config: Config = None) -> None:
     """Remove a rig from a running lab: its torque is zeroed, its session ends, its port is closed."""
-    from hilrig_cli.client import check_rig
+    from hilrig_cli.client import check_rig, send_control_request
     from hilrig_cli.service_kinds import RIG_SERVICES, STOP_ORDER
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_schemas import Event
+    from hilrig_schemas import ControlRequest, RemoveRig
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
@@ -108,23 +108,23 @@ def remove(rig: Name, config: Config = None) -> None:
             raise OperationError(f"no running service has rig {rig!r}; hilrig rig list shows the existing rigs")
         # The edge first: its last command is zero torque.
         for info in sorted(owners, key=lambda info: STOP_ORDER.index(info.service)):
-            print(_request(bus, lab, info, Event(kind=Event.RIG_REMOVED, rig=rig)).text)
+            print(send_control_request(bus, lab, info, ControlRequest(remove_rig=RemoveRig(rig=rig))).text)
 
 
 @app.command()
 def reset(rig: Name, config: Config = None) -> None:
     """Reset a rig's arm and parts to their start; the controller that holds the lease stays connected."""
-    from hilrig_cli.client import check_rig
+    from hilrig_cli.client import check_rig, send_control_request
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
-    from hilrig_schemas import Event
+    from hilrig_schemas import ControlRequest, ResetRig
 
     lab = load_lab(config)
     with ZenohBus(lab.bus, "rig") as bus:
         for info in _discover(bus, lab):
             if info.service == "edge" and rig in info.rigs:
-                print(_request(bus, lab, info, Event(kind=Event.RESET, rig=rig)).text)
+                print(send_control_request(bus, lab, info, ControlRequest(reset_rig=ResetRig(rig=rig))).text)
                 return
         check_rig(bus, lab, rig)
     raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
@@ -179,19 +179,3 @@ def _least_loaded(infos: "list[ServiceInfo]", service: str, lab: "LabConfig") ->
     if not candidates:
         raise OperationError(f"no {service} service of lab {lab.name!r} found: is it running?")
     return min(candidates, key=lambda info: len(info.rigs))
-
-
-def _request(bus: "Bus", lab: "LabConfig", info: "ServiceInfo", request: "Event") -> "Event":
-    from hilrig_cli.client import QUERY_TIMEOUT_S
-    from hilrig_runtime.errors import OperationError
-    from hilrig_schemas import Event, topics
-
-    key = topics.CONTROL.key(lab.name, info.service, info.instance)
-    replies = bus.query(key, request.SerializeToString(), timeout_s=QUERY_TIMEOUT_S)
-    if not replies:
-        raise OperationError(
-            f"{info.service}/{info.instance} on {info.host} does not reply within {QUERY_TIMEOUT_S:g} s"
-        )
-    if replies[0].error:
-        raise OperationError(f"{info.service}/{info.instance} on {info.host} refused: {replies[0].error}")
-    return Event.FromString(replies[0].payload)

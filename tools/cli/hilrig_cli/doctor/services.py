@@ -11,6 +11,7 @@ from hilrig_cli.service_kinds import SERVICE_KINDS
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import HilrigError, InputError
+from hilrig_runtime.process.control import release_series
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Health
@@ -171,7 +172,7 @@ def check_versions(healths: Iterable[Health], own: str) -> Iterator[CheckResult]
     for version, names in sorted(others.items()):
         yield CheckResult(
             "versions",
-            Level.WARNING if _compatibility(version) == _compatibility(own) else Level.ERROR,
+            Level.WARNING if release_series(version) == release_series(own) else Level.ERROR,
             f"{', '.join(sorted(names))}: version {version}; this command: {own}",
             "install the same version everywhere; services can be upgraded one by one",
         )
@@ -213,9 +214,3 @@ def _is_granted_here() -> bool:
     trial.start()
     trial.join()
     return granted == [True]
-
-
-def _compatibility(version: str) -> tuple[str, ...]:
-    """Parts of a version that must be equal for compatibility: the first; before 1.0 the second too."""
-    parts = version.split(".")
-    return tuple(parts[:2] if parts[0] == "0" else parts[:1])

@@ -87,7 +87,9 @@ def run_demo(
         config = out / "lab.toml"
         config.write_text(
             LAB_TEMPLATE.format(
-                modbus_port=free_ports(5020), bus_port=free_ports(7447, 3), folder=json.dumps(str(recordings.resolve()))
+                modbus_port=free_ports(LabConfig().edge.first_port),
+                bus_port=free_ports(LabConfig().bus.first_port, 3),
+                folder=json.dumps(str(recordings.resolve())),
             )
         )
     except OSError as error:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, median
-from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Losses, Run
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hilrig_replay.analysis.data_quality import Stalls
 from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles
+from hilrig_replay.analysis.stages import CONTROLLER, EDGE, INJECTED, TICK_WAIT
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_sim.arm.model import JOINT_SCALE
@@ -99,8 +100,8 @@ def edge_stall(evidence: Evidence) -> Finding | None:
     requests = [requests for _, _, requests in evidence.windows() if len(requests)]
 
     def waits() -> Iterator[tuple[NDArray[np.int64], Rows]]:
-        for rows in samples.blocks("edge", "sampled_ns", "incarnation"):
-            yield rows["edge"], rows
+        for rows in samples.blocks(EDGE.key, "sampled_ns", "incarnation"):
+            yield rows[EDGE.key], rows
         for rows in requests:
             yield rows["answered_ns"] - rows["arrived_ns"], rows
 
@@ -119,10 +120,10 @@ def edge_stall(evidence: Evidence) -> Finding | None:
         """Times of the late samples and requests, in chronological order."""
         waits = [run.time_ns(rows)[rows["answered_ns"] - rows["arrived_ns"] > limit_ns] for rows in requests]
         others = np.sort(np.concatenate([np.empty(0, np.int64), *waits]))
-        for rows in samples.blocks("edge", "sampled_ns", "incarnation"):
+        for rows in samples.blocks(EDGE.key, "sampled_ns", "incarnation"):
             time_ns = run.time_ns(rows)
             before = int(np.searchsorted(others, time_ns[-1]))
-            yield np.sort(np.concatenate((time_ns[rows["edge"] > limit_ns], others[:before])))
+            yield np.sort(np.concatenate((time_ns[rows[EDGE.key] > limit_ns], others[:before])))
             others = others[before:]
         yield others
 
@@ -138,7 +139,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
 
 def injected_delay(evidence: Evidence) -> Finding | None:
     """Delay that was injected by a configured impairment."""
-    injected = evidence.stages_ms.get("injected")
+    injected = evidence.stages_ms.get(INJECTED.key)
     if injected is None or not injected.max:
         return None
     return Finding(
@@ -166,7 +167,7 @@ def slow_controller(evidence: Evidence) -> Finding | None:
     """A controller with a long time between reading a state and writing a command."""
     if evidence.loop_ms is None:
         return None
-    held, loop = evidence.stages_ms["controller"].p50 * MS, evidence.loop_ms.p50 * MS
+    held, loop = evidence.stages_ms[CONTROLLER.key].p50 * MS, evidence.loop_ms.p50 * MS
     if held < max(0.4 * loop, 5 * MS):
         return None
     cycle = evidence.cycle_ns
@@ -186,7 +187,7 @@ def beating(evidence: Evidence) -> Finding | None:
     samples, step = evidence.samples, evidence.step_ns
     if len(samples) < 50:
         return None
-    waits = samples.column("tick_wait")
+    waits = samples.column(TICK_WAIT.key)
     low, high = percentiles(waits, (5, 95))
     if high - low < 0.5 * step:
         return None

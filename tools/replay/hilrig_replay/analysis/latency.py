@@ -13,7 +13,8 @@ from typing import Any
 from hilrig_replay.analysis.data_quality import DataQuality, Lost
 from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose
 from hilrig_replay.analysis.distribution import Statistics, percentiles
-from hilrig_replay.analysis.samples import STAGES, CommandMatcher, SampleTable
+from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
+from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 

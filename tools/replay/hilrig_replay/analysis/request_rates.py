@@ -1,4 +1,7 @@
-"""Modbus request rates: reads and writes of each controller, counted in bins of 0.1 s.
+"""Modbus request rates: reads, writes and errors of each controller, counted in bins of 0.1 s.
+
+Each request has one kind. A request that was answered with an exception response is an error, and so is an unknown
+function; function 23, which reads and writes, is a write.
 
 Requests are added in blocks whose ends can be within a bin, so a bin is returned when a later bin has begun. Only the
 current bin of each controller and kind is kept, and controllers beyond the first `MAX_CLIENTS` are counted together.
@@ -10,13 +13,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_replay.io.columns import Rows, StringTable
 
 BIN_NS: Final = 100_000_000
 MAX_CLIENTS: Final = 32
 OTHER_CLIENTS: Final = "others"
-KINDS: Final = ("reads", "writes")
-_READS: Final = (1, 2, 3, 4, 23, 43)
+KINDS: Final = ("reads", "writes", "errors")
+_WRITES: Final = [function for function in FunctionCode if function.is_write]
+_READS: Final = [function for function in FunctionCode if not function.is_write]
 _MAX_GAP_BINS: Final = 20
 """Gaps of up to this number of bins are returned as empty bins; of longer gaps only the first and last bin."""
 
@@ -34,10 +39,11 @@ class RequestRates:
 
     def add(self, traffic: Rows) -> Iterator[Rate]:
         """Add requests, fields as `columns.TRAFFIC_DTYPE`; returns the bins that are complete."""
-        read = np.isin(traffic["function"], _READS)
+        executed = traffic["exception"] == 0
+        reads, writes = (executed & np.isin(traffic["function"], functions) for functions in (_READS, _WRITES))
         clients = np.array([self._client(int(code)) for code in traffic["controller"]], dtype=object)
         for client in dict.fromkeys(clients):
-            for kind, chosen in zip(KINDS, (read, ~read), strict=True):
+            for kind, chosen in zip(KINDS, (reads, writes, ~(reads | writes)), strict=True):
                 bins = traffic["wall_ns"][(clients == client) & chosen] // BIN_NS
                 if len(bins):
                     yield from self._count(client, kind, bins)

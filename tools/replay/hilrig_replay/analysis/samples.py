@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.disk_table import DiskTable
+from hilrig_replay.analysis.stages import LOOP_STAGES, STAGES, fill_stages
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
-
-STAGES: Final = ("register_wait", "controller", "edge", "injected", "tick_wait", "transport")
-"""Stages of the loop in the order of the data flow; `transport` is last because it is the remainder."""
 
 SAMPLE_DTYPE: Final = np.dtype(
     [
@@ -60,7 +58,7 @@ class CommandMatcher:
         self._waiting = missing[-MATCH_WINDOW_ROWS:].copy()
         self._dropped += len(missing) - len(self._waiting)
         self._commands = known[-max(MATCH_WINDOW_ROWS, len(commands)) :].copy()
-        return _stages(effective[found], known[rows[found]])
+        return _samples(effective[found], known[rows[found]])
 
 
 class SampleTable(DiskTable):
@@ -102,20 +100,13 @@ def join_commands(states: Rows, commands: Rows) -> tuple[NDArray[np.intp], NDArr
     return rows, keys[rows] == wanted
 
 
-def _stages(states: Rows, commands: Rows) -> NDArray[np.void]:
+def _samples(states: Rows, commands: Rows) -> NDArray[np.void]:
     """Compute the samples of states and their commands, row by row, as defined in docs/timing.md."""
     samples = np.empty(len(states), SAMPLE_DTYPE)
     for name in ("step", "incarnation", "sampled_ns", "wall_ns", "basis_step", "command_seq"):
         samples[name] = states[name]
     for name in ("write_arrived_ns", "state_served_ns"):
         samples[name] = commands[name]
-    served, written = commands["state_served_ns"], commands["write_arrived_ns"]
-    state_injected, command_injected = commands["state_injected_ns"], commands["command_injected_ns"]
     samples["loop"] = states["loop_latency_ns"]
-    samples["register_wait"] = served - commands["state_arrived_ns"] - state_injected
-    samples["controller"] = written - served
-    samples["edge"] = commands["sent_ns"] - written - command_injected
-    samples["injected"] = state_injected + command_injected
-    samples["tick_wait"] = states["sampled_ns"] - states["command_arrived_ns"]
-    samples["transport"] = samples["loop"] - sum(samples[stage] for stage in STAGES[:-1])
+    fill_stages(samples, LOOP_STAGES, states, commands)
     return samples

@@ -1,8 +1,7 @@
 """Extracts the delays of a recorded session as a delay trace for network impairment emulation.
 
-The delay of each loop latency sample is the sum of the stages *controller* (both network directions and the
-controller's computing time) and *injected*. The trace excludes register wait, tick wait, edge and transport, because
-the impaired rig adds its own; they would be counted twice.
+The delay of each loop latency sample is the sum of `TRACE_STAGES`. The trace excludes the other stages, because the
+impaired rig adds its own; they would be counted twice.
 """
 
 from typing import Final
@@ -10,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import CONTROLLER, INJECTED
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.impairment import MAX_DELAY_MS, TraceDelay
@@ -17,6 +17,8 @@ from hilrig_runtime.errors import InputError
 
 MIN_SAMPLES: Final = 100
 """Smallest number of samples of a usable delay distribution."""
+TRACE_STAGES: Final = (CONTROLLER, INJECTED)
+"""Stages outside the rig: both network directions, and the computing time of the controller."""
 
 
 def delay_trace(run: Run) -> TraceDelay:
@@ -42,7 +44,7 @@ def delay_trace(run: Run) -> TraceDelay:
             f"{run.path}: unusable as a delay trace: {report.samples} loop latency samples, "
             f"at least {MIN_SAMPLES} are required"
         )
-    delays_ms = (report.table["controller"] + report.table["injected"]) / 1e6
+    delays_ms = np.sum([report.table[stage.key] for stage in TRACE_STAGES], axis=0) / 1e6
     if (delays_ms < 0).any():
         raise InputError(f"{run.path}: unusable as a delay trace: inconsistent time stamps, a delay is negative")
     longest = int(np.argmax(delays_ms))

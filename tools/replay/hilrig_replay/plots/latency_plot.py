@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 
 from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.latency import LatencyReport
-from hilrig_replay.analysis.samples import STAGES
+from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
-from hilrig_replay.plots.palette import STAGE_COLORS, STAGE_NAMES, TEXT_COLOR
+from hilrig_replay.plots.palette import LOOP_COLOR, TEXT_COLOR
 from hilrig_runtime.errors import InputError
 
 _PERCENTILE_COLOR: Final = "#d62728"
@@ -69,7 +69,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     for loop_ns in report.table.column("loop")():
         counts += np.histogram(np.minimum(loop_ns / 1e6, limit), edges)[0]
         beyond += int((loop_ns / 1e6 > limit).sum())
-    axes.stairs(counts, edges, baseline=0.5, fill=True, color=STAGE_COLORS["register_wait"])
+    axes.stairs(counts, edges, baseline=0.5, fill=True, color=LOOP_COLOR)
     set_log_scale(axes)
     steps = np.arange(step, limit + step / 2, step)
     axes.vlines(steps, 0, 1, transform=axes.get_xaxis_transform(), color="#bbbbbb", linewidth=0.8, zorder=0)
@@ -101,9 +101,9 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
 
 
 def _stages(axes: Axes, report: LatencyReport) -> None:
-    for row, stage in enumerate(STAGES):
-        statistics = report.stages_ms[stage]
-        axes.barh(row, statistics.p50, color=STAGE_COLORS[stage], height=0.6)
+    for row, stage in enumerate(LOOP_STAGES):
+        statistics = report.stages_ms[stage.key]
+        axes.barh(row, statistics.p50, color=stage.color, height=0.6)
         axes.plot([statistics.p50, statistics.p99], [row, row], color=TEXT_COLOR, linewidth=1.2)
         axes.plot([statistics.p99], [row], marker="|", color=TEXT_COLOR, markersize=9)
         axes.annotate(
@@ -115,15 +115,15 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
             fontsize=8,
             color=TEXT_COLOR,
         )
-    axes.set_yticks(range(len(STAGES)), [STAGE_NAMES[stage] for stage in STAGES])
+    axes.set_yticks(range(len(LOOP_STAGES)), [stage.title for stage in LOOP_STAGES])
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.15 * max(1e-3, *(report.stages_ms[stage].p99 for stage in STAGES)))
+    axes.set_xlim(0, 1.15 * max(1e-3, *(statistics.p99 for statistics in report.stages_ms.values())))
     label_axes(axes, "Stage latencies (bar and number: p50, line: p99)", "latency, ms", "")
 
 
 def _tail(axes: Axes, report: LatencyReport) -> None:
     loop_ns, share_above = complementary_cdf(report.table.column("loop"))
-    axes.step(loop_ns / 1e6, share_above, where="post", color=STAGE_COLORS["register_wait"], linewidth=1.4)
+    axes.step(loop_ns / 1e6, share_above, where="post", color=LOOP_COLOR, linewidth=1.4)
     set_log_scale(axes)
     axes.grid(color="#e5e5e5", linewidth=0.6)
     for share, name in ((0.5, "p50"), (0.05, "p95"), (0.01, "p99"), (0.001, "p99.9")):
@@ -160,7 +160,7 @@ def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
         linestyle="none",
         marker=".",
         markersize=2.5,
-        color=STAGE_COLORS["register_wait"],
+        color=LOOP_COLOR,
         rasterized=True,
     )
     axes.set_ylim(0, 1.1 * float(slowest.max()))

@@ -1,24 +1,9 @@
-"""Colors and names of stages, joints and events, common to the viewer, plots and reports."""
+"""Colors and names of joints, runs and events, common to the viewer, plots and reports."""
 
 from typing import Final
 
 TEXT_COLOR: Final = "#333333"
-STAGE_NAMES: Final = {
-    "register_wait": "register wait",
-    "controller": "controller",
-    "edge": "edge",
-    "injected": "injected",
-    "tick_wait": "tick wait",
-    "transport": "transport",
-}
-STAGE_COLORS: Final = {
-    "register_wait": "#4c78a8",
-    "controller": "#f58518",
-    "edge": "#54a24b",
-    "injected": "#b279a2",
-    "tick_wait": "#72b7b2",
-    "transport": "#e45756",
-}
+LOOP_COLOR: Final = "#4c78a8"
 JOINT_SYMBOLS: Final = ("θ1", "θ2", "d3", "θ4")
 JOINT_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
 PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")

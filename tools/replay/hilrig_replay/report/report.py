@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.similarity import find_similar
+from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
@@ -18,14 +19,14 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
-from hilrig_replay.plots.palette import EFFORT_SYMBOLS, STAGE_NAMES
+from hilrig_replay.plots.palette import EFFORT_SYMBOLS
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.process.process_pool import process_pool
 
 _COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
-ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "SATURATION", "LEASE_REFUSED")
+ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "LEASE_REFUSED")
 """Event kinds that count as alarms in the overview."""
 _MIN_RUNS_FOR_PROCESSES: Final = 4
 """Fewer runs take less time than the start of worker processes."""
@@ -275,8 +276,10 @@ def _efforts(summary: RunSummary) -> str:
 
 def _latency(summary: RunSummary) -> str:
     latency = summary.latency
-    rows = [] if latency.loop_ms is None else [["loop", *_statistics_cells(latency.loop_ms)]]
-    rows += [[STAGE_NAMES[stage], *_statistics_cells(statistics)] for stage, statistics in latency.stages_ms.items()]
+    rows = []
+    if latency.loop_ms is not None:
+        rows.append(["loop", *_statistics_cells(latency.loop_ms)])
+        rows += [[stage.title, *_statistics_cells(latency.stages_ms[stage.key])] for stage in LOOP_STAGES]
     rows.append(["tick lateness", *_statistics_cells(latency.jitter_ms.tick_lateness)])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'

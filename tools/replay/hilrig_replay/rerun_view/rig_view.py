@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
-from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
-from hilrig_replay.analysis.samples import STAGES, CommandMatcher, join_commands
+from hilrig_replay.analysis.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
+from hilrig_replay.analysis.samples import CommandMatcher, join_commands
+from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
@@ -32,8 +33,6 @@ from hilrig_replay.plots.palette import (
     PALE_JOINT_COLORS,
     RUN_COLORS,
     SEVERITY_COLORS,
-    STAGE_COLORS,
-    STAGE_NAMES,
     rgb,
 )
 from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL, arm_path
@@ -55,7 +54,7 @@ _UNKNOWN_PART_SIZE_M: Final = (0.03, 0.03, 0.03)
 _OTHER_EVENT_COLOR: Final = "#9aa5b1"
 _NOT_IN_PATH: Final = re.compile(r"[^\w.-]")
 """Characters that an entity path must not contain."""
-_REQUEST_COLORS: Final = {"reads": "#4c78a8", "writes": "#f58518"}
+_REQUEST_COLORS: Final = dict(zip(KINDS, ("#4c78a8", "#f58518", "#e45756"), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +191,9 @@ class RerunRigWriter:
         self._legend("velocity", JOINT_SYMBOLS, JOINT_COLORS)
         self._legend("effort/commanded", [f"{name} commanded" for name in EFFORT_SYMBOLS], PALE_JOINT_COLORS, 0.8)
         self._legend("effort/applied", [f"{name} applied" for name in EFFORT_SYMBOLS], JOINT_COLORS)
-        ends = ["state sampled", *(f"+ {STAGE_NAMES[stage]}" for stage in STAGES[:-1]), "+ transport = loop"]
-        self._legend("stages", ends, [_BASELINE_COLOR, *(STAGE_COLORS[stage] for stage in STAGES)])
+        ends = ["state sampled", *(f"+ {stage.title}" for stage in LOOP_STAGES)]
+        ends[-1] += " = loop"
+        self._legend("stages", ends, [_BASELINE_COLOR, *(stage.color for stage in LOOP_STAGES)])
         self._legend("loop", ["loop latency"], ["#e0e4e8"])
         self._state_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
         self._state_legend("part", {part.name: part.colour for part in self._geometry.parameters.scene.parts})
@@ -288,7 +288,7 @@ class RerunRigWriter:
     def _add_latency(self, samples: Rows) -> None:
         times = self._times(samples)
         self._scalars("loop", times, samples["loop"][:, None] / 1e6)
-        ends = np.cumsum(np.stack([samples[stage] for stage in STAGES], axis=1), axis=1) / 1e6
+        ends = np.cumsum(np.stack([samples[stage.key] for stage in LOOP_STAGES], axis=1), axis=1) / 1e6
         self._scalars("stages", times, np.hstack((np.zeros((len(ends), 1)), ends)))
 
     def _add_rates(self, rates: Iterable[Rate]) -> None:

@@ -5,6 +5,7 @@ study. The tick times are measured on a rig of the same simulation without impai
 share their ticks.
 """
 
+import struct
 import time
 from collections.abc import Callable
 from typing import Any, Final, cast
@@ -15,7 +16,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
 from hilrig_modbus_edge.registers import codec
-from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
+from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, REGISTERS, TORQUE_ADDRESS
 from hilrig_runtime.errors import OperationError
 from hilrig_study.controllers.control_laws import Controller, Measurement
 from hilrig_study.simulation.simulated_loop import Scenario
@@ -24,8 +25,6 @@ TICK_OBSERVATION_S: Final = 0.5
 """Duration of the tick phase measurement, s."""
 MIN_TICKS: Final = 3
 """Fewest observed ticks of a valid measurement."""
-_STEP_ADDRESS: Final = 2
-_LATENCY_ADDRESS: Final = 4
 _BUSY_WAIT_NS: Final = 300_000
 
 
@@ -46,13 +45,11 @@ class RigClient:
 
     def step(self) -> int:
         """Read the step counter of the newest state, low 32 bits."""
-        high, low = self._request(lambda: self._client.read_input_registers(_STEP_ADDRESS, count=2))
-        return high << 16 | low
+        return self._input("step")
 
     def latency_s(self) -> float:
         """Read the latest loop latency of the rig, s."""
-        high, low = self._request(lambda: self._client.read_input_registers(_LATENCY_ADDRESS, count=2))
-        return (high << 16 | low) * 1e-6
+        return self._input("loop_latency") * 1e-6
 
     def position(self) -> tuple[float, float, float, float]:
         """Read the joint positions, registers 5-8; rad, rad, m, rad."""
@@ -68,6 +65,12 @@ class RigClient:
     def close(self) -> None:
         """Close the connection."""
         self._client.close()
+
+    def _input(self, name: str) -> int:
+        """Read an input register, or the two of a 32-bit value, of the register map."""
+        register = REGISTERS[name]
+        words = self._request(lambda: self._client.read_input_registers(register.address, count=register.type.words))
+        return int.from_bytes(struct.pack(f">{len(words)}H", *words))
 
     def _request(self, send: Callable[[], ModbusPDU]) -> list[int]:
         try:

@@ -122,13 +122,13 @@ def _write_lab(
     find_ports: FindPorts,
 ) -> None:
     single_rig_lab = study.lab(step_ms)
-    ports = find_ports(5020, len(rigs) + 1)
+    ports = find_ports(single_rig_lab.edge.first_port, len(rigs) + 1)
     lines = [
         "# Lab of the live points of a study: one rig per point, and one rig without impairment.",
         'name = "study"',
         f"sim = {_toml(single_rig_lab.sim.model_dump())}",
         f"edge = {_toml({'first_port': ports, 'session_grace_ms': 0.0})}",
-        f"bus = {_toml({'first_port': find_ports(7447, 3)})}",
+        f"bus = {_toml({'first_port': find_ports(single_rig_lab.bus.first_port, 3)})}",
         f"recorder = {_toml({'folder': str(recordings.resolve())})}",
         f"scene = {_toml({'trays': [], 'parts': []})}",
     ]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import TRANSPORT
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 from hilrig_study.study_config import StudyConfig
@@ -85,7 +86,7 @@ def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, fol
     commands, states = run.commands, run.states
     answered = commands[commands["state_served_ns"] > 0]
     step_ns, own = run.step_ns, study.loop
-    transport_ns = float(np.median(report.table["transport"])) / 2
+    transport_ns = float(np.median(report.table[TRANSPORT.key])) / 2
     after_arrival = (answered["state_served_ns"] - answered["state_arrived_ns"]) % step_ns
     phase_ms = _circular_median(after_arrival, step_ns) / 1e6 + transport_ns / 1e6
     compute_ms = float(np.median(answered["write_arrived_ns"] - answered["state_served_ns"])) / 1e6

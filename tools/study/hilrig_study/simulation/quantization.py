@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_modbus_edge.registers.codec import COUNTS_PER_UNIT, FULL_SCALE
+from hilrig_modbus_edge.registers.codec import COUNTS_PER_UNIT, EFFORT_SCALE, FULL_SCALE
 
 Floats = NDArray[np.float64]
 
@@ -19,5 +19,5 @@ def position(values: Floats) -> Floats:
 
 def effort(values: Floats) -> Floats:
     """Quantize efforts (N·m, N·m, N, N·m), (4, N), as the simulation gets them from registers 1-4; NaN becomes 0."""
-    counts = np.clip(np.rint(values * 1000), -FULL_SCALE, FULL_SCALE)
-    return np.asarray(np.where(np.isnan(counts), 0.0, counts) / 1000)
+    counts = np.clip(np.rint(values * EFFORT_SCALE), -FULL_SCALE, FULL_SCALE)
+    return np.asarray(np.where(np.isnan(counts), 0.0, counts) / EFFORT_SCALE)

@@ -1,0 +1,57 @@
+"""Rate limit of repeated events and log messages: counts the suppressed ones."""
+
+from collections.abc import Hashable, Iterator
+from typing import Generic, TypeVar
+
+KeyT = TypeVar("KeyT", bound=Hashable)
+
+
+class RateLimiter(Generic[KeyT]):
+    """Allows one report per key and period, and counts the occurrences between two reports. Time is passed in.
+
+    The first occurrence of a key is reported, later ones are counted. The count is reported with the first occurrence
+    after the period, or when the period ends if `pop_remainders` is called periodically. The table has the newest keys,
+    `keys` at most: counts of older ones are forgotten.
+    """
+
+    def __init__(self, period_ns: int, keys: int = 256) -> None:
+        self._period_ns = period_ns
+        self._keys = keys
+        self._reported: dict[KeyT, tuple[int, int]] = {}
+        """By key, in the order of the reports: time of the last report, ns, and number of occurrences since then."""
+
+    def record(self, key: KeyT, now_ns: int) -> int:
+        """Record one occurrence at `now_ns`, monotonic clock.
+
+        Returns the number of occurrences since the last report if a report is due, else 0.
+        """
+        reported_ns, suppressed = self._reported.get(key, (now_ns - self._period_ns, 0))
+        count = suppressed + 1
+        if now_ns - reported_ns < self._period_ns:
+            self._reported[key] = (reported_ns, count)
+            return 0
+        self._report(key, now_ns)
+        return count
+
+    def pop_remainders(self, now_ns: int) -> Iterator[tuple[KeyT, int]]:
+        """Yield each key whose period has ended with suppressed occurrences, and their number: a report is due."""
+        for key, (reported_ns, suppressed) in list(self._reported.items()):
+            if now_ns - reported_ns < self._period_ns:
+                return
+            if suppressed:
+                self._report(key, now_ns)
+                yield key, suppressed
+            else:
+                del self._reported[key]
+
+    def _report(self, key: KeyT, now_ns: int) -> None:
+        # Inserted again: the oldest report is first.
+        self._reported.pop(key, None)
+        self._reported[key] = (now_ns, 0)
+        if len(self._reported) > self._keys:
+            del self._reported[next(iter(self._reported))]
+
+
+def repeat_suffix(count: int) -> str:
+    """Return " (N times)" for the end of a message; empty for one occurrence."""
+    return f" ({count} times)" if count > 1 else ""

@@ -1,0 +1,62 @@
+"""Rate limiter: the first occurrence is reported, later ones are counted, and no counted one is lost in the table."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+
+PERIOD = 100
+
+
+def test_first_is_reported_and_later_ones_are_counted() -> None:
+    limiter: RateLimiter[str] = RateLimiter(PERIOD)
+    assert [limiter.record("a", now) for now in (0, 1, 99)] == [1, 0, 0]
+    assert limiter.record("b", 99) == 1, "keys are independent"
+    assert [limiter.record("a", now) for now in (100, 199, 200)] == [3, 0, 2]
+
+
+def test_remainder_is_due_when_the_period_ends() -> None:
+    limiter: RateLimiter[tuple[str, str]] = RateLimiter(PERIOD)
+    for now in (0, 10, 20):
+        limiter.record(("lease", "session 1"), now)
+    limiter.record(("range", "session 1"), 50)
+    assert list(limiter.pop_remainders(99)) == []
+    assert list(limiter.pop_remainders(100)) == [(("lease", "session 1"), 2)]
+    # A report starts a new period, and a key without suppressed occurrences has no remainder.
+    assert limiter.record(("lease", "session 1"), 199) == 0
+    assert list(limiter.pop_remainders(200)) == [(("lease", "session 1"), 1)]
+
+
+def test_oldest_key_is_forgotten_beyond_the_capacity() -> None:
+    limiter: RateLimiter[int] = RateLimiter(PERIOD, keys=3)
+    for key in range(4):
+        assert limiter.record(key, key) == 1
+    assert [limiter.record(key, 10) for key in (3, 2, 1)] == [0, 0, 0]
+    assert limiter.record(0, 10) == 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 80), st.booleans()), max_size=60))
+def test_every_occurrence_is_reported_once(steps: list[tuple[int, int, bool]]) -> None:
+    limiter: RateLimiter[int] = RateLimiter(PERIOD)
+    now, reported, last = 0, [0] * 4, dict.fromkeys(range(4), -PERIOD)
+
+    def report(key: int, count: int) -> None:
+        if count:
+            assert now - last[key] >= PERIOD
+            reported[key] += count
+            last[key] = now
+
+    for key, wait, polls in steps:
+        now += wait
+        if polls:
+            for found, count in limiter.pop_remainders(now):
+                report(found, count)
+        report(key, limiter.record(key, now))
+    now += PERIOD
+    for found, count in limiter.pop_remainders(now):
+        report(found, count)
+    assert reported == [sum(step[0] == key for step in steps) for key in range(4)]
+
+
+def test_repeat_suffix_is_empty_for_one_occurrence() -> None:
+    assert (repeat_suffix(1), repeat_suffix(2)) == ("", " (2 times)")
