@@ -5,7 +5,6 @@ solved by trying each set of pushing stops.
 """
 
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -69,23 +68,23 @@ class ReferenceArm:
             if side and v == 0 and side * c > 0:
                 return q, 0.0
 
-            def rise(t: float, y: np.ndarray) -> float:
+            def rise(_: float, y: np.ndarray) -> float:
                 return float(y[0] - upper)
 
-            def fall(t: float, y: np.ndarray) -> float:
+            def fall(_: float, y: np.ndarray) -> float:
                 return float(y[0] - lower)
 
-            def turn(t: float, y: np.ndarray) -> float:
+            def turn(_: float, y: np.ndarray) -> float:
                 return float(y[1])
 
             for event, direction in ((rise, 1), (fall, -1), (turn, 0)):
                 event.terminal, event.direction = True, direction  # type: ignore[attr-defined]
 
-            def solve(duration: float, events: list[Callable[[float, np.ndarray], float]]) -> Any:
+            def solve(duration: float, events: list[Any], start: tuple[float, float] = (q, v)) -> Any:
                 return solve_ivp(
-                    lambda t, y: [y[1], c - rate * y[1]],
+                    lambda _, y: [y[1], c - rate * y[1]],
                     (0, duration),
-                    [q, v],
+                    start,
                     method="DOP853",
                     rtol=RTOL,
                     atol=ATOL,
@@ -139,18 +138,18 @@ class ReferenceArm:
             for joint in (0, 1):
                 if joint in held:
                     sign = side[joint]
-                    event = lambda t, y, joint=joint, sign=sign: sign * reaction(y, joint)  # noqa: E731
+                    event = lambda _, y, joint=joint, sign=sign: sign * reaction(y, joint)  # noqa: E731
                     directions = [(event, -1, "release", joint, None)]
                 else:
                     # A joint that starts at its stop must not be found there.
-                    high = lambda t, y, joint=joint: y[joint] - upper[joint] - 1e-12  # noqa: E731
-                    low = lambda t, y, joint=joint: y[joint] - lower[joint] + 1e-12  # noqa: E731
+                    high = lambda _, y, joint=joint: y[joint] - upper[joint] - 1e-12  # noqa: E731
+                    low = lambda _, y, joint=joint: y[joint] - lower[joint] + 1e-12  # noqa: E731
                     directions = [(high, 1, "hit", joint, upper[joint]), (low, -1, "hit", joint, lower[joint])]
                 events += directions
             for event, direction, *_ in events:
                 event.terminal, event.direction = True, direction
             run = solve_ivp(
-                lambda t, y, held=held: np.concatenate([y[2:], acceleration_of(y, held)]),
+                lambda _, y, held=held: np.concatenate([y[2:], acceleration_of(y, held)]),
                 (0, left),
                 np.concatenate([q, v]),
                 method="DOP853",

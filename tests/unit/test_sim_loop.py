@@ -183,7 +183,10 @@ def test_chattering_joint_is_reported_once_per_period() -> None:
 
 def test_diverged_rig_is_reset_to_the_start() -> None:
     arm = ArmConfig(masses_kg=(0.05, 0.02, 0.02), friction=(0.01, 0.01, 0.1, 0.01))
-    with VirtualRig(LabConfig(rigs=(RigSettings(arm=arm),))) as rig, np.errstate(all="ignore"):
+    with (
+        VirtualRig(LabConfig(sim=SimConfig(substeps=1), rigs=(RigSettings(arm=arm),))) as rig,
+        np.errstate(all="ignore"),
+    ):
         for turn in range(300):
             rig.command([32.0, -32.0, 0.0, 1.0] if turn % 2 else [-32.0, 32.0, 0.0, 1.0])
             rig.tick()
@@ -194,6 +197,31 @@ def test_diverged_rig_is_reset_to_the_start() -> None:
         state = rig.tick()
     assert state.step == reset.step
     assert list(state.position) == [0.0] * 4
+
+
+def test_inaccurate_steps_are_counted_and_reported_once_a_second() -> None:
+    with VirtualRig(LabConfig(sim=SimConfig(substeps=1))) as rig:
+        for turn in range(40):
+            rig.command([16.0, -16.0, -4.9, 0.0] if turn % 2 else [-16.0, 16.0, -4.9, 0.0])
+            state = rig.tick()
+        assert state.substeps == 1
+        reports = [event for event in rig.events if event.kind == Event.INACCURATE_STEP]
+        assert len(reports) == 1
+        assert reports[0].severity == Event.WARNING
+        assert reports[0].rig == "rig1"
+        assert reports[0].integration_data.steps == 1
+        assert max(reports[0].integration_data.error[:2]) > np.radians(0.1)
+        assert "inaccurate step: the estimated error of joint" in reports[0].text
+        assert rig.counters.inaccurate_steps > 20
+
+
+def test_automatic_substeps_are_accurate_and_published() -> None:
+    with VirtualRig(LabConfig()) as rig:
+        for turn in range(40):
+            rig.command([16.0, -16.0, -4.9, 0.0] if turn % 2 else [-16.0, 16.0, -4.9, 0.0])
+            assert rig.tick().substeps >= 2
+        assert "INACCURATE_STEP" not in rig.kinds()
+        assert rig.counters.inaccurate_steps == 0
 
 
 def test_rigs_apply_their_own_commands_only() -> None:
@@ -218,7 +246,7 @@ def test_parameters_survive_json() -> None:
 
 
 def test_unstable_step_is_rejected_with_the_rig() -> None:
-    lab = LabConfig(sim=SimConfig(step_ms=40))
+    lab = LabConfig(sim=SimConfig(step_ms=40, substeps=1))
     with pytest.raises(InputError, match=r"rig 'rig1': the step of 40 ms would be unstable.*sim\.substeps = 2"):
         rig_parameters(lab, lab.rigs[0])
 

@@ -21,6 +21,8 @@ LARGEST_REGISTER_FORCE: Final = 32.767
 LARGEST_EFFORT: Final = 32.768
 """Largest effort of the drives, N·m or N: the absolute limit of a torque register."""
 
+PLANT_VERSION: Final = 2
+"""Current rules of the plant; a recording is verified with its own."""
 AUTO: Final = "auto"
 """Value of `StepParameters.substeps`: the number of integration steps is chosen for each rig and step."""
 
@@ -160,11 +162,18 @@ class StepParameters:
     substeps: int | Literal["auto"] = _SIM.substeps
     """Integration steps of a step of the loop: a fixed number, or `AUTO`."""
     integrator: str = _SIM.integrator
+    plant_version: int = PLANT_VERSION
+    """Rules of the plant: 1, of recordings without this number: released parts fall from rest."""
 
     @property
     def step(self) -> float:
         """Length of a step of the loop, s."""
         return self.step_ns * 1e-9
+
+
+def describe_substeps(substeps: int | Literal["auto"]) -> str:
+    """Return a number of integration steps as human-readable text."""
+    return "automatic sub-steps" if substeps == AUTO else f"{substeps} sub-steps"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +209,11 @@ class RigParameters:
             fields = json.loads(text)
             scene = _tuples(fields["scene"])
             scene["trays"] = tuple(TrayParameters(**tray) for tray in scene["trays"])
+            sim = {"plant_version": 1, **fields["sim"]}
             scene["parts"] = tuple(PartParameters(**part) for part in scene["parts"])
             return cls(
                 arm=ArmParameters(**_tuples(fields["arm"])),
-                sim=StepParameters(**fields["sim"]),
+                sim=StepParameters(**sim),
                 scene=SceneParameters(**scene),
             )
         except (ValueError, TypeError, KeyError, AttributeError) as error:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hilrig_sim.arm.dynamics import ReducedDynamics
 from hilrig_sim.arm.integrators import Tableau
 from hilrig_sim.arm.model import ArmParameters
+from hilrig_sim.arm.stability import MAX_SUBSTEPS
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import first_arrival, stop_outward
 
@@ -26,8 +27,6 @@ Ints = NDArray[np.int64]
 STEP_TOLERANCE: Final = (math.radians(0.01), math.radians(0.01), 0.01e-3, math.radians(0.01))
 """Largest accepted error estimate of each joint in an integration step: 0.01° or 0.01 mm; rad, rad, m, rad. The error
 is smaller than the embedded estimate, except for the fastest motions, where it can be three times as large."""
-MAX_SUBSTEPS: Final = 64
-"""Largest number of integration steps of a rig in a step of the loop."""
 MAX_ATTEMPTS: Final = 4 * MAX_SUBSTEPS
 ARRIVAL_TOLERANCE_RAD: Final = 1e-6
 """A joint that is this near to a stop and moves toward it has reached it, rad."""
@@ -133,9 +132,9 @@ class PlaneSolver:
             cut, loss = arrival, arrival
             if held is not _NONE_HELD and held.any():
                 rates1 = stepper.accelerations(q1, v1, acting)
-                pushing = stop_outward(
-                    rates1[0], rates1[1], *np.where(held, side, 0.0), mass=dynamics.mass_matrix_12(q1[1])
-                )[2:]
+                pushed = np.where(held, side, 0.0)
+                mass = dynamics.mass_matrix_12(q1[1])
+                pushing = stop_outward(rates1[0], rates1[1], pushed[0], pushed[1], mass)[2:]
                 lost = held & ~np.array(pushing) & ~leaving[:, at]
                 before, after = side * rates0, side * rates1[:2]
                 linear = (before > 0) & (after < 0)
@@ -190,9 +189,7 @@ class PlaneSolver:
         self._hits.clear()
         if outward.any():
             for joint, column in np.argwhere(outward).tolist():
-                self._hits.append(
-                    Impact(column, joint, bool(side[joint, column] > 0), abs(float(v[joint, column])))
-                )
+                self._hits.append(Impact(column, joint, bool(side[joint, column] > 0), abs(float(v[joint, column]))))
             v[0], v[1], _, _ = stop_outward(v[0], v[1], side[0], side[1], mass)
         rates = stepper.accelerations(q, v, effort)[:2]
         settles = (side * v[:2] < 0) & (v[:2] ** 2 < 2 * ARRIVAL_TOLERANCE_RAD * side * rates)

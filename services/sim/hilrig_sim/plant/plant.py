@@ -2,8 +2,7 @@
 
 A step is a pure function of state, effort and parameters. `Plant` owns the state and the scratch memory of the step. It
 has no clock and no bus, so the same class runs in real time, in the verification of a recording and in a study of a
-thousand rigs. The published state contains everything that the next step depends on, except the speed of a falling
-part.
+thousand rigs. The published state contains everything that the next step depends on.
 """
 
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics
 from hilrig_sim.arm.integrators import TABLEAUS, Tableau
 from hilrig_sim.arm.model import AUTO, RigParameters
-from hilrig_sim.arm.stability import base_substeps
+from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import crossing, first_arrival, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
@@ -65,7 +64,8 @@ class Plant:
         """q̇: rad/s, rad/s, m/s, rad/s, (4, N)."""
         self.error = np.zeros((4, count))
         """Embedded error estimate of q for the last integration step, (4, N)."""
-        self.world = World([rig.scene for rig in rigs], max(arm.l2 + arm.l3 for arm in self._arms))
+        reach = max(arm.l2 + arm.l3 for arm in self._arms)
+        self.world = World([rig.scene for rig in rigs], reach, ballistic=sim.plant_version > 1)
         self.dynamics = ReducedDynamics(self._arms)
         self._integrators = self._steppers()
         self._integrator = self._integrators[0]
@@ -97,6 +97,9 @@ class Plant:
         self._step_error = np.zeros((4, count))
         self._tolerance = np.empty((4, count))
         self._tolerance[:] = np.array(STEP_TOLERANCE)[:, np.newaxis]
+        self._error_bound = np.empty((4, count))
+        self._error_bound[:] = np.array(ERROR_BOUND)[:, np.newaxis]
+        self._inaccurate = np.zeros((4, count), dtype=np.bool_)
         self._nothing_held = (np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_))
         self._held = self._nothing_held
         self._plane = PlaneSolver(self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2])
@@ -114,6 +117,12 @@ class Plant:
         """For each rig: bit j-1 joint j at its lower stop, bit 3+j at its upper stop, bit 8 tool touches an object."""
         return self._limits.flags
 
+    def is_inaccurate(self) -> bool:
+        """Return whether the error estimate of the last step exceeds its bound for any rig."""
+        np.absolute(self.error, self._work)
+        np.greater(self._work, self._error_bound, self._inaccurate)
+        return any_true(self._inaccurate)
+
     def tool(self, rigs: Ints | slice) -> Floats:
         """Return the tool poses (x, y, z, yaw) of rigs, (4, K); (1)–(4)."""
         theta1, theta2, d3, theta4 = position = self.position[:, rigs]
@@ -125,6 +134,16 @@ class Plant:
         np.subtract(self._l1[rigs], d3, pose[2])
         np.add(sum12, theta4, pose[3])
         return pose
+
+    def _tool_velocity(self, rigs: Ints) -> Floats:
+        """Return the derivatives of the tool poses of rigs, (4, K)."""
+        theta1, theta2 = self.position[:2, rigs]
+        v1, v2, v3, v4 = self.velocity[:, rigs]
+        w2 = v1 + v2
+        link1, link2 = self.dynamics.l2[rigs] * v1, self.dynamics.l3[rigs] * w2
+        vx = -link1 * np.sin(theta1) - link2 * np.sin(theta1 + theta2)
+        vy = link1 * np.cos(theta1) + link2 * np.cos(theta1 + theta2)
+        return np.stack([vx, vy, -v3, w2 + v4])
 
     def reset(self, rig: int) -> None:
         """Move a rig and its parts to the start pose, at rest."""
@@ -196,7 +215,7 @@ class Plant:
         if dropping.size:
             for rig in dropping:
                 self._events.append(PlantEvent(PlantEventKind.PART_DROPPED, int(rig), part=int(world.held[rig])))
-            world.release(dropping)
+            world.release(dropping, self.tool(dropping), self._tool_velocity(dropping))
             self.dynamics.set_payload(world.payload())
         switching_on = np.flatnonzero(self._switched & magnet)
         if switching_on.size:
@@ -308,7 +327,7 @@ class Plant:
             if self._limits.any:
                 self._update_limits()
             return
-        plane = repeat[:2].any(axis=0)
+        plane = np.logical_or(repeat[0], repeat[1])
         if any_true(plane):
             self._resolve_plane(np.flatnonzero(plane), error, effort)
             if any_true(self._low):
@@ -324,7 +343,8 @@ class Plant:
             np.copyto(error[2:], 0.0, where=rests)
             linear &= ~rests
             if any_true(linear):
-                self._resolve_linear(*linear.nonzero(), error, effort)
+                joint, rig = linear.nonzero()
+                self._resolve_linear(joint, rig, error, effort)
         self._update_limits()
 
     def _update_limits(self) -> None:

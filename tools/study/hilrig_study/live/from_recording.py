@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.model import AUTO, RigParameters
 from hilrig_study.controllers.control_laws import LawController
 from hilrig_study.linear_model import linearize
 from hilrig_study.study_config import AxisConfig, ControllerConfig, StudyConfig
@@ -124,7 +124,8 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     )
     step_s = run.step_ns * 1e-9
     plant_model = linearize(rig.arm, pose.tolist())
-    phi, gamma = plant_model.discretize(step_s, rig.sim.integrator, rig.sim.substeps)
+    method = () if rig.sim.substeps == AUTO else (rig.sim.integrator, rig.sim.substeps)
+    phi, gamma = plant_model.discretize(step_s, *method)
     latency = run.states["loop_latency_ns"][run.states["basis_step"] != 0] / 1e6
     p50, p99 = np.percentile(latency, (50, 99))
     plane = study or StudyConfig(x=AxisConfig(what="delay_ms", values=(0.0,)), y=AxisConfig(what="gain", values=(1.0,)))
