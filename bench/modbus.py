@@ -38,6 +38,7 @@ from modbus_servers import (
 from numpy.typing import NDArray
 from steal import StealMonitor
 
+from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.server.admission import Limits
@@ -178,9 +179,12 @@ def protocol_code_us(frame: bytes, times: int = 30_000) -> float:
         service.recording_stream.append = lambda *_: None  # type: ignore[method-assign]
         state = JointState(rig="rig1", step=1, position=[0] * 4, velocity=[0] * 4, effort=[0] * 4)
         arrival = TimestampedPayload(state.SerializeToString(), service.clock.monotonic_ns())
-        output = Mock(send_command=service.rig_publisher(topics.COMMAND, "rig1").publish)
+        states = Mock(get=lambda _: arrival)
+        scheduler = Mock(send=lambda *_: None)
         settings = DeviceSettings.of(service.lab.edge, service.lab.impairment)
-        device = Device("rig1", settings, service.clock, output, lambda: arrival)
+        publisher = service.rig_publisher(topics.COMMAND, "rig1")
+        sender = CommandSender("rig1", scheduler, publisher, service.clock, settings.repeat_ns)
+        device = Device("rig1", settings, service.clock, Mock(), states, sender)
         server = RigServer(device, Limits(32, 16, 0, ()), service.clock, service.counters)
         transport = Mock(write=lambda _: None)
         connection = ModbusConnection(server, transport, device.connect("127.0.0.1", 1))

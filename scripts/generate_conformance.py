@@ -9,6 +9,7 @@ from itertools import groupby
 
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.registers.export import TABLE_NAMES
+from hilrig_modbus_edge.registers.map import INPUT_END
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,12 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.4", "04 with quantity 126 is an illegal value", "04 00 00 00 7E", "84 03"),
     Rule("AP 6.4", "04 with quantity 125 is legal; the address is illegal", "04 00 00 00 7D", "84 02"),
     Rule("AP 6.4", "04 at address 65535 does not wrap", "04 FF FF 00 02", "84 02"),
-    Rule("AP 6.4", "04 across the map's end is an illegal address", "04 00 23 00 02", "84 02"),
+    Rule(
+        "AP 6.4",
+        "04 across the map's end is an illegal address",
+        f"04 {(INPUT_END - 1).to_bytes(2).hex(' ').upper()} 00 02",
+        "84 02",
+    ),
     # Write Single Coil
     Rule("AP 6.5", "05 echoes the request", "05 00 00 FF 00", "05 00 00 FF 00"),
     Rule("AP 6.5", "05 switches off with 0000", "05 00 00 00 00", "05 00 00 00 00"),

@@ -4,6 +4,8 @@ An error is raised where it is found and states the defect, its place and the ac
 top of the process (`process.shutdown.run_main`).
 """
 
+from collections.abc import Sequence
+
 
 class HilrigError(Exception):
     """An error that is reported as one line, without a traceback."""
@@ -21,3 +23,14 @@ class OperationError(HilrigError):
     """A valid request that failed: a port in use, a full disk. Exit code 3."""
 
     exit_code = 3
+
+
+def list_names(names: Sequence[str], limit: int = 3) -> str:
+    """Join names for a message; those beyond `limit` are only counted."""
+    more = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")
+
+
+def listen_failure(error: OSError) -> str:
+    """Return the reason why a socket can't listen, without the address that Python appends to it."""
+    return (error.strerror or str(error)).partition(" (while")[0]

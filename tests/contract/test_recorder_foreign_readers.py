@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, encode_message
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
+from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.recover import recover
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export.export import export_foxglove
@@ -56,11 +57,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     run = open_run(made)
     for name, values in run.metadata.items():
         writer.add_metadata(name, values)
-    for number, (topic, sequence, log_ns, publish_ns, payload) in enumerate(
-        run.file.messages(frozenset(CHANNEL_OF_TOPIC))
-    ):
-        channel = CHANNEL_OF_TOPIC[topic]
-        writer.add(encode_message(channel, sequence, log_ns, publish_ns, payload))
+    for number, message in enumerate(run.file.messages(frozenset(CHANNEL_OF_TOPIC))):
+        channel_id = CHANNEL_OF_TOPIC[run.file.topics[message.channel_id]]
+        writer.add(encode_message(channel_id, *message[1:]))
         if number % 300 == 299:
             writer.close_chunk()
     for name, data in run.file.attachments.items():

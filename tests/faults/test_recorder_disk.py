@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
-from hilrig_recorder.mcap_format.scan import Chunk, Message, read_chunk, scan
+from hilrig_recorder.mcap_format.records import Chunk, Message
+from hilrig_recorder.mcap_format.scan import read_chunk, scan
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Health, JointState

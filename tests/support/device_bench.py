@@ -3,10 +3,11 @@
 import random
 import struct
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.protocol.functions import RegisterTable
@@ -19,8 +20,20 @@ from hilrig_schemas import Event, JointState, TorqueCommand
 MS = 1_000_000
 
 
+@dataclass
+class Timer:
+    """A scheduled call."""
+
+    at_ns: int
+    callback: Callable[[], None]
+    canceled: bool = False
+
+    def cancel(self) -> None:
+        self.canceled = True
+
+
 class Bench:
-    """A device and its recorded output."""
+    """A device and its recorded output: it replaces scheduler, publisher, state cache and output port."""
 
     def __init__(self, **settings: Any) -> None:
         self.clock = ManualClock()
@@ -28,18 +41,30 @@ class Bench:
         self.repeats: list[TorqueCommand] = []
         self.events: list[Event] = []
         self.session_changes = 0
-        self.deadlines: list[int] = []
-        self.sends: list[int] = []
+        self.scheduled: list[bytes] = []
+        self.timers: list[Timer] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
-        device_settings = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
-        self.device = Device("rig1", device_settings, self.clock, self, lambda: self.arrival, random.Random(4))
+        values = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
+        sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
+        self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
 
-    def send_command(self, command: TorqueCommand) -> None:
-        self.commands.append(TorqueCommand.FromString(command.SerializeToString()))
+    def send(self, rig: str, payload: bytes) -> None:
+        assert rig == "rig1"
+        self.scheduled.append(payload)
 
-    def repeat_command(self, command: TorqueCommand) -> None:
-        self.repeats.append(TorqueCommand.FromString(command.SerializeToString()))
+    def publish_encoded(self, payload: bytes, wall_ns: int) -> None:
+        assert payload is self.scheduled[-1]
+        self.commands.append(TorqueCommand.FromString(payload))
+        assert wall_ns == self.commands[-1].wall_ns
+
+    def republish_encoded(self, payload: bytes) -> None:
+        assert payload is self.scheduled[-1]
+        self.repeats.append(TorqueCommand.FromString(payload))
+
+    def get(self, rig: str) -> TimestampedPayload | None:
+        assert rig == "rig1"
+        return self.arrival
 
     def emit(self, event: Event) -> None:
         self.events.append(event)
@@ -47,11 +72,9 @@ class Bench:
     def sessions_changed(self) -> None:
         self.session_changes += 1
 
-    def watch(self, deadline_ns: int) -> None:
-        self.deadlines.append(deadline_ns)
-
-    def send_at(self, deadline_ns: int) -> None:
-        self.sends.append(deadline_ns)
+    def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> Timer:
+        self.timers.append(Timer(deadline_ns, callback))
+        return self.timers[-1]
 
     def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         self.arrive = arrive
@@ -87,6 +110,17 @@ class Bench:
     def wait(self, ms: float) -> None:
         self.clock.advance(round(ms * MS))
         self.device.check(self.clock.monotonic_ns())
+
+    def advance(self, ms: float) -> None:
+        """Advance the clock as the edge does: with the calls that are due, and a check of the device at the end."""
+        end_ns = self.clock.monotonic_ns() + round(ms * MS)
+        while due := [timer for timer in self.timers if timer.at_ns <= end_ns and not timer.canceled]:
+            timer = min(due, key=lambda one: one.at_ns)
+            self.timers.remove(timer)
+            self.clock.sleep_until_ns(timer.at_ns)
+            timer.callback()
+        self.clock.sleep_until_ns(end_ns)
+        self.device.check(end_ns)
 
     def kinds(self) -> list[str]:
         return [Event.Kind.Name(event.kind) for event in self.events]

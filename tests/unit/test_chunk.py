@@ -8,22 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Metadata
 
-from hilrig_recorder.mcap_format.channels import encode_message
-from hilrig_recorder.mcap_format.chunk import (
-    CHUNK_BYTES,
-    ChunkInfo,
-    compressor,
-    encode_chunk,
-    read_chunk_infos,
-    split_into_chunks,
-)
-from hilrig_recorder.mcap_format.summary_section import encode_records
+from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES, compressor, encode_chunk, split_into_chunks
+from hilrig_recorder.mcap_format.reader import buffer_reader
+from hilrig_recorder.mcap_format.records import ChunkInfo, DamagedError, encode_message, encode_records
 
 MESSAGES = st.lists(st.tuples(st.integers(1, 4), st.integers(0, 2**62), st.binary(max_size=300)), min_size=1)
 
 
 def found(content: bytes, begin: int = 0) -> list[ChunkInfo]:
-    return list(read_chunk_infos(lambda at, size: content[at : at + size], begin, len(content)))
+    return list(buffer_reader(content).chunk_infos(begin, len(content)))
 
 
 @given(st.lists(MESSAGES, max_size=5), st.binary(max_size=40))
@@ -53,7 +46,7 @@ def test_chunk_infos_are_read_back_from_a_file(chunks: list[list[tuple[int, int,
 def test_incomplete_records_are_rejected() -> None:
     content = encode_chunk([encode_message(1, 1, 1, 1, b"message")], compressor())
     for content_with_error in (content[:-1], content + b"12345", b"\x01" + content):
-        with pytest.raises(ValueError, match="record"):
+        with pytest.raises(DamagedError, match="record"):
             found(content_with_error)
 
 

@@ -38,12 +38,12 @@ class Edge:
         self.states = LatestValueCache(self.clock, Counters(), {})
         self.timers: list[Call] = []
         self.sent: list[tuple[int, dict[str, bytes]]] = []
-        scheduler = CommandScheduler("edge/1", self._put, self.states.get, step_ns, self.clock, self._call_at)
+        scheduler = CommandScheduler("edge/1", self, self.states, step_ns, self.clock, self._call_at)  # type: ignore[arg-type]
         self.send, self.flush = scheduler.send, scheduler.flush
         self.clock.advance(10 * STEP_NS)
         self.tick()
 
-    def _put(self, payload: bytes) -> None:
+    def put(self, payload: bytes) -> None:
         batch = RigBatch.FromString(payload)
         assert batch.source == "edge/1"
         self.sent.append((self.since_tick_ns, dict(zip(batch.rigs, batch.messages, strict=True))))

@@ -1,10 +1,10 @@
 """Unit tests of the command latch: new commands, repetition, timeout, resets, late commands."""
 
 import math
-from dataclasses import dataclass
 
 import pytest
 
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import TorqueCommand
 from hilrig_sim.arm.model import LARGEST_EFFORT
 from hilrig_sim.commands import ZERO_EFFORT, CommandLatch, StepTimes
@@ -12,15 +12,15 @@ from hilrig_sim.commands import ZERO_EFFORT, CommandLatch, StepTimes
 MS = 1_000_000
 
 
-@dataclass(frozen=True)
-class Received:
-    payload: bytes
-    arrived_ns: int
-
-
-def command(seq: int = 1, at_ms: int = 0, **fields: object) -> Received:
+def command(seq: int = 1, at_ms: int = 0, **fields: object) -> TimestampedPayload:
     fields = {"effort": [1.0, 2.0, 3.0, 4.0], "session": "s", "basis_incarnation": 7, "basis_step": 5} | fields
-    return Received(TorqueCommand(seq=seq, **fields).SerializeToString(), at_ms * MS)
+    return TimestampedPayload(TorqueCommand(seq=seq, **fields).SerializeToString(), at_ms * MS)
+
+
+def tick(latch: CommandLatch, received: TimestampedPayload | None, now_ns: int) -> None:
+    """End the step before, and latch the command of the next tick."""
+    latch.start_step()
+    latch.latch(received, now_ns)
 
 
 def new_latch(timeout_ms: int = 600) -> CommandLatch:
@@ -29,19 +29,19 @@ def new_latch(timeout_ms: int = 600) -> CommandLatch:
 
 def test_effort_is_zero_before_the_first_command() -> None:
     latch = new_latch()
-    latch.latch(None, 10_000 * MS)
+    tick(latch, None, 10_000 * MS)
     assert (latch.effort, latch.safe, latch.seq, latch.command_lost) == (ZERO_EFFORT, True, 0, False)
 
 
 def test_new_command_has_basis_and_arrival_for_one_tick() -> None:
     latch = new_latch()
     received = command(at_ms=3)
-    latch.latch(received, 20 * MS)
+    tick(latch, received, 20 * MS)
     assert latch.is_new
     assert (latch.effort, latch.basis_step, latch.arrived_ns) == ((1.0, 2.0, 3.0, 4.0), 5, 3 * MS)
     assert not latch.safe
     assert not latch.command_resumed
-    latch.latch(received, 40 * MS)
+    tick(latch, received, 40 * MS)
     assert not latch.is_new
     assert (latch.basis_step, latch.arrived_ns, latch.seq) == (0, 0, 1)
     assert latch.effort == (1.0, 2.0, 3.0, 4.0)
@@ -49,69 +49,69 @@ def test_new_command_has_basis_and_arrival_for_one_tick() -> None:
 
 def test_repetition_restarts_the_timeout_but_is_not_new() -> None:
     latch = new_latch(timeout_ms=100)
-    latch.latch(command(at_ms=0), 0)
-    latch.latch(command(at_ms=90), 95 * MS)
+    tick(latch, command(at_ms=0), 0)
+    tick(latch, command(at_ms=90), 95 * MS)
     assert not latch.is_new
-    latch.latch(None, 180 * MS)
+    tick(latch, None, 180 * MS)
     assert not latch.safe
 
 
 @pytest.mark.parametrize("change", [{"seq": 2}, {"session": "t"}])
 def test_new_number_or_session_is_a_new_command(change: dict[str, object]) -> None:
     latch = new_latch()
-    latch.latch(command(), 0)
-    latch.latch(command(**{"at_ms": 5, **change}), 20 * MS)  # type: ignore[arg-type]
+    tick(latch, command(), 0)
+    tick(latch, command(**{"at_ms": 5, **change}), 20 * MS)  # type: ignore[arg-type]
     assert latch.is_new
 
 
 def test_timeout_zeroes_effort_until_the_next_message() -> None:
     latch = new_latch(timeout_ms=100)
     received = command(magnet=True)
-    latch.latch(received, 0)
-    latch.latch(received, 100 * MS)
+    tick(latch, received, 0)
+    tick(latch, received, 100 * MS)
     assert not latch.safe
-    latch.latch(received, 101 * MS)
+    tick(latch, received, 101 * MS)
     assert latch.safe
     assert latch.command_lost
     assert latch.effort == ZERO_EFFORT
     assert latch.magnet
     assert latch.silent_ns == 101 * MS
-    latch.latch(received, 121 * MS)
+    tick(latch, received, 121 * MS)
     assert latch.safe
     assert not latch.command_lost
-    latch.latch(command(at_ms=139), 140 * MS)
+    tick(latch, command(at_ms=139), 140 * MS)
     assert latch.command_resumed
     assert not latch.is_new
     assert latch.effort == (1.0, 2.0, 3.0, 4.0)
-    latch.latch(command(at_ms=139), 160 * MS)
+    tick(latch, command(at_ms=139), 160 * MS)
     assert not latch.command_resumed
 
 
 def test_timeout_zero_holds_a_command_forever() -> None:
     latch = new_latch(timeout_ms=0)
-    latch.latch(command(), 0)
-    latch.latch(None, 10**15)
+    tick(latch, command(), 0)
+    tick(latch, None, 10**15)
     assert not latch.safe
 
 
 def test_basis_of_another_incarnation_is_ignored() -> None:
     latch = new_latch()
-    latch.latch(command(basis_incarnation=6), 0)
+    tick(latch, command(basis_incarnation=6), 0)
     assert latch.is_new
     assert latch.basis_step == 0
 
 
 def test_efforts_are_limited_and_finite() -> None:
     latch = new_latch()
-    latch.latch(command(effort=[math.nan, math.inf, -math.inf, 1e9]), 0)
+    tick(latch, command(effort=[math.nan, math.inf, -math.inf, 1e9]), 0)
     assert latch.effort == (0.0, LARGEST_EFFORT, -LARGEST_EFFORT, LARGEST_EFFORT)
 
 
 def test_malformed_message_is_counted_and_ignored() -> None:
     latch = new_latch()
-    latch.latch(command(), 0)
-    latch.latch(Received(b"\xff\xff\xff", MS), 20 * MS)
-    latch.latch(command(seq=9, effort=[1.0]), 40 * MS)
+    tick(latch, command(), 0)
+    tick(latch, TimestampedPayload(b"\xff\xff\xff", MS), 20 * MS)
+    tick(latch, command(seq=9, effort=[1.0]), 40 * MS)
     assert latch.malformed == 2
     assert (latch.seq, latch.effort) == (1, (1.0, 2.0, 3.0, 4.0))
 
@@ -120,11 +120,11 @@ def test_increased_count_requests_a_reset() -> None:
     latch = new_latch()
     resets_requested = []
     for seq, resets in enumerate([3, 3, 4, 4, 0, 1], start=1):
-        latch.latch(command(seq=seq, resets=resets), seq * MS)
+        tick(latch, command(seq=seq, resets=resets), seq * MS)
         resets_requested.append(latch.reset)
     # The first count is only a reference; a lower count is that of a restarted edge.
     assert resets_requested == [False, False, True, False, False, True]
-    latch.latch(command(seq=6, resets=2), 8 * MS)
+    tick(latch, command(seq=6, resets=2), 8 * MS)
     assert latch.reset
 
 
@@ -138,8 +138,8 @@ def test_step_times_are_kept_up_to_the_capacity() -> None:
 
 def test_command_superseded_before_its_tick_is_not_applied() -> None:
     latch = new_latch()
-    latch.latch(command(seq=1, at_ms=15, basis_step=4, effort=[9.0, 0.0, 0.0, 0.0]), 20 * MS)
-    latch.relatch(command(seq=2, at_ms=19, basis_incarnation=8), 20 * MS)
+    tick(latch, command(seq=1, at_ms=15, basis_step=4, effort=[9.0, 0.0, 0.0, 0.0]), 20 * MS)
+    latch.latch(command(seq=2, at_ms=19, basis_incarnation=8), 20 * MS)
     assert latch.is_new
     assert (latch.seq, latch.effort, latch.arrived_ns) == (2, (1.0, 2.0, 3.0, 4.0), 19 * MS)
     assert latch.basis_step == 0
@@ -148,9 +148,9 @@ def test_command_superseded_before_its_tick_is_not_applied() -> None:
 def test_repetition_or_malformed_message_supersedes_nothing() -> None:
     latch = new_latch()
     received = command(seq=1, at_ms=15)
-    latch.latch(received, 20 * MS)
-    for later in (received, None, command(seq=1, at_ms=19), Received(b"\xff\xff\xff", 19 * MS)):
-        latch.relatch(later, 20 * MS)
+    tick(latch, received, 20 * MS)
+    for later in (received, None, command(seq=1, at_ms=19), TimestampedPayload(b"\xff\xff\xff", 19 * MS)):
+        latch.latch(later, 20 * MS)
         assert latch.is_new
         assert (latch.seq, latch.basis_step, latch.arrived_ns) == (1, 5, 15 * MS)
     assert latch.malformed == 1
@@ -158,21 +158,21 @@ def test_repetition_or_malformed_message_supersedes_nothing() -> None:
 
 def test_reset_of_superseded_command_is_executed_once() -> None:
     latch = new_latch()
-    latch.latch(command(seq=1), 20 * MS)
-    latch.latch(command(seq=2, resets=1), 40 * MS)
+    tick(latch, command(seq=1), 20 * MS)
+    tick(latch, command(seq=2, resets=1), 40 * MS)
     last = command(seq=3, resets=1)
-    latch.relatch(last, 40 * MS)
+    latch.latch(last, 40 * MS)
     assert latch.reset
-    latch.latch(last, 60 * MS)
+    tick(latch, last, 60 * MS)
     assert not latch.reset
 
 
 def test_command_just_before_the_timeout_tick_is_not_lost() -> None:
     latch = new_latch(timeout_ms=100)
     received = command()
-    latch.latch(received, 0)
-    latch.latch(received, 120 * MS)
+    tick(latch, received, 0)
+    tick(latch, received, 120 * MS)
     assert latch.command_lost
-    latch.relatch(command(seq=2, at_ms=119), 120 * MS)
+    latch.latch(command(seq=2, at_ms=119), 120 * MS)
     assert (latch.safe, latch.command_lost, latch.command_resumed) == (False, False, False)
     assert latch.effort == (1.0, 2.0, 3.0, 4.0)

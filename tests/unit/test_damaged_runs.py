@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from hilrig_recorder.mcap_format.records import Chunk, Message
 from hilrig_recorder.mcap_format.recover import recover
-from hilrig_recorder.mcap_format.scan import Chunk, Message, read_chunk, scan
+from hilrig_recorder.mcap_format.scan import read_chunk, scan
 from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run

@@ -6,7 +6,7 @@ import pytest
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
-from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, MAGNET_COIL, RESET_COIL, Status, address_of
+from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, INPUT_END, MAGNET_COIL, RESET_COIL, Status, address_of
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
@@ -353,7 +353,7 @@ def test_write_of_read_only_client_gets_01(bench: Bench) -> None:
 def test_watchdog_zeroes_torque_when_writes_stop(bench: Bench) -> None:
     client = bench.connect()
     bench.write(client, 0, 1000, 1000, 1000, 1000)
-    assert bench.deadlines == [bench.clock.monotonic_ns() + 1000 * MS]
+    assert [timer.at_ns for timer in bench.timers] == [bench.clock.monotonic_ns() + 1000 * MS]
     bench.wait(999)
     assert not bench.commands[-1].safe
     bench.wait(1)
@@ -433,6 +433,14 @@ def test_new_session_restores_timeout_and_echo_defaults(bench: Bench) -> None:
     assert [command.echo for command in bench.commands if command.controller] == [4711, 0]
 
 
+def test_echo_write_of_new_session_restores_default_timeout(bench: Bench) -> None:
+    one, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(one, ECHO_ADDRESS, 4711, 150)
+    bench.device.disconnect(one, "done")
+    bench.write(other, ECHO_ADDRESS, 4712)
+    assert bench.read(other, ECHO_ADDRESS, 2) == [4712, 1000]
+
+
 # -- sessions
 
 
@@ -501,26 +509,10 @@ def test_positions_before_first_state_get_04() -> None:
     assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 1) == 0
 
 
-def test_extended_map_contains_the_whole_state(bench: Bench) -> None:
+def test_status_register_equals_the_discrete_inputs(bench: Bench) -> None:
     client = bench.connect()
-    bench.state(
-        70_000,
-        position=(1.5, -1.0, 0.125, 6.2),
-        velocity=(0.5, 0.0, -0.25, 0.0),
-        effort=(1.0, 2.0, -3.5, 0.25),
-        loop_latency_ns=20_000_000,
-        limit_flags=0b1_0010_0001,
-        magnet=True,
-        held_part="cube",
-    )
+    bench.state(70_000, position=(1.5, -1.0, 0.125, 6.2), limit_flags=0b1_0010_0001, magnet=True, held_part="cube")
     bench.write(client, 0, 1)
-    bench.clock.advance(12 * MS)
-    data = struct.pack(">36H", *bench.read(client, 0, 36, RegisterTable.INPUT_REGISTER))
-    version, status, step, latency, lease, watchdog, timeout, session, stops, age = struct.unpack_from(
-        ">HHIIHHHHHH", data
-    )
-    assert (version, step, latency, timeout, session, age) == (1, 70_000, 20_000, 1000, 1, 12)
-    assert (lease, watchdog, stops) == (1, 2, 0b1_0010_0001)
     wanted = (
         Status.SIMULATION_ALIVE
         | Status.SESSION_OPEN
@@ -532,13 +524,8 @@ def test_extended_map_contains_the_whole_state(bench: Bench) -> None:
         | Status.PART_HELD
         | Status.POSITION_SATURATED
     )
-    assert status == wanted
-    floats = struct.unpack_from(">12f", data, 24)
-    assert floats[:4] == pytest.approx([85.9437, -57.2958, 125.0, 355.2338], abs=1e-4)
-    assert floats[4:8] == pytest.approx([28.6479, 0.0, -250.0, 0.0], abs=1e-4)
-    assert floats[8:] == (1.0, 2.0, -3.5, 0.25)
-    bits = bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 16)
-    assert bits == wanted
+    assert bench.read(client, address_of("status"), 1, RegisterTable.INPUT_REGISTER) == [wanted]
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 16) == wanted
 
 
 def test_lease_and_read_only_bits_depend_on_the_client(bench: Bench) -> None:
@@ -557,7 +544,7 @@ def test_old_state_clears_the_alive_bit(bench: Bench) -> None:
     bench.clock.advance(1000 * MS)
     assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 1) == 0
     # The age register saturates at its maximum.
-    age = len(struct.pack(">HHIIHHHHH", *[0] * 9)) // 2
+    age = address_of("state_age")
     assert bench.read(client, age, 1, RegisterTable.INPUT_REGISTER) == [1000]
     bench.clock.advance(100_000 * MS)
     assert bench.read(client, age, 1, RegisterTable.INPUT_REGISTER) == [0xFFFF]
@@ -588,7 +575,7 @@ def test_one_read_contains_one_step(bench: Bench) -> None:
     client = bench.connect()
     for step in range(1, 200):
         bench.state(step, position=(0, 0, step / 1000, 0), velocity=(0, 0, step / 1000, 0), effort=(step,) * 4)
-        data = struct.pack(">36H", *bench.read(client, 0, 36, RegisterTable.INPUT_REGISTER))
+        data = struct.pack(f">{INPUT_END}H", *bench.read(client, 0, INPUT_END, RegisterTable.INPUT_REGISTER))
         floats = struct.unpack_from(">12f", data, 24)
         assert struct.unpack_from(">I", data, 4) == (step,)
         assert (floats[2], floats[6], floats[8:]) == (step, step, (step,) * 4)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.protocol.pdu import execute
+from hilrig_modbus_edge.server.pdu import execute
 from support.device_bench import MS, Bench
 
 WATCHDOG_MS, LEASE_MS, GRACE_MS, HOST_CHANGE_MS = 1000, 5000, 5000, 1000

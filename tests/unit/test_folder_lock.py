@@ -1,6 +1,7 @@
 """One recorder per rig (folder locks, partition), and manual sessions."""
 
 import random
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -16,13 +17,13 @@ WALL = 1_767_225_600_000_000_000
 
 def test_rig_is_locked_until_its_recorder_closes(tmp_path: Path) -> None:
     refusal = r"another recorder \(process \d+ on .*\) already records rig2 in this folder"
-    with FolderLock(tmp_path, "1", ["rig1", "rig2"]), pytest.raises(OperationError, match=refusal):
+    with closing(FolderLock(tmp_path, "1", ["rig1", "rig2"])), pytest.raises(OperationError, match=refusal):
         FolderLock(tmp_path, "2", ["rig2", "rig3"])
     FolderLock(tmp_path, "2", ["rig2", "rig3"]).close()
 
 
 def test_recorders_of_different_rigs_share_a_folder(tmp_path: Path) -> None:
-    with FolderLock(tmp_path, "1", ["rig1"]), FolderLock(tmp_path, "2", ["rig2"]):
+    with closing(FolderLock(tmp_path, "1", ["rig1"])), closing(FolderLock(tmp_path, "2", ["rig2"])):
         with pytest.raises(OperationError, match="choose another --instance"):
             FolderLock(tmp_path, "2", ["rig3"])
         with pytest.raises(OperationError, match="already records rig1 in this folder"):

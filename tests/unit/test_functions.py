@@ -5,9 +5,10 @@ from unittest.mock import Mock
 import pytest
 
 from generate_conformance import RULES
-from hilrig_modbus_edge.protocol import pdu
+from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
 from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_modbus_edge.server import pdu
 
 EXAMPLES = {
     1: ("01 0000 0008", 0, 8),
@@ -29,7 +30,7 @@ FUNCTIONS = pytest.mark.parametrize("function", FunctionCode, ids=lambda functio
 
 def recorder() -> Mock:
     """Return a device without registers that records its calls."""
-    device = Mock(spec=pdu.DataModel)
+    device = Mock(spec=Device)
     device.read_registers.side_effect = lambda *arguments: bytes(2 * arguments[-1])
     device.read_bits.return_value = 0
     return device

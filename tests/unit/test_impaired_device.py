@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.watchdog import WatchdogState
 from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, MAGNET_COIL
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_schemas import Event, TorqueCommand
@@ -33,17 +34,6 @@ def impaired(**impairment: Any) -> Bench:
     return bench
 
 
-def advance(bench: Bench, ms: float) -> None:
-    """Advance the clock as the edge does: delayed commands are sent at their deadlines."""
-    end_ns = bench.clock.monotonic_ns() + round(ms * MS)
-    while bench.sends and min(bench.sends) <= end_ns:
-        bench.clock.sleep_until_ns(min(bench.sends))
-        bench.sends = [send for send in bench.sends if send > bench.clock.monotonic_ns()]
-        bench.device.send_due(bench.clock.monotonic_ns())
-    bench.clock.sleep_until_ns(end_ns)
-    bench.device.check(end_ns)
-
-
 def client_commands(bench: Bench) -> list[TorqueCommand]:
     """Return the commands of clients, without internal commands."""
     return [command for command in bench.commands if command.controller]
@@ -53,12 +43,12 @@ def run_loop(bench: Bench, client: Client, steps: int, step_ms: float = 20.0) ->
     """Publish one state per step; the client reads it a moment later and writes it as a torque."""
     for step in range(2, steps + 2):
         bench.state(step, position=(step * 1e-4, 0, 0, 0))
-        advance(bench, 0.3)
+        bench.advance(0.3)
         positions = bench.read(client, 4, 4)
-        advance(bench, 0.2)
+        bench.advance(0.2)
         bench.write(client, 0, positions[0] & 0x7FFF, 0, 0, 0)
-        advance(bench, step_ms - 0.5)
-    advance(bench, 1000)
+        bench.advance(step_ms - 0.5)
+    bench.advance(1000)
 
 
 def assert_stages_not_negative(command: TorqueCommand) -> None:
@@ -82,11 +72,11 @@ def test_injected_delay_has_configured_distribution(kind: str, link: str) -> Non
     client = bench.connect()
     for step in range(2, 1002):
         bench.state(step)
-        advance(bench, 99)
+        bench.advance(99)
         bench.read(client, 4, 4)
         bench.write(client, 0, step & 0x7FFF, 0, 0, 0)
-        advance(bench, 1)
-    advance(bench, 100)
+        bench.advance(1)
+    bench.advance(100)
     commands = client_commands(bench)
     for command in commands:
         assert_stages_not_negative(command)
@@ -117,9 +107,9 @@ def test_command_is_sent_exactly_after_its_delay() -> None:
     client = bench.connect()
     bench.write(client, 0, 1000)
     written_ns = bench.clock.monotonic_ns()
-    advance(bench, 29)
+    bench.advance(29)
     assert not client_commands(bench)
-    advance(bench, 2)
+    bench.advance(2)
     [command] = client_commands(bench)
     assert (command.sent_ns, command.command_injected_ns) == (written_ns + 30 * MS, 30 * MS)
     assert list(command.effort) == [1.0, 0.0, 0.0, 0.0]
@@ -137,7 +127,7 @@ def test_reader_is_served_the_newest_delivered_state() -> None:
     client = bench.connect()
     for step in range(2, 8):
         bench.state(step, position=(step * 1e-2, 0, 0, 0))
-        advance(bench, 20)
+        bench.advance(20)
     # Step 7 arrived 20 ms ago, step 6 40 ms ago, step 5 60 ms ago.
     [first, *_] = bench.read(client, 4, 4)
     assert first == round(np.degrees(5e-2) * 100)
@@ -191,13 +181,13 @@ def test_watchdog_zero_is_not_delayed_and_drops_commands() -> None:
     client = bench.connect()
     bench.write(client, 0, 1000)
     tripped_at_ns = bench.clock.monotonic_ns() + 1000 * MS
-    advance(bench, 999)
+    bench.advance(999)
     assert "WATCHDOG_TRIP" not in bench.kinds()
-    advance(bench, 1)
+    bench.advance(1)
     last = bench.commands[-1]
     assert (list(last.effort), last.safe, last.sent_ns) == ([0.0] * 4, True, tripped_at_ns)
     assert last.command_injected_ns == 0
-    advance(bench, 3000)
+    bench.advance(3000)
     assert not client_commands(bench), "the delayed torque must not be sent after the trip"
     assert bench.device.impairment.status().commands_superseded == 1
 
@@ -208,22 +198,40 @@ def test_watchdog_trips_when_all_commands_are_lost() -> None:
     bench.write(client, 0, 1000)
     bench.device.impairment.set(ImpairmentConfig.model_validate({"command": {"loss": "bernoulli:1"}}))
     for _ in range(50):
-        advance(bench, 20)
+        bench.advance(20)
         bench.write(client, 0, 2000)
     assert bench.kinds().count("WATCHDOG_TRIP") == 1
     assert list(bench.commands[-1].effort) == [0.0] * 4
     assert [list(command.effort) for command in client_commands(bench)] == [[1.0, 0.0, 0.0, 0.0]]
 
 
+def test_dropped_write_does_not_arm_or_rearm_watchdog() -> None:
+    bench = impaired(command={"loss": "bernoulli:1"})
+    client = bench.connect()
+    bench.write(client, 0, 1000)
+    assert bench.device.watchdog.state is WatchdogState.WAITING
+    bench.advance(2000)
+    assert "WATCHDOG_TRIP" not in bench.kinds()
+    bench.device.impairment.set(ImpairmentConfig())
+    bench.write(client, 0, 1000)
+    bench.advance(1000)
+    assert bench.kinds().count("WATCHDOG_TRIP") == 1
+    bench.device.impairment.set(ImpairmentConfig.model_validate({"command": {"loss": "bernoulli:1"}}))
+    bench.write(client, 0, 1000)
+    bench.device.write_coil(client, MAGNET_COIL, True, bench.clock.monotonic_ns())
+    assert bench.device.watchdog.state is WatchdogState.TRIPPED
+    assert "WATCHDOG_REARM" not in bench.kinds()
+
+
 def test_repeated_command_is_the_last_published_one() -> None:
     bench = impaired(command="constant:500")
     client = bench.connect()
     bench.write(client, 0, 1000)
-    advance(bench, 450)
+    bench.advance(450)
     assert {tuple(repeat.effort) for repeat in bench.repeats} == {(0.0, 0.0, 0.0, 0.0)}
-    advance(bench, 100)
+    bench.advance(100)
     bench.repeats.clear()
-    advance(bench, 300)
+    bench.advance(300)
     assert {(tuple(repeat.effort), repeat.seq) for repeat in bench.repeats} == {
         ((1.0, 0.0, 0.0, 0.0), client_commands(bench)[-1].seq)
     }
@@ -235,7 +243,7 @@ def test_trip_keeps_the_published_magnet_command() -> None:
     client.record_request(bench.clock.monotonic_ns())
     bench.device.write_coil(client, MAGNET_COIL, True, bench.clock.monotonic_ns())
     bench.write(client, 0, 1000)
-    advance(bench, 1000)
+    bench.advance(1000)
     assert bench.commands[-1].safe
     assert not bench.commands[-1].magnet, "it was written, but never published"
 
@@ -245,7 +253,7 @@ def test_operator_reset_is_not_delayed() -> None:
     bench.write(bench.connect(), 0, 1000)
     bench.device.reset()
     assert (bench.commands[-1].resets, list(bench.commands[-1].effort)) == (1, [0.0] * 4)
-    advance(bench, 400)
+    bench.advance(400)
     assert not client_commands(bench), "the earlier torque must not be sent after the reset"
 
 
@@ -253,14 +261,14 @@ def test_session_end_does_not_send_delayed_torque_early() -> None:
     bench = impaired(command="constant:300")
     first = bench.connect(host="10.0.0.1")
     bench.write(first, 0, 1000)
-    advance(bench, 350)
+    bench.advance(350)
     bench.write(first, 0, 5000)
     bench.device.disconnect(first, "gone")
     second = bench.connect(host="10.0.0.2", port=2)
     bench.write(second, 1, 7)
     internal = [command for command in bench.commands if not command.controller]
     assert list(internal[-1].effort) == [1.0, 0.0, 0.0, 0.0]
-    advance(bench, 400)
+    bench.advance(400)
     assert list(bench.commands[-1].effort) == [1.0, 0.007, 0.0, 0.0]
 
 
@@ -289,7 +297,7 @@ def test_schedule_is_followed_and_reported() -> None:
     client = bench.connect()
     for _ in range(30):
         bench.write(client, 0, 1)
-        advance(bench, 20)
+        bench.advance(20)
     injected = [command.command_injected_ns for command in client_commands(bench)]
     assert injected == [0] * 10 + [5 * MS] * 10 + [0] * 10
     assert bench.kinds().count("IMPAIRMENT_CHANGED") == 2
@@ -307,7 +315,7 @@ def test_impaired_session_starts_with_impairment_event() -> None:
 def test_removed_impairment_delivers_messages_in_flight() -> None:
     bench = impaired(state="constant:200", command="constant:200")
     client = bench.connect()
-    advance(bench, 250)
+    bench.advance(250)
     bench.state(50, position=(0.5, 0, 0, 0))
     bench.write(client, 0, 1000)
     bench.clock.advance(3 * MS)
@@ -326,8 +334,8 @@ def test_states_without_reader_do_not_accumulate() -> None:
     assert bench.arrive is not None
     for step in range(2, 500):
         bench.state(step)
-        advance(bench, 20)
-    line = bench.device.impairment._delayed_states.line  # type: ignore[union-attr]
+        bench.advance(20)
+    line = bench.device._states.delayed.line  # type: ignore[union-attr]
     assert line.count == 498
     assert len(line._in_flight) <= 6
 

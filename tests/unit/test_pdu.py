@@ -21,7 +21,8 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from hilrig_modbus_edge.protocol import pdu
+from hilrig_modbus_edge.registers.map import INPUT_END
+from hilrig_modbus_edge.server import pdu
 from support.device_bench import Bench
 
 WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=4)
@@ -88,12 +89,12 @@ def test_discrete_inputs_are_bits_of_status_register(address: int, count: int) -
     assert list(reply.bits[:count]) == [bool(status >> bit & 1) for bit in range(address, address + count)]
 
 
-@given(st.integers(0, 40), st.integers(1, 60))
+@given(st.integers(0, INPUT_END + 4), st.integers(1, INPUT_END + 24))
 def test_input_registers_are_slices_of_one_block(address: int, count: int) -> None:
     bench = fresh()
-    whole = ask(bench, ReadInputRegistersRequest(address=0, count=36)).registers
+    whole = ask(bench, ReadInputRegistersRequest(address=0, count=INPUT_END)).registers
     reply = ask(bench, ReadInputRegistersRequest(address=address, count=count))
-    if address + count > 36:
+    if address + count > INPUT_END:
         assert isinstance(reply, ExceptionResponse)
         assert reply.exception_code == 2
     else:
@@ -133,5 +134,5 @@ def test_wrong_address_takes_precedence_over_missing_state() -> None:
     assert code("17 00 04 00 04 00 00 00 01 02 00 2A") == 4
     assert code("17 00 04 00 04 00 08 00 01 02 00 2A") == 2
     assert code("03 00 04 00 05") == 2
-    assert code("04 00 23 00 02") == 2
+    assert code(f"04 {INPUT_END - 1:04X} 00 02") == 2
     assert bench.device.lease.holder is None

@@ -42,7 +42,7 @@ def test_schedule_restores_the_publication_intervals(run: Run, speed: float) -> 
     schedule = list(Player(run.file, speed=speed))
     assert len(schedule) == len(MADE)
     first = MADE[0].publish_wall_ns
-    assert [each.message.publish_ns for each in schedule] == [one.publish_wall_ns for one in MADE]
+    assert [each.message.publish_time for each in schedule] == [one.publish_wall_ns for one in MADE]
     for each, one in zip(schedule, MADE, strict=True):
         assert each.offset_ns == round((one.publish_wall_ns - first) / speed)
 
@@ -106,7 +106,7 @@ def test_playback_stops_when_stopping_is_set(run: Run) -> None:
 
 
 def test_all_recorded_topics_are_played(run: Run) -> None:
-    assert {each.message.topic for each in Player(run.file)} == set(RECORDED)
+    assert {each.topic for each in Player(run.file)} == set(RECORDED)
 
 
 def test_command_rejects_an_invalid_rig_name(run: Run) -> None:

@@ -12,10 +12,11 @@ from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
 
-from hilrig_recorder.mcap_format.channels import encode_message
+from hilrig_recorder.mcap_format.file_names import recovered_path
 from hilrig_recorder.mcap_format.fsutil import lock_file
-from hilrig_recorder.mcap_format.recover import read_session_metadata, recover, recovered_path
-from hilrig_recorder.mcap_format.scan import Chunk, Message, is_complete, read_chunk, scan
+from hilrig_recorder.mcap_format.records import Chunk, Message, encode_message
+from hilrig_recorder.mcap_format.recover import read_session_metadata, recover
+from hilrig_recorder.mcap_format.scan import is_complete, read_chunk, scan
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
 from support import recordings

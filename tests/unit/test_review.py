@@ -12,10 +12,12 @@ import pytest
 from hilrig_replay.analysis.compare import Origin, compare, find_origin
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
+from hilrig_replay.export.foxglove_messages import LOG_LEVELS
 from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.comparison_plot import save_comparison_plot
+from hilrig_replay.plots.palette import EVENT_COLORS, SEVERITY_COLORS
 from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError
@@ -40,7 +42,7 @@ def test_summary_has_the_scripted_motion(tmp_path: Path) -> None:
     work = np.abs(run.states["effort"] * run.states["velocity"]).sum() * 0.02
     assert summary.motion.work_j == pytest.approx(work)
     assert summary.motion.saturated_share == (0, 0, 0, 0)
-    assert summary.events == {"SESSION_END": 1, "SESSION_START": 1}
+    assert (summary.events, summary.alarms) == ({"SESSION_END": {"INFO": 1}, "SESSION_START": {"INFO": 1}}, 0)
     assert summary.placement is not None
     assert (summary.placement.placed, len(summary.placement.parts)) == (0, 4)
 
@@ -242,6 +244,32 @@ def test_group_report_ranks_the_runs(tmp_path: Path) -> None:
     assert page.text.index("one-part") < page.text.index("nothing")
     assert "1 of 4" in page.text
     assert "1.00" in page.text
+
+
+def test_alarms_are_the_events_from_warning_up(tmp_path: Path) -> None:
+    script = Script(seconds=2.0)
+    made = make(script)
+    added = (
+        (Event.RESET, Event.INFO),
+        (Event.RESET, Event.ERROR),
+        (Event.RECORDING, Event.ERROR),
+        (Event.WATCHDOG_TRIP, Event.WARNING),
+    )
+    for kind, severity in added:
+        event = Event(rig="rig1", kind=kind, severity=severity, wall_ns=made[50].publish_wall_ns, text="text")
+        made.append(TimedMessage("event", event.wall_ns, event))
+    paths = [named(tmp_path, "alarms", script, made).path, named(tmp_path, "other", script).path]
+    found = build_report(paths)
+    alarms = {run["name"]: (run["alarms"], run["events"].get("RESET")) for run in found.runs}
+    assert alarms == {"alarms": (3, {"ERROR": 1, "INFO": 1}), "other": (0, None)}
+    assert re.search(r'data-label="alarms">3</td>', found.html)
+    assert "<td>reset</td><td>error</td><td>1</td></tr><tr><td>reset</td><td>info</td><td>1</td>" in found.html
+
+
+def test_palette_and_log_levels_match_the_schema() -> None:
+    severities = {name for name, number in Event.Severity.items() if number}
+    assert set(SEVERITY_COLORS) == set(LOG_LEVELS) == severities
+    assert set(EVENT_COLORS) <= set(Event.Kind.keys())
 
 
 def test_report_lists_replayed_and_copied_runs(tmp_path: Path) -> None:

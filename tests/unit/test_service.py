@@ -37,7 +37,7 @@ def test_republished_message_is_not_recorded() -> None:
     seen: list[bytes] = []
     MemoryBus(hub).subscribe(STATE.key("lab", "*"), lambda _, payload: seen.append(payload))
     with make_service(hub, ManualClock()) as service:
-        service.rig_publisher(STATE, "rig1").republish(JointState(step=1))
+        service.rig_publisher(STATE, "rig1").republish_encoded(b"state")
     assert len(seen) == 1
     assert not [key for key in hub.history if LogBatch.FromString(hub.history[key][0]).keys]
 

@@ -8,7 +8,7 @@ import pytest
 from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import Recording
 from hilrig_recorder.ingest.sessions import BLOCK_PERIOD_NS, DRAIN_MAX_NS, OWNER_TIMEOUT_NS, SessionTracker
-from hilrig_recorder.mcap_format.channels import parse_message_header
+from hilrig_recorder.mcap_format.records import decode_message_head
 from hilrig_runtime.messaging.recording_stream import put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, STATE
@@ -29,9 +29,6 @@ class FakeFile:
     end: str = ""
     reason: str = ""
 
-    def write(self, records: Sequence[bytes]) -> None:
-        self.records += records
-
     @property
     def payloads(self) -> list[bytes]:
         """Payloads of the written and the pending messages."""
@@ -41,7 +38,7 @@ class FakeFile:
     @property
     def log_times(self) -> list[int]:
         self.flush()
-        return [parse_message_header(record).log_time for record in self.records]
+        return [decode_message_head(record).log_time for record in self.records]
 
 
 @dataclass
@@ -58,16 +55,22 @@ class FakeStore:
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
     horizon_ns: dict[int, int] = field(default_factory=dict)
 
-    def open(self, recording: Recording) -> FakeFile | None:
+    def open(self, recording: Recording) -> bool:
         if not self.accepts:
-            return None
+            return False
         recording.seen, recording.last, recording.horizon_ns = self.seen, dict(self.last), self.horizon_ns
         self.files.append(FakeFile(recording, self.flush))
-        return self.files[-1]
+        return True
+
+    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
+        self._file(recording).records += records
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
-        file = next(file for file in self.files if file.recording is recording)
+        file = self._file(recording)
         file.end, file.reason = end, reason
+
+    def _file(self, recording: Recording) -> FakeFile:
+        return next(file for file in self.files if file.recording is recording)
 
     def record_loss(self, _recording: Recording, _source: str, key: str, transport: int, recorder: int) -> None:
         self.losses.append((key, transport, recorder))

@@ -212,7 +212,7 @@ def test_inaccurate_steps_are_counted_and_reported_once_a_second() -> None:
         assert reports[0].integration_data.steps == 1
         assert max(reports[0].integration_data.error[:2]) > np.radians(0.1)
         assert "inaccurate step: the estimated error of joint" in reports[0].text
-        assert rig.counters.inaccurate_steps > 20
+        assert rig.service.counters.inaccurate_steps > 20
 
 
 def test_automatic_substeps_are_accurate_and_published() -> None:
@@ -221,7 +221,7 @@ def test_automatic_substeps_are_accurate_and_published() -> None:
             rig.command([16.0, -16.0, -4.9, 0.0] if turn % 2 else [-16.0, 16.0, -4.9, 0.0])
             assert rig.tick().substeps >= 2
         assert "INACCURATE_STEP" not in rig.kinds()
-        assert rig.counters.inaccurate_steps == 0
+        assert rig.service.counters.inaccurate_steps == 0
 
 
 def test_rigs_apply_their_own_commands_only() -> None:

@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters
-from hilrig_sim.arm.urdf import JOINTS, LINKS, urdf
+from hilrig_sim.arm.model import JOINT_NAMES, ArmParameters, RigParameters, SceneParameters
+from hilrig_sim.arm.urdf import LINKS, urdf
 from support.recordings import PARAMETERS
 
 ROBOT = ElementTree.fromstring(urdf(PARAMETERS, "rig1"))
@@ -21,7 +21,7 @@ def test_links_and_joints_are_a_chain_from_base_to_tip() -> None:
         assert parent is not None
         assert child is not None
         chain.append((joint.get("name"), parent.get("link"), child.get("link")))
-    assert chain == list(zip(JOINTS, LINKS, LINKS[1:], strict=False))
+    assert chain == list(zip(JOINT_NAMES, LINKS, LINKS[1:], strict=False))
 
 
 def test_visuals_are_primitives_with_defined_colors() -> None:

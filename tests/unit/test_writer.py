@@ -17,9 +17,10 @@ from mcap.records import Chunk, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, CHANNELS, encode_message
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, CHANNELS
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 from hilrig_recorder.mcap_format.file_names import part_path
+from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.scan import scan
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_schemas import JointState

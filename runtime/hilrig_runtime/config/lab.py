@@ -29,7 +29,7 @@ from hilrig_runtime.config.types import (
     Vector4,
 )
 from hilrig_runtime.config.validation import format_validation_error
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import InputError, list_names
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
 MAX_RIGS = 10_000
@@ -319,12 +319,8 @@ class LabConfig(Section):
     def no_such_rig(self, name: str, added: Iterable[str] = ()) -> InputError:
         """Return the error for an unknown rig; `added` are running rigs that are not in the file."""
         names = list(dict.fromkeys([*(rig.name for rig in self.rigs), *added]))
-        more = (
-            f" and {len(names) - MAX_NAMES_IN_MESSAGE} more (hilrig rig list)"
-            if len(names) > MAX_NAMES_IN_MESSAGE
-            else ""
-        )
-        return InputError(f"unknown rig {name!r}; this lab has {', '.join(names[:MAX_NAMES_IN_MESSAGE])}{more}")
+        hint = " (hilrig rig list)" if len(names) > MAX_NAMES_IN_MESSAGE else ""
+        return InputError(f"unknown rig {name!r}; this lab has {list_names(names, MAX_NAMES_IN_MESSAGE)}{hint}")
 
 
 def read_rig(settings_json: str) -> RigSettings:

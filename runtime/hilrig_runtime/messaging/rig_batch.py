@@ -5,7 +5,7 @@ content. So a simulation first publishes the states of a tick as one batch to th
 its rig's own key, which costs little without a subscriber. Each message is recorded under its rig's key.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import repeat
 
 from hilrig_runtime.bus.api import Publisher
@@ -21,7 +21,7 @@ class BatchPublisher:
     def __init__(
         self, source: str, batches: Publisher, recording_stream: RecordingStream, clock: Clock, counters: Counters
     ) -> None:
-        self._put_batch = batches.put
+        self._batches = batches
         self._recording_stream = recording_stream
         self._wall_ns = clock.wall_ns
         self._counters = counters
@@ -30,20 +30,20 @@ class BatchPublisher:
         self._head = b""
         """The encoded fields that all batches have in common."""
         self._keys: list[str] = []
-        self._puts: list[Callable[[bytes], None]] = []
+        self._publishers: list[Publisher] = []
         self._sequences: list[int] = []
 
     def add(self, rig: str, key: str, publisher: Publisher) -> None:
         """Add a rig after the others; its messages are also published on `key` through `publisher`."""
         self._rigs.append(rig)
         self._keys.append(key)
-        self._puts.append(publisher.put)
+        self._publishers.append(publisher)
         self._sequences.append(0)
         self._encode_head()
 
     def remove(self, index: int) -> None:
         """Remove a rig; the rigs after it move up."""
-        del self._rigs[index], self._keys[index], self._puts[index], self._sequences[index]
+        del self._rigs[index], self._keys[index], self._publishers[index], self._sequences[index]
         self._encode_head()
 
     def _encode_head(self) -> None:
@@ -54,9 +54,9 @@ class BatchPublisher:
         # A new message each time: a protobuf message keeps the memory of its former content until it is freed.
         batch = RigBatch(messages=payloads)
         wall_ns = self._wall_ns()
-        self._put_batch(self._head + batch.SerializeToString())
-        for put, payload in zip(self._puts, payloads, strict=True):
-            put(payload)
+        self._batches.put(self._head + batch.SerializeToString())
+        for publisher, payload in zip(self._publishers, payloads, strict=True):
+            publisher.put(payload)
         self._sequences = [sequence + 1 for sequence in self._sequences]
         self._recording_stream.extend(zip(self._keys, self._sequences, repeat(wall_ns), payloads, strict=False))
         self._counters.published += len(payloads)

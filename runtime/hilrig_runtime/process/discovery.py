@@ -21,7 +21,7 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Bus, Handle
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import OperationError, list_names
 from hilrig_runtime.process.liveliness import PeerDownTracker
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import ServiceInfo
@@ -32,8 +32,6 @@ RETRY_INTERVAL_S: Final = 0.1
 QUERY_TIMEOUT_S: Final = 0.5
 CLAIM_TIMEOUT_S: Final = 3.0
 """Query timeout for the check of conflicts, s; it ends early when all services have replied."""
-MAX_NAMES_IN_MESSAGE: Final = 3
-"""Number of rigs that an error message names before "and … more"."""
 
 logger = logging.getLogger(__name__)
 
@@ -63,9 +61,7 @@ def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
             return f"{where} has the same instance name; choose another --instance"
         shared = sorted(set(own.rigs) & set(other.rigs))
         if shared:
-            rest = len(shared) - MAX_NAMES_IN_MESSAGE
-            rigs = ", ".join(shared[:MAX_NAMES_IN_MESSAGE]) + (f" and {rest} more" if rest > 0 else "")
-            return f"{where} already serves {rigs}; each rig has one {own.service} (--rigs)"
+            return f"{where} already serves {list_names(shared)}; each rig has one {own.service} (--rigs)"
     return ""
 
 

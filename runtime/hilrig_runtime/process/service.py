@@ -17,7 +17,7 @@ from hilrig_runtime.bus.api import Bus, Handle, Publisher
 from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
-from hilrig_runtime.messaging.publisher import CommandSink, RigPublisher
+from hilrig_runtime.messaging.publisher import RigPublisher
 from hilrig_runtime.messaging.recording_stream import RecordingStream, batch_cache_depth
 from hilrig_runtime.messaging.rig_batch import BatchPublisher
 from hilrig_runtime.process.discovery import PeerRegistry
@@ -110,17 +110,11 @@ class Service(Handle):
         self.rigs = rigs
         self.counters.rigs = len(rigs)
 
-    def rig_publisher(
-        self,
-        topic: RigTopic[MessageT],
-        rig: str,
-        *,
-        control_path: CommandSink | None = None,
-    ) -> RigPublisher[MessageT]:
-        """Create a publisher of a rig's topic; `control_path` gets each encoded message before it is published."""
+    def rig_publisher(self, topic: RigTopic[MessageT], rig: str) -> RigPublisher[MessageT]:
+        """Create a publisher of a rig's topic."""
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters, control_path)
+        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters)
 
     def latest_value_cache(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
-from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
+from hilrig_runtime.bus.api import Publisher
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigBatch
 
@@ -50,8 +51,8 @@ class CommandScheduler:
 
     Args:
         source: name of the edge, put into the messages.
-        put: publishes an encoded `RigBatch`.
-        newest_state: returns the newest state of a rig; its arrival is an estimate of the last tick of the simulation.
+        publisher: publisher of the batches of commands.
+        states: newest state of each rig; its arrival is an estimate of the last tick of the simulation.
         step_ns: step of the simulation, ns.
         clock: monotonic time.
         call_at: calls a function on the event loop at a time of its clock, s.
@@ -60,15 +61,15 @@ class CommandScheduler:
     def __init__(
         self,
         source: str,
-        put: Callable[[bytes], None],
-        newest_state: Callable[[str], TimestampedPayload | None],
+        publisher: Publisher,
+        states: LatestValueCache,
         step_ns: int,
         clock: Clock,
         call_at: Callable[[float, Callable[[], None]], TimerHandle],
     ) -> None:
         self._source = source
-        self._put = put
-        self._newest_state = newest_state
+        self._publisher = publisher
+        self._states = states
         self._step_ns = step_ns
         self._monotonic_ns = clock.monotonic_ns
         self._call_at = call_at
@@ -99,14 +100,15 @@ class CommandScheduler:
             self._timer = None
         pending = self._pending
         if pending:
-            self._put(RigBatch(source=self._source, rigs=pending, messages=pending.values()).SerializeToString())
+            batch = RigBatch(source=self._source, rigs=pending, messages=pending.values())
+            self._publisher.put(batch.SerializeToString())
             pending.clear()
             self._flushed_ns = self._monotonic_ns()
 
     def _send_time(self, rig: str, now_ns: int) -> int:
         """Return the latest time at which a new command of a rig is sent, ns, monotonic clock."""
         window_end_ns = self._flushed_ns + COALESCE_WINDOW_NS
-        state = self._newest_state(rig)
+        state = self._states.get(rig)
         state_ns = 0 if state is None else state.arrived_ns
         writes = self._writes.get(rig)
         if writes is None or writes.state_ns != state_ns:

@@ -4,10 +4,10 @@ import asyncio
 import socket
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
+from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
@@ -25,48 +25,22 @@ REQUEST_LOG_PERIOD_NS: Final = 200_000_000
 
 
 class BusOutput:
-    """Output port of a device: publishes on the bus, and runs the device's timers on the event loop.
+    """Output port of a device: publishes its events on the bus, and runs its timers on the event loop.
 
-    Implements `DeviceOutput`. `check` is called at the watchdog's deadline and returns the next one; `send_due` is
-    called when a delayed command is due.
+    Implements `DeviceOutput`.
     """
 
-    def __init__(
-        self,
-        rig: str,
-        service: Service,
-        commands: CommandScheduler,
-        sessions_changed: Callable[[], None],
-        check: Callable[[], int | None],
-        send_due: Callable[[], None],
-    ) -> None:
-        sender = service.rig_publisher(topics.COMMAND, rig, control_path=partial(commands.send, rig))
-        self.send_command = sender.publish
-        self.repeat_command = sender.republish
+    def __init__(self, rig: str, service: Service, sessions_changed: Callable[[], None]) -> None:
         self.emit: Callable[[Event], None] = service.emit
         self.sessions_changed = sessions_changed
-        self._check = check
-        self._send_due = send_due
         self._bus = service.bus
         self._monotonic_ns = service.clock.monotonic_ns
         self._state_key = topics.STATE.key(service.lab.name, rig)
-        self._timer: asyncio.TimerHandle | None = None
-        self._send_ns: int | None = None
         self._states: Handle | None = None
 
-    def watch(self, deadline_ns: int) -> None:
-        """See `DeviceOutput.watch`."""
-        loop = asyncio.get_running_loop()
-        if self._timer is not None:
-            self._timer.cancel()
-        delay_ns = deadline_ns - self._monotonic_ns()
-        self._timer = loop.call_later(max(0, delay_ns) * 1e-9, self._on_deadline)
-
-    def send_at(self, deadline_ns: int) -> None:
-        """See `DeviceOutput.send_at`."""
-        if self._send_ns is None or deadline_ns < self._send_ns:
-            self._send_ns = deadline_ns
-            asyncio.get_running_loop().call_at(deadline_ns * 1e-9, self._on_send)
+    def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> asyncio.TimerHandle:
+        """See `DeviceOutput.call_at`."""
+        return asyncio.get_running_loop().call_at(deadline_ns * 1e-9, callback)
 
     def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """See `DeviceOutput.follow_states`."""
@@ -79,17 +53,6 @@ class BusOutput:
                 self._state_key, lambda _, payload: arrive(TimestampedPayload(payload, monotonic_ns()))
             )
 
-    def _on_send(self) -> None:
-        self._send_ns = None
-        self._send_due()
-
-    def _on_deadline(self) -> None:
-        self._timer = None
-        # Writes since then moved the deadline, but not the timer: there are too many of them.
-        deadline_ns = self._check()
-        if deadline_ns is not None:
-            self.watch(deadline_ns)
-
 
 class RigEndpoint:
     """Device, server and bus connection of one rig."""
@@ -99,17 +62,17 @@ class RigEndpoint:
         rig: RigSettings,
         service: Service,
         states: LatestValueCache,
-        commands: CommandScheduler,
+        scheduler: CommandScheduler,
         sessions_changed: Callable[[], None],
     ) -> None:
         lab = service.lab
         self._clock = service.clock
         self._edge = lab.edge
-        self._output = BusOutput(
-            rig.name, service, commands, sessions_changed, self._check_device, self._send_delayed_commands
-        )
+        self._output = BusOutput(rig.name, service, sessions_changed)
         settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
-        self.device = Device(rig.name, settings, service.clock, self._output, partial(states.get, rig.name))
+        publisher = service.rig_publisher(topics.COMMAND, rig.name)
+        sender = CommandSender(rig.name, scheduler, publisher, service.clock, settings.repeat_ns)
+        self.device = Device(rig.name, settings, service.clock, self._output, states, sender)
         limits = Limits(
             lab.edge.max_connections,
             lab.edge.max_connections_per_host,
@@ -181,14 +144,6 @@ class RigEndpoint:
         if self._server.request_log.count:
             self._publish_request_log()
         self.closing.close()
-
-    def _check_device(self) -> int | None:
-        """Check the device; return the next deadline of its watchdog."""
-        self.device.check(self._clock.monotonic_ns())
-        return self.device.watchdog.deadline_ns
-
-    def _send_delayed_commands(self) -> None:
-        self.device.send_due(self._clock.monotonic_ns())
 
     def _publish_request_log(self) -> None:
         clock = self._clock

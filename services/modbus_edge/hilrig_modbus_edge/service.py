@@ -55,10 +55,10 @@ class EdgeService:
         # A query arrives on a thread of the bus and is handled on the event loop.
         self._executor = OwnerThreadExecutor(loop.call_soon_threadsafe)
         self._states = service.latest_value_cache(topics.STATES)
-        self._commands = CommandScheduler(
+        self._scheduler = CommandScheduler(
             service.source,
-            service.publisher(topics.COMMANDS).put,
-            self._states.get,
+            service.publisher(topics.COMMANDS),
+            self._states,
             service.lab.sim.step_ns,
             service.clock,
             loop.call_at,
@@ -74,7 +74,7 @@ class EdgeService:
         self._closing = ExitStack()
 
     def _new_endpoint(self, rig: RigSettings) -> RigEndpoint:
-        return RigEndpoint(rig, self._service, self._states, self._commands, self._announce_sessions)
+        return RigEndpoint(rig, self._service, self._states, self._scheduler, self._announce_sessions)
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
@@ -247,6 +247,6 @@ class EdgeService:
         self._closing.close()
         for endpoint in self._endpoints.values():
             endpoint.stop("edge stopped")
-        self._commands.flush()
+        self._scheduler.flush()
         self._announce_sessions()
         self._service.recording_stream.flush(self._service.clock.monotonic_ns())

@@ -16,6 +16,7 @@ from hilrig_recorder.ingest.queue import IngestQueue
 from hilrig_recorder.ingest.recording import SECOND_NS, Recording
 from hilrig_recorder.ingest.rig_partition import RigPartition
 from hilrig_recorder.ingest.sessions import SessionTracker
+from hilrig_recorder.mcap_format.file_names import PART_SUFFIX
 from hilrig_recorder.mcap_format.recover import read_session_metadata
 from hilrig_recorder.storage.folder_lock import FolderLock
 from hilrig_recorder.storage.maintenance import MaintenanceWorker, find_unfinished
@@ -54,7 +55,7 @@ def run(service: Service) -> None:
     """
     service.claim()
     with ExitStack() as closing:
-        closing.enter_context(_lock_folder(service))
+        closing.callback(_lock_folder(service).close)
         recorder = Recorder(service)
         closing.callback(recorder.close)
         recorder.run()
@@ -262,7 +263,8 @@ class Recorder:
         self._sessions.stop()
         if not self._sync_worker.close(_FINISH_TIMEOUT_S):
             logger.error(
-                "the disk is too slow: some files keep the suffix .part; they will be recovered at the next start"
+                "the disk is too slow: some files keep the suffix %s; they will be recovered at the next start",
+                PART_SUFFIX,
             )
         self._maintenance.close()
         self._store.release()

@@ -6,27 +6,16 @@ one; a repetition only shows that the edge is alive.
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from google.protobuf.message import DecodeError
 
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import TorqueCommand
 from hilrig_sim.arm.model import LARGEST_EFFORT
 
 ZERO_EFFORT: Final = (0.0, 0.0, 0.0, 0.0)
 Effort = tuple[float, float, float, float]
-
-
-class ReceivedCommand(Protocol):
-    """A received message."""
-
-    @property
-    def payload(self) -> bytes:
-        """Encoded `TorqueCommand`."""
-
-    @property
-    def arrived_ns(self) -> int:
-        """Arrival time, ns, monotonic clock."""
 
 
 class StepTimes:
@@ -95,29 +84,29 @@ class CommandLatch:
     """Time without a message before `command_lost` or `command_resumed`, ns."""
     malformed: int = 0
     """Number of malformed messages."""
-    _received: ReceivedCommand | None = None
+    received: TimestampedPayload | None = None
+    """The latched message."""
     _last_received_ns: int = 0
     _commanded: Effort = ZERO_EFFORT
     _resets: int | None = None
     _flags_clear: bool = True
 
-    def latch(self, arrival: ReceivedCommand | None, now_ns: int) -> None:
-        """Latch the newest received message for the next tick.
-
-        `arrival` is the same object as before if no message was received; it is not later than `now_ns`.
-        """
+    def start_step(self) -> None:
+        """Clear everything that describes one tick only, after that tick."""
         if not self._flags_clear:
             self.is_new = self.changed = self.command_lost = self.command_resumed = self.reset = False
             self.basis_step = self.arrived_ns = 0
             self._flags_clear = True
-        self.relatch(arrival, now_ns)
 
-    def relatch(self, arrival: ReceivedCommand | None, now_ns: int) -> None:
-        """Latch a message that was received after `latch`, but before its tick: the previous one was never applied."""
-        if arrival is not self._received and arrival is not None:
+    def latch(self, command: TimestampedPayload | None, now_ns: int) -> None:
+        """Latch the newest received command for the next tick; it replaces one that was latched before the same tick.
+
+        `command` is the same object as before if no message was received; it is not later than `now_ns`.
+        """
+        if command is not self.received and command is not None:
             self._flags_clear = False
-            self._received = arrival
-            self._apply(arrival, now_ns)
+            self.received = command
+            self._apply(command, now_ns)
         elif not self.safe and self.timeout_ns and now_ns - self._last_received_ns > self.timeout_ns:
             self._flags_clear = False
             self.safe = self.command_lost = self.changed = True
@@ -127,18 +116,18 @@ class CommandLatch:
             self.is_new = False
             self.basis_step = self.arrived_ns = 0
 
-    def _apply(self, arrival: ReceivedCommand, now_ns: int) -> None:
-        command = _decode(arrival.payload)
+    def _apply(self, received: TimestampedPayload, now_ns: int) -> None:
+        command = _decode(received.payload)
         if command is None:
             self.malformed += 1
             return
         was_silent_ns = now_ns - self._last_received_ns
-        self._last_received_ns = arrival.arrived_ns
+        self._last_received_ns = received.arrived_ns
         if command.seq != self.seq or command.session != self.session or self._resets is None:
             self.is_new = self.changed = True
             self.seq, self.session, self.magnet = command.seq, command.session, command.magnet
             self.effort = self._commanded = command.effort
-            self.arrived_ns = arrival.arrived_ns
+            self.arrived_ns = received.arrived_ns
             self.basis_step = command.basis_step if command.basis_incarnation == self.incarnation else 0
         if self.safe:
             # Not for the first command, and not if it was received between `latch` and the tick.

@@ -5,7 +5,6 @@ state x_k is published with the effort that is applied from now on, and then x_k
 at the start of its step.
 """
 
-from collections.abc import Mapping
 from math import isfinite
 from typing import Final
 
@@ -16,7 +15,7 @@ from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import JointState, RigReport, topics
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.arm.stability import ERROR_BOUND
-from hilrig_sim.commands import StepTimes
+from hilrig_sim.commands import CommandLatch, StepTimes
 from hilrig_sim.events import SimulationEvents
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.state_encoder import RigStateEncoder, encode_loop_latency, encode_motion
@@ -50,6 +49,7 @@ class Simulation:
             self._new_encoder(index, rig.name, values, self._plant)
             for index, (rig, values) in enumerate(zip(service.rigs, parameters, strict=True))
         ]
+        self._latches = [self._new_latch() for _ in self._rigs]
         self._states = service.batch_publisher(topics.STATES)
         for rig in self._rigs:
             service.add_to_batch(self._states, topics.STATE, rig.name)
@@ -65,31 +65,31 @@ class Simulation:
         if len(self._rigs) < PRE_ENCODE_MIN_RIGS:
             return
         self._clock.sleep_until_ns(tick_ns - self._step_ns // PRE_ENCODE_STEP_DIVISOR)
-        for rig in self._rigs:
+        for rig, latch in zip(self._rigs, self._latches, strict=True):
             if self._clock.monotonic_ns() >= tick_ns:
                 return
-            rig.update_command(self._commands.get(rig.name), tick_ns)
+            latch.latch(self._commands.get(rig.name), tick_ns)
             # The pose after a reset is known at the tick only.
-            if not rig.command.reset:
-                rig.encode(self._times, tick_ns)
+            if not latch.reset:
+                rig.encode(latch, self._times, tick_ns)
 
     def tick(self, tick: Tick) -> None:
         """Latch the commands, take the timestamps, publish the states, step the plant."""
         self._step = step = self._step + 1
-        newest, rigs, plant, times = self._commands.get, self._rigs, self._plant, self._times
-        arrivals = [newest(rig.name) for rig in rigs]
+        rigs, latches, plant, times = self._rigs, self._latches, self._plant, self._times
+        commands = [self._commands.get(rig.name) for rig in rigs]
         # Sampled after the commands were fetched: no command arrives after the tick that applies it.
         sampled_ns, wall_ns = self._clock.monotonic_ns(), self._clock.wall_ns()
         times.add(step, sampled_ns)
         # After a late tick, states are encoded again: a command may have timed out.
         overrun = tick.missed_steps > 0 or tick.lateness_ns > self._step_ns
-        for rig, arrival in zip(rigs, arrivals, strict=True):
-            if arrival is not rig.arrival or not rig.encoded or overrun:
-                rig.update_command(arrival, sampled_ns)
-                if rig.command.reset:
+        for rig, latch, command in zip(rigs, latches, commands, strict=True):
+            if command is not latch.received or not rig.encoded or overrun:
+                latch.latch(command, sampled_ns)
+                if latch.reset:
                     plant.reset(rig.index)
                     rig.set_motion(encode_motion(plant)[rig.index], plant.limit_flags[rig.index])
-                rig.encode(times, sampled_ns)
+                rig.encode(latch, times, sampled_ns)
         # The same for all rigs: encoded once, and prepended to each state.
         common = JointState(
             step=step,
@@ -102,13 +102,15 @@ class Simulation:
         latencies_ns = {basis: sampled_ns - (times.get(basis) or sampled_ns) for basis in {r.basis_step for r in rigs}}
         ends = {basis: encode_loop_latency(latency_ns) for basis, latency_ns in latencies_ns.items()}
         self._states.publish([common + rig.encoded + ends[rig.basis_step] for rig in rigs])
-        self._apply_commands(latencies_ns)
+        self._apply_commands()
+        for rig in rigs:
+            rig.on_published(latencies_ns[rig.basis_step])
         events = plant.step(self._effort, self._magnet)
         if events:
-            self._events.report_plant_events(events, step + 1, sampled_ns, [rig.command.session for rig in rigs])
+            self._events.report_plant_events(events, step + 1, sampled_ns, [latch.session for latch in latches])
         if not isfinite(plant.velocity.sum()):
             self._reset_diverged(step + 1)
-        elif plant.is_inaccurate():
+        if plant.is_inaccurate():
             self._report_inaccurate(step + 1, sampled_ns)
         self._update_motion()
         self._counters.count_tick(tick, self._step_ns)
@@ -117,16 +119,15 @@ class Simulation:
         elif self._events.overran:
             self._events.report_overruns(sampled_ns)
 
-    def _apply_commands(self, latencies_ns: Mapping[int, int]) -> None:
-        """Pass changed efforts and magnets to the plant, and emit the events of the commands."""
+    def _apply_commands(self) -> None:
+        """Set the efforts and magnets that latched commands changed, and emit the events of the commands."""
         changed = []
-        for rig in self._rigs:
-            command = rig.command
-            rig.on_published(latencies_ns[rig.basis_step])
-            if command.changed:
-                changed.append((rig.index, command.effort, command.magnet))
-            if command.command_lost or command.command_resumed or command.reset:
-                self._events.report_command_changes(rig.index, command, self._step)
+        for index, latch in enumerate(self._latches):
+            if latch.changed:
+                changed.append((index, latch.effort, latch.magnet))
+            if latch.command_lost or latch.command_resumed or latch.reset:
+                self._events.report_command_changes(index, latch, self._step)
+            latch.start_step()
         if changed:
             indices, efforts, magnets = zip(*changed, strict=True)
             self._effort[:, indices] = np.array(efforts).T
@@ -142,6 +143,7 @@ class Simulation:
         count = len(self._rigs)
         plant.copy_state_from(self._plant, range(count), range(count))
         self._rigs.append(self._new_encoder(count, name, plant.rigs[count], plant))
+        self._latches.append(self._new_latch())
         self._effort = np.hstack([self._effort, np.zeros((4, 1))])
         self._magnet = np.append(self._magnet, False)
         self._service.add_to_batch(self._states, topics.STATE, name)
@@ -151,14 +153,16 @@ class Simulation:
         """Remove a rig; `plant` has all the others."""
         kept = [number for number in range(len(self._rigs)) if number != index]
         plant.copy_state_from(self._plant, range(len(kept)), kept)
-        del self._rigs[index]
+        del self._rigs[index], self._latches[index]
         self._effort, self._magnet = self._effort[:, kept].copy(), self._magnet[kept]
         self._states.remove(index)
         self._set_plant(plant)
 
     def _new_encoder(self, index: int, name: str, parameters: RigParameters, plant: Plant) -> RigStateEncoder:
-        timeout_ns = self._service.lab.sim.command_timeout_ns
-        return RigStateEncoder(index, name, parameters, self._service.incarnation, timeout_ns, plant)
+        return RigStateEncoder(index, name, parameters, self._service.incarnation, plant)
+
+    def _new_latch(self) -> CommandLatch:
+        return CommandLatch(self._service.incarnation, self._service.lab.sim.command_timeout_ns)
 
     def _update_motion(self) -> None:
         """Encode the motion at the start of the next step now, so that its tick has less work."""
@@ -174,21 +178,21 @@ class Simulation:
         self._update_motion()
 
     def _rig_reports(self) -> list[RigReport]:
-        return [rig.report() for rig in self._rigs]
+        return [rig.report(latch.safe) for rig, latch in zip(self._rigs, self._latches, strict=True)]
 
     def _reset_diverged(self, step: int) -> None:
         """Reset the rigs whose state is not finite any more, because the motion was too fast for the step."""
-        for rig in self._rigs:
-            if not np.isfinite(self._plant.velocity[:, rig.index]).all():
-                self._plant.reset(rig.index)
-                self._events.report_divergence(rig.index, rig.command.session, step)
+        for index, latch in enumerate(self._latches):
+            if not np.isfinite(self._plant.velocity[:, index]).all():
+                self._plant.reset(index)
+                self._events.report_divergence(index, latch.session, step)
 
     def _report_inaccurate(self, step: int, now_ns: int) -> None:
         """Count and report the rigs whose error estimate of the last step exceeds its bound."""
         error = np.abs(self._plant.error)
         for index in np.flatnonzero((error > np.array(ERROR_BOUND)[:, np.newaxis]).any(axis=0)).tolist():
             self._counters.inaccurate_steps += 1
-            session = self._rigs[index].command.session
+            session = self._latches[index].session
             self._events.report_inaccurate(index, error[:, index], session, step, now_ns)
 
     def _warm_up(self) -> None:

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import JointState, PartState, RigReport
 from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.commands import CommandLatch, StepTimes
@@ -65,29 +64,16 @@ def encode_loop_latency(latency_ns: int) -> bytes:
 
 
 class RigStateEncoder:
-    """Encodes the state of one rig at each step, and holds its latched command."""
+    """Encodes the state of one rig at each step."""
 
-    def __init__(
-        self,
-        index: int,
-        name: str,
-        parameters: RigParameters,
-        incarnation: int,
-        command_timeout_ns: int,
-        plant: Plant,
-    ) -> None:
+    def __init__(self, index: int, name: str, parameters: RigParameters, incarnation: int, plant: Plant) -> None:
         self.name = name
-        self.command = CommandLatch(incarnation, command_timeout_ns)
         self.encoded = b""
         """Encoded state without timestamps and loop latency, which the tick adds; empty: not encoded yet."""
-        self.arrival: TimestampedPayload | None = None
-        """Received command that it was encoded with."""
         self.basis_step = 0
         """Step that the new command is based on; 0: no new command, or an unknown step."""
         self._incarnation = incarnation
         self._external = (parameters.arm.external_force_z, parameters.arm.external_torque_z)
-        self._latched = False
-        """Whether a command has been latched for the next tick."""
         self._motion = b""
         self._limit_flags = 0
         self._held_part = ""
@@ -112,26 +98,16 @@ class RigStateEncoder:
         self._motion, self._limit_flags = motion, limit_flags
         self.encoded = b""
 
-    def update_command(self, arrival: TimestampedPayload | None, now_ns: int) -> None:
-        """Latch the newest command for the next tick; may be called again with a newer one before the tick."""
-        self.arrival = arrival
-        self.encoded = b""
-        if self._latched:
-            self.command.relatch(arrival, now_ns)
-        else:
-            self.command.latch(arrival, now_ns)
-            self._latched = True
-
-    def encode(self, times: StepTimes, now_ns: int) -> None:
-        """Encode everything that is known for a tick at `now_ns`, monotonic clock."""
-        command, world, index = self.command, self._world, self.index
+    def encode(self, command: CommandLatch, times: StepTimes, now_ns: int) -> None:
+        """Encode everything that is known for a tick at `now_ns`, monotonic clock, with its latched command."""
+        world, index = self._world, self.index
         parts, self._parts_encoded_ns = b"", 0
         if self._part_names and (world.moving[index] or now_ns >= self._parts_due_ns):
             parts, self._parts_encoded_ns = self._encode_parts(), now_ns
         slow_values = (command.session, command.magnet, command.safe, self._held_part, self._limit_flags)
         if slow_values != self._encoded_slow_values:
             self._encoded_slow_values = slow_values
-            self._slow_fields = self._encode_slow_fields()
+            self._slow_fields = self._encode_slow_fields(command)
         # The message object is reused: it has numeric fields only, so setting them again allocates no memory.
         command_fields = self._command_fields
         command_fields.command_seq = command.seq
@@ -150,21 +126,19 @@ class RigStateEncoder:
 
     def on_published(self, latency_ns: int) -> None:
         """Record that the state was published; `latency_ns`: its loop latency, 0: none."""
-        self._latched = False
         if self._parts_encoded_ns:
             # Not in `encode`: the state may have been encoded several times before the tick.
             self._parts_due_ns = self._parts_encoded_ns + ALL_PARTS_PERIOD_NS
         if latency_ns:
             self._loops_us.append(latency_ns // 1000)
 
-    def report(self) -> RigReport:
-        """Return the report on the rig since the last report."""
+    def report(self, safe: bool) -> RigReport:
+        """Return the report on the rig since the last report; `safe`: its commands have timed out."""
         loops_us, self._loops_us = self._loops_us, []
-        return RigReport(rig=self.name, loop_us=loops_us, safe=self.command.safe)
+        return RigReport(rig=self.name, loop_us=loops_us, safe=safe)
 
-    def _encode_slow_fields(self) -> bytes:
+    def _encode_slow_fields(self, command: CommandLatch) -> bytes:
         """Encode the fields that rarely change."""
-        command = self.command
         force, torque = self._external
         return JointState(
             rig=self.name,

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options and texts that several commands share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,3 +23,12 @@ def config_for_commands(context: typer.Context, config: Config = None) -> None:
     """Callback of a command group: accepts `-c` before the command too; `-c` after the command takes precedence."""
     if config is not None and isinstance(context.command, TyperGroup):
         context.default_map = {name: {"config": str(config)} for name in context.command.commands}
+
+
+def format_size(size: float) -> str:
+    """Return a size in bytes as a readable text."""
+    for unit in ("B", "KiB", "MiB"):
+        if size < 1024:
+            return f"{size:.0f} {unit}"
+        size /= 1024
+    return f"{size:.1f} GiB"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_console.worker import Worker
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
+from hilrig_recorder.mcap_format.file_names import recording_stem
 from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
 from hilrig_runtime.errors import HilrigError, InputError
 
@@ -178,7 +178,7 @@ def _row(entry: RunEntry) -> dict[str, Any]:
     for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
-    row["name"] = Path(entry.path).name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
+    row["name"] = recording_stem(Path(entry.path).name)
     row["unfit"] = "; ".join(entry.unfit_reasons)
     row["open"] = entry.ended == IN_PROGRESS
     return row

@@ -16,7 +16,7 @@ from hilrig_console.auth import HEALTH_PATH, AccessPolicy, is_loopback
 from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.errors import InputError, OperationError, listen_failure
 
 SHUTDOWN_GRACE_S: Final = 1
 """Time limit for downloads to finish on shutdown, s."""
@@ -59,9 +59,9 @@ class ListenAddress:
             return socket.create_server((self.host, self.port), family=family, backlog=128)
         except OSError as error:
             where = f"{self.host or '0.0.0.0'}:{self.port}"
-            # Python appends the address to the message of the operating system.
-            reason = (error.strerror or str(error)).partition(" (while")[0]
-            raise OperationError(f"can't listen on {where}: {reason}; choose another address with --listen") from error
+            raise OperationError(
+                f"can't listen on {where}: {listen_failure(error)}; choose another address with --listen"
+            ) from error
 
     def url(self, port: int, scheme: str) -> str:
         """Return the URL to open in a browser."""

@@ -16,7 +16,7 @@ from scipy.linalg import expm
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import GRAVITY, ArmParameters, Vector4
+from hilrig_sim.arm.model import GRAVITY, JOINT_NAMES, ArmParameters, Vector4
 
 Floats = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def linearize(arm: ArmParameters, pose: Sequence[float], *, payload: float = 0.0
     """
     if len(pose) != 4:
         raise InputError(f"pose: expected four joint positions, got {len(pose)}")
-    for name, low, value, high in zip(("theta1", "theta2", "d3", "theta4"), arm.lower, pose, arm.upper, strict=True):
+    for name, low, value, high in zip(JOINT_NAMES, arm.lower, pose, arm.upper, strict=True):
         if not low < value < high:
             raise InputError(f"pose: {name} must be between its stops {low:g} and {high:g} (rad or m), got {value:g}")
     mass = mass_matrix(arm, pose[1], payload)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import platform
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -13,10 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from hilrig_runtime.errors import OperationError
+from hilrig_sim.arm.model import JOINT_NAMES
+from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import CELL_DTYPE, SweepResult
-
-JOINTS = ("theta1", "theta2", "d3", "theta4")
 
 
 def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
@@ -27,7 +26,7 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
         columns[name] = np.ascontiguousarray(swept.cells[name])
     for name in ("cost", "settled", "failed_s", "loop_p50_ms", "loop_p99_ms"):
         columns[name] = np.ascontiguousarray(swept.results[name])
-    for number, joint in enumerate(JOINTS):
+    for number, joint in enumerate(JOINT_NAMES):
         columns[f"error_rms_{joint}"] = np.ascontiguousarray(swept.results["error_rms"][:, number])
     columns["spectral_radius"] = swept.radius
     return pa.table(columns)
@@ -55,7 +54,7 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
         "title": study.title,
         "study": study.model_dump(mode="json"),
         "software": f"hilrig {version('hilrig')}",
-        "machine": f"{platform.machine()} {platform.system()}, Python {platform.python_version()}",
+        "machine": machine_name(),
         "runs": len(swept.cells),
         "simulated_s": simulated_s,
         "seconds": swept.seconds,

@@ -20,7 +20,7 @@ from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
 from hilrig_runtime.config.validation import format_validation_error
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import JOINT_NAMES, RigParameters
+from hilrig_sim.arm.model import JOINT_NAMES, RigParameters, joints_si
 from hilrig_sim.parameters import rig_parameters
 from hilrig_study.controllers.control_laws import ComputedTorque, Controller, Pid
 from hilrig_study.controllers.lqr import PredictiveLqr
@@ -86,7 +86,13 @@ class MotionTaskConfig(Section):
 
     def scenario(self) -> Scenario:
         """Return the task in SI units."""
-        return Scenario(_si(self.pose), _si(self.offset), _si(self.amplitude), self.frequency_hz, _si(self.limit))
+        return Scenario(
+            joints_si(self.pose),
+            joints_si(self.offset),
+            joints_si(self.amplitude),
+            self.frequency_hz,
+            joints_si(self.limit),
+        )
 
 
 class ControllerConfig(Section):
@@ -292,7 +298,7 @@ class StudyConfig(Section):
         Raises:
             InputError: the pose is at or beyond a stop.
         """
-        return linearize(self.rig().arm, _si(self.task.pose))
+        return linearize(self.rig().arm, joints_si(self.task.pose))
 
     def discretized_plant(self, step_ms: float) -> tuple[Floats, Floats]:
         """Return Φ, (8, 8), and Γ, (8, 4), of the linear model, discretized as the study steps its plant.
@@ -322,8 +328,3 @@ def load_study(path: Path) -> StudyConfig:
     study.linear_plant()
     study.loop.timing()
     return study
-
-
-def _si(joints: Sequence[float]) -> tuple[float, float, float, float]:
-    theta1, theta2, d3, theta4 = joints
-    return math.radians(theta1), math.radians(theta2), d3 / 1e3, math.radians(theta4)

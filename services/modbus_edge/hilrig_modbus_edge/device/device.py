@@ -2,22 +2,23 @@
 
 The device does no I/O: clock and output port are passed in. A read shows one state of the simulation as a whole: the
 newest one when the read is executed. A write is published as one `TorqueCommand` before its response is sent. The
-owner calls `check` every few milliseconds, and at the deadline that was passed to `DeviceOutput.watch`.
+owner calls `check` every few milliseconds; the device schedules its own deadlines with `DeviceOutput.call_at`.
 """
 
 import random
-from collections.abc import Callable
 from typing import Final
 
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client, Host, address_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
+from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.device.session import Session
+from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
+from hilrig_modbus_edge.device.state_reader import StateReader
 from hilrig_modbus_edge.device.watchdog import WatchdogState
 from hilrig_modbus_edge.device.write_access import WriteAccess
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
@@ -35,7 +36,7 @@ from hilrig_modbus_edge.registers.map import (
     Status,
     struct_of,
 )
-from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.rate_limiter import repeat_suffix
 from hilrig_schemas import Event, LeaseStatus
@@ -56,21 +57,24 @@ class Device:
         settings: DeviceSettings,
         clock: Clock,
         output: DeviceOutput,
-        newest_state: Callable[[], TimestampedPayload | None],
+        states: LatestValueCache,
+        sender: CommandSender,
         rng: random.Random | None = None,
     ) -> None:
         self.rig = rig
         self.clients: set[Client] = set()
         self._hosts: dict[str, Host] = {}
         self._monotonic_ns = clock.monotonic_ns
-        self._state = StateImage()
-        self._events = EventEmitter(rig, output)
-        self._commands = CommandPublisher(rig, clock, output, settings.repeat_ns)
+        self._session = SessionState()
+        self._states = StateReader(rig, clock, output, states)
+        self._sender = sender
+        self._events = EventEmitter(rig, output, self._session, self._states.image)
+        self._commands = CommandPublisher(rig, clock, output, sender, self._session)
         self.impairment = ImpairmentController(
-            rig, settings.impairment, clock, output, self._commands, self._events, newest_state
+            rig, settings.impairment, clock, self._states, self._commands, self._events
         )
         self._write_access = WriteAccess(
-            rig, settings, clock, output, self._commands, self._events, rng, self.impairment.start_session
+            rig, settings, clock, output, self._commands, self.impairment, self._events, self._session, rng
         )
         self.lease = self._write_access.lease
         self.watchdog = self._write_access.watchdog
@@ -78,7 +82,7 @@ class Device:
     @property
     def session(self) -> Session | None:
         """The open session; None: none is open."""
-        return self._write_access.session
+        return self._session.current
 
     # -- connections
 
@@ -145,7 +149,7 @@ class Device:
         if table is RegisterTable.DISCRETE_INPUT:
             if address + count > DISCRETE_END:
                 raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-            self.refresh_state()
+            self._states.refresh()
             return (self._status(client) >> address) & ((1 << count) - 1)
         if count == 1 and address == MAGNET_COIL:
             return int(self._commands.magnet)
@@ -162,7 +166,7 @@ class Device:
         end = address + count
         if end > PAPER_END and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        if POSITION_ADDRESS < end <= PAPER_END and self.refresh_state().arrival is None:
+        if POSITION_ADDRESS < end <= PAPER_END and not self.has_state:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
 
     # -- writes
@@ -186,22 +190,22 @@ class Device:
         """
         end = address + len(words) // 2
         if end <= POSITION_ADDRESS:
-            fed_ns = self.watchdog.fed_ns
             self._write_access.authorize_write(client, arrived_ns)
             self._commands.torque[2 * address : 2 * end] = words
-            if not self._commands.publish_write(client, arrived_ns):
-                self._write_access.revert_watchdog_feed(fed_ns)
+            self._publish_write(client, arrived_ns)
             return
         self.check_writable(address, len(words) // 2)
-        timeout_ns = self.watchdog.timeout_ns
         if end == EXTENDED_END:
             timeout_ns = int.from_bytes(words[-2:], "big") * MS
             self._write_access.check_timeout(timeout_ns)
         self._write_access.authorize_write(client, arrived_ns)
         if address == ECHO_ADDRESS:
             self._commands.echo = int.from_bytes(words[:2], "big")
-        self._write_access.set_timeout(timeout_ns)
+        if end == EXTENDED_END:
+            self._write_access.set_timeout(timeout_ns)
+        # These are registers of the edge, so the emulated network does not drop the write.
         self._commands.publish_session()
+        self._write_access.feed_watchdog(client, arrived_ns)
 
     def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int) -> None:
         """Switch the magnet, or reset the rig.
@@ -211,29 +215,29 @@ class Device:
         """
         if address not in (MAGNET_COIL, RESET_COIL):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        fed_ns = self.watchdog.fed_ns
         self._write_access.authorize_write(client, arrived_ns)
+        if address == RESET_COIL and not on:
+            self._commands.publish_session()
+            self._write_access.feed_watchdog(client, arrived_ns)
+            return
         if address == MAGNET_COIL:
             self._commands.magnet = on
-        elif on:
-            self._commands.reset()
         else:
-            self._commands.publish_session()
-            return
-        if not self._commands.publish_write(client, arrived_ns):
-            self._write_access.revert_watchdog_feed(fed_ns)
+            self._commands.reset()
+        self._publish_write(client, arrived_ns)
+
+    def _publish_write(self, client: Client, arrived_ns: int) -> None:
+        """Publish the written registers; a command that the emulated network drops does not feed the watchdog."""
+        if self._commands.publish_write(client, arrived_ns):
+            self._write_access.feed_watchdog(client, arrived_ns)
 
     # -- time
 
     def check(self, now_ns: int) -> None:
         """Do everything that is due: trip, lease expiry, end of session, repetition, schedule; ns, monotonic clock."""
         self._write_access.check(now_ns)
-        self._commands.repeat_if_due(now_ns)
+        self._sender.repeat_if_due(now_ns)
         self.impairment.check(now_ns)
-
-    def send_due(self, now_ns: int) -> None:
-        """Publish the delayed commands that are due; ns, monotonic clock."""
-        self._commands.send_due(now_ns)
 
     def start(self) -> None:
         """Publish the first command, zero torque, and apply the impairment of lab.toml."""
@@ -251,12 +255,7 @@ class Device:
 
     def refresh_state(self) -> StateImage:
         """Update the register image to the newest state, without serving it to a client, and return the image."""
-        arrival = self.impairment.newest_state()
-        state = self._state
-        if arrival is not state.arrival and arrival is not None:
-            state.update(arrival)
-            self._events.step = state.step
-        return state
+        return self._states.refresh()
 
     # -- operator
 
@@ -279,7 +278,7 @@ class Device:
 
     def _serve_state(self, client: Client) -> StateImage:
         """Return the newest state and record that `client` is served it."""
-        state = self.refresh_state()
+        state = self._states.refresh()
         if state.arrival is None:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
         # The time is taken after the newest state was fetched: a state is never served before it arrived.
@@ -288,20 +287,20 @@ class Device:
 
     def _input_image(self, client: Client) -> bytes:
         state = self._serve_state(client)
-        holder = self.lease.holder
+        holder, session = self.lease.holder, self._session.current
         lease = 0 if holder is None else 1 if holder is client else 2
         return state.input_words(
             status=self._status(client),
             lease=lease,
             watchdog=self.watchdog.state,
             timeout_ms=self.watchdog.timeout_ns // MS,
-            session=0 if self.session is None else self.session.number,
+            session=0 if session is None else session.number,
             age_ms=(self._monotonic_ns() - state.arrived_ns) // MS,
         )
 
     def _status(self, client: Client) -> int:
-        status = self._state.status(self._monotonic_ns())
-        if self.session is not None:
+        status = self._states.image.status(self._monotonic_ns())
+        if self._session.current is not None:
             status |= Status.SESSION_OPEN
         holder = self.lease.holder
         if holder is not None:

@@ -4,7 +4,9 @@ from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
+from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 
@@ -15,17 +17,16 @@ LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
 class EventEmitter:
     """Emits the events of one rig."""
 
-    def __init__(self, rig: str, output: DeviceOutput) -> None:
-        self.session = ""
-        """Id of the open session; empty: none."""
-        self.step = 0
-        """Step of the newest received state."""
+    def __init__(self, rig: str, output: DeviceOutput, session: SessionState, image: StateImage) -> None:
         self._rig = rig
         self._output = output
+        self._session = session
+        self._image = image
 
     def event(self, kind: Event.Kind, severity: Event.Severity, text: str) -> Event:
         """Return a new event, to be completed and emitted."""
-        return Event(rig=self._rig, session=self.session, kind=kind, severity=severity, text=text, step=self.step)
+        session, step = self._session.id, self._image.step
+        return Event(rig=self._rig, session=session, kind=kind, severity=severity, text=text, step=step)
 
     def emit(self, event: Event) -> None:
         """Publish an event."""

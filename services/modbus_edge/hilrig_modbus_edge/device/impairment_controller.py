@@ -1,45 +1,39 @@
 """Applies the active network impairment to the state link and command link of one rig, and reports changes.
 
-Without an impairment, states are read where they are received and commands are published at once. Only the state link
-and the clients' commands are impaired; lease, watchdog and internal commands are not.
+Only the state link and the clients' commands are impaired; lease, watchdog and internal commands are not. Without an
+impairment, no part of it is called by a read or write.
 """
 
-from collections.abc import Callable
+from typing import Literal
 
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.events import EventEmitter
-from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.impairment.delay_line import DelayedStates
+from hilrig_modbus_edge.device.state_reader import StateReader
+from hilrig_modbus_edge.impairment.delay_line import ImpairmentSamples
 from hilrig_modbus_edge.impairment.model import Impairment, link_seed
 from hilrig_modbus_edge.impairment.schedule import ImpairmentSchedule
 from hilrig_runtime.config.impairment import ImpairmentConfig
-from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, ImpairmentStatus
 
 
 class ImpairmentController:
-    """Impairment of one rig: activates settings, follows the schedule, and provides the newest delivered state."""
+    """Impairment of one rig: activates settings and follows the schedule."""
 
     def __init__(
         self,
         rig: str,
         lab: ImpairmentConfig,
         clock: Clock,
-        output: DeviceOutput,
+        states: StateReader,
         commands: CommandPublisher,
         events: EventEmitter,
-        newest_state: Callable[[], TimestampedPayload | None],
     ) -> None:
-        self.newest_state = newest_state
-        """Return the newest state that the state link has delivered; None: none so far."""
         self._rig = rig
         self._monotonic_ns = clock.monotonic_ns
-        self._output = output
+        self._states = states
         self._commands = commands
         self._events = events
-        self._newest_received = newest_state
-        self._delayed_states: DelayedStates | None = None
         self._schedule = ImpairmentSchedule(lab)
 
     def start(self) -> None:
@@ -67,9 +61,9 @@ class ImpairmentController:
         """Follow the schedule; ns, monotonic clock."""
         if self._schedule.check(now_ns):
             self._apply()
-        if self._delayed_states is not None:
+        if self._states.delayed is not None:
             # Without readers, the received states must not accumulate.
-            self._delayed_states.newest(now_ns)
+            self._states.delayed.newest(now_ns)
 
     def status(self) -> ImpairmentStatus:
         """Return the active setting and its counters."""
@@ -81,43 +75,29 @@ class ImpairmentController:
             seed=schedule.seed,
             source=schedule.source,
         )
-        if self._delayed_states is not None:
-            line = self._delayed_states.line
-            status.states, status.states_lost, status.states_superseded = line.count, line.lost, line.superseded
-        commands = self._commands.delay_line
-        if commands is not None:
+        if self._states.delayed is not None:
+            states = self._states.delayed.line
+            status.states, status.states_lost, status.states_superseded = states.count, states.lost, states.superseded
+        if self._commands.delayed is not None:
+            commands = self._commands.delayed.line
             status.commands, status.commands_lost = commands.count, commands.lost
             status.commands_superseded = commands.superseded
         return status
 
     def _apply(self) -> None:
         schedule = self._schedule
-        links, seed = schedule.links, schedule.seed
-        if links.state.is_inactive:
-            self._remove_state_impairment()
-        else:
-            self._impair_states(Impairment(links.state, link_seed(seed, self._rig, "state")))
-        samples = None
-        if not links.command.is_inactive:
-            samples = Impairment(links.command, link_seed(seed, self._rig, "command")).samples()
-        self._commands.set_impairment(samples)
-        seed_text = "" if links.is_inactive else f", seed {seed}"
+        links = schedule.links
+        self._states.set_impairment(self._samples("state"))
+        self._commands.set_impairment(self._samples("command"))
+        seed_text = "" if links.is_inactive else f", seed {schedule.seed}"
         text = f"impairment of {self._rig}: {links.describe()}{seed_text} (source: {schedule.source})"
         event = self._events.event(Event.IMPAIRMENT_CHANGED, Event.INFO, text)
         event.configuration_data.text = links.model_dump_json()
         self._events.emit(event)
 
-    def _impair_states(self, impairment: Impairment) -> None:
-        if self._delayed_states is not None:
-            self._delayed_states.line.set_samples(impairment.samples())
-            return
-        # The last served state stays the newest one until the first state is delivered.
-        delayed = self._delayed_states = DelayedStates(impairment.samples(), self._newest_received())
-        self.newest_state = lambda: delayed.newest(self._monotonic_ns())
-        self._output.follow_states(delayed.arrive)
-
-    def _remove_state_impairment(self) -> None:
-        if self._delayed_states is not None:
-            self._delayed_states = None
-            self.newest_state = self._newest_received
-            self._output.follow_states(None)
+    def _samples(self, link: Literal["state", "command"]) -> ImpairmentSamples | None:
+        """Return the samples of a link; None: it is not impaired."""
+        settings = self._schedule.links.state if link == "state" else self._schedule.links.command
+        if settings.is_inactive:
+            return None
+        return Impairment(settings, link_seed(self._schedule.seed, self._rig, link)).samples()

@@ -1,20 +1,15 @@
-"""The output port of a device: commands, events and timers that its owner provides."""
+"""The output port of a device: events and timers that its owner provides."""
 
 from collections.abc import Callable
 from typing import Protocol
 
+from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
-from hilrig_schemas import Event, TorqueCommand
+from hilrig_schemas import Event
 
 
 class DeviceOutput(Protocol):
-    """Everything that a device sends, and the timers that it needs."""
-
-    def send_command(self, command: TorqueCommand) -> None:
-        """Publish a new command; the message object is reused after the call."""
-
-    def repeat_command(self, command: TorqueCommand) -> None:
-        """Publish the held command again, for subscribers that check its age."""
+    """Everything that a device needs beside its commands and states."""
 
     def emit(self, event: Event) -> None:
         """Publish an event."""
@@ -22,11 +17,8 @@ class DeviceOutput(Protocol):
     def sessions_changed(self) -> None:
         """Report that a session started or ended."""
 
-    def watch(self, deadline_ns: int) -> None:
-        """Schedule a call of `Device.check` at the watchdog's deadline; ns, monotonic clock."""
-
-    def send_at(self, deadline_ns: int) -> None:
-        """Schedule a call of `Device.send_due`: a delayed command is due at the deadline; ns, monotonic clock."""
+    def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> TimerHandle:
+        """Call `callback` at a time of the monotonic clock, ns."""
 
     def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
         """Call `arrive` with every received state, on any thread; None: stop calling it."""

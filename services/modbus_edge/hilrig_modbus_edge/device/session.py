@@ -33,3 +33,16 @@ class Session:
     def as_message(self) -> OpenSession:
         """Return the session as it is announced to the recorder."""
         return OpenSession(rig=self.rig, session=self.id, controller=self.controller, start_wall_ns=self.start_wall_ns)
+
+
+@dataclass(slots=True)
+class SessionState:
+    """The session state of a rig, shared by everything that names the session in its messages."""
+
+    current: Session | None = None
+    """The open session; None: none is open."""
+
+    @property
+    def id(self) -> str:
+        """Id of the open session; empty: none."""
+        return "" if self.current is None else self.current.id

@@ -1,21 +1,22 @@
 """Write access to a rig: lease, watchdog and session.
 
-The first client that writes acquires the lease. A write of the lease holder is accepted and feeds the watchdog. The
-lease expires a timeout after the holder's last request of any kind. A session starts with a lease and ends a grace
-time after it. Time is passed in or read from the given clock.
+The first client that writes acquires the lease. A write of the lease holder is accepted, and feeds the watchdog unless
+the emulated network drops it. The lease expires a timeout after the holder's last request of any kind. A session starts
+with a lease and ends a grace time after it. Time is passed in or read from the given clock.
 """
 
 import random
-from collections.abc import Callable
 from typing import Final, Generic, NoReturn, Protocol, TypeVar
 
 from pymodbus.constants import ExcCodes
 
+from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter
+from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.device.session import Session
+from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
@@ -71,19 +72,21 @@ class WriteAccess:
         clock: Clock,
         output: DeviceOutput,
         commands: CommandPublisher,
+        impairment: ImpairmentController,
         events: EventEmitter,
-        rng: random.Random | None = None,
-        on_session_start: Callable[[], None] = lambda: None,
+        session: SessionState,
+        rng: random.Random | None,
     ) -> None:
         self.lease: Lease[Client] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
-        self.session: Session | None = None
+        self._session = session
         self._rig = rig
         self._settings = settings
         self._monotonic_ns = clock.monotonic_ns
         self._wall_ns = clock.wall_ns
         self._output = output
         self._commands = commands
+        self._impairment = impairment
         self._events = events
         self._rng = random.SystemRandom() if rng is None else rng
         self._lease_events = LeaseEventReporter(rig, events)
@@ -91,16 +94,19 @@ class WriteAccess:
         self._last_writer = ""
         self._host_change_ns = 0
         """Earliest time at which another host may end a session, ns, monotonic clock."""
-        self._on_session_start = on_session_start
+        self._watchdog_timer: TimerHandle | None = None
 
     def authorize_write(self, client: Client, now_ns: int) -> None:
-        """Authorize a valid write and feed the watchdog; ns, monotonic clock.
+        """Authorize a valid write; ns, monotonic clock.
 
         Raises:
             ModbusError: 06 another client holds the lease, 01 the client is read-only.
         """
         if self.lease.holder is not client:
             self._acquire_lease(client, now_ns)
+
+    def feed_watchdog(self, client: Client, now_ns: int) -> None:
+        """Feed the watchdog with an authorized write that was not dropped; ns, monotonic clock."""
         watchdog = self.watchdog
         if watchdog.fed_ns is not None:
             watchdog.fed_ns = now_ns
@@ -110,15 +116,7 @@ class WriteAccess:
             event = self._events.event(Event.WATCHDOG_REARM, Event.INFO, text)
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._events.emit(event)
-        self._watch()
-
-    def revert_watchdog_feed(self, fed_ns: int | None) -> None:
-        """Undo the watchdog feed: the accepted write was dropped by the emulated network.
-
-        `fed_ns`: time of the feed before it; None: the watchdog was not armed, and stays armed by this write.
-        """
-        if fed_ns is not None:
-            self.watchdog.fed_ns = fed_ns
+        self._schedule_check()
 
     def check_timeout(self, timeout_ns: int) -> None:
         """Check a watchdog timeout that a client sets.
@@ -135,7 +133,7 @@ class WriteAccess:
     def set_timeout(self, timeout_ns: int) -> None:
         """Set the watchdog timeout; it counts from the last write."""
         self.watchdog.timeout_ns = timeout_ns
-        self._watch()
+        self._schedule_check()
 
     def on_disconnect(self, client: Client, reason: str) -> None:
         """Release the lease of a closed connection; its torque stays applied until the watchdog trips."""
@@ -150,7 +148,8 @@ class WriteAccess:
         self._lease_events.check(now_ns)
         if self.lease.expired(now_ns):
             self._release_lease(f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)")
-        if self.session is not None and self.session.expired(now_ns, self._settings.grace_ns):
+        session = self._session.current
+        if session is not None and session.expired(now_ns, self._settings.grace_ns):
             self._end_session("no lease holder for the grace time (edge.session_grace_ms)")
 
     def release(self, reason: str) -> str:
@@ -171,7 +170,7 @@ class WriteAccess:
         self._release_lease(reason)
         self.watchdog.disarm()
         self._commands.zero()
-        if self.session is not None:
+        if self._session.current is not None:
             self._end_session(reason)
         else:
             self._commands.publish_internal()
@@ -183,7 +182,7 @@ class WriteAccess:
             rig=self._rig,
             holder=self._holder,
             silent_ns=0 if holder is None else self._monotonic_ns() - holder.last_request_ns,
-            session="" if self.session is None else self.session.id,
+            session=self._session.id,
             watchdog_tripped=self.watchdog.tripped,
             watchdog_timeout_ns=self.watchdog.timeout_ns,
         )
@@ -195,7 +194,7 @@ class WriteAccess:
         return "" if holder is None else holder.address
 
     def _acquire_lease(self, client: Client, now_ns: int) -> None:
-        session = self.session
+        session = self._session.current
         if not client.may_write:
             reason = "read-only: the client certificate lacks the role operator; use a certificate with that role"
             self._deny(client, now_ns, reason, ExcCodes.ILLEGAL_FUNCTION)
@@ -225,22 +224,22 @@ class WriteAccess:
         holder = self.lease.release()
         if holder is None:
             return
-        if self.session is not None:
-            self.session.released_ns = self._monotonic_ns()
+        if self._session.current is not None:
+            self._session.current.released_ns = self._monotonic_ns()
         if not self._commands.has_torque:
             # There is no torque to stop.
             self.watchdog.disarm()
         self._lease_events.lease_released(holder, reason, disconnected=disconnected)
 
     def _start_or_continue_session(self, client: Client) -> None:
-        if self.session is not None:
-            self.session.released_ns = None
+        if self._session.current is not None:
+            self._session.current.released_ns = None
             return
         self._session_count += 1
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._rng)
-        self.session = Session(self._rig, identity, self._session_count, client.address, client.host, wall_ns)
-        self._commands.session = self._events.session = identity
+        number = self._session_count
+        self._session.current = Session(self._rig, identity, number, client.address, client.host, wall_ns)
         # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
         self._commands.echo = 0
@@ -249,10 +248,10 @@ class WriteAccess:
         event.session_data.reason = "lease acquired"
         self._events.emit(event)
         self._output.sessions_changed()
-        self._on_session_start()
+        self._impairment.start_session()
 
     def _end_session(self, reason: str) -> None:
-        session, self.session = self.session, None
+        session = self._session.current
         if session is None:
             return
         # The first command of the next session must not be based on a state that was read in this one.
@@ -261,7 +260,7 @@ class WriteAccess:
         event.session_data.controller = session.controller
         event.session_data.reason = reason
         # This command tells the simulation that the session has ended. It is a new one, because it has no session.
-        self._commands.session = self._events.session = ""
+        self._session.current = None
         self._commands.publish_internal()
         self._events.emit(event)
         self._output.sessions_changed()
@@ -285,7 +284,17 @@ class WriteAccess:
         event.watchdog_data.timeout_ns = self.watchdog.timeout_ns
         self._events.emit(event)
 
-    def _watch(self) -> None:
+    def _schedule_check(self) -> None:
+        """Schedule a check at the deadline of the watchdog.
+
+        Writes move the deadline, but not the timer, because there are too many of them.
+        """
+        if self._watchdog_timer is not None:
+            self._watchdog_timer.cancel()
         deadline_ns = self.watchdog.deadline_ns
         if deadline_ns is not None:
-            self._output.watch(deadline_ns)
+            self._watchdog_timer = self._output.call_at(deadline_ns, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self.check(self._monotonic_ns())
+        self._schedule_check()

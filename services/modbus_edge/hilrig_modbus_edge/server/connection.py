@@ -14,9 +14,9 @@ from pymodbus.constants import ExcCodes
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Request, decode_frames
-from hilrig_modbus_edge.protocol.pdu import exception_response, execute
 from hilrig_modbus_edge.registers.map import UNIT_IDS
 from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_modbus_edge.server.pdu import exception_response, execute
 from hilrig_runtime.counters import Counters
 
 BUFFER_BYTES: Final = 2048

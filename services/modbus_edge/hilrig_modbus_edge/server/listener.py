@@ -15,7 +15,7 @@ from hilrig_modbus_edge.server.connection import Connection
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import OperationError, listen_failure
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 
@@ -117,8 +117,7 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
-        # Python appends the address to the system's message.
-        reason = (error.strerror or str(error)).partition(" (while")[0]
+        reason = listen_failure(error)
         if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
             hint = "edge.host in lab.toml must be an address of this host"
         elif error.errno in (errno.EMFILE, errno.ENFILE):

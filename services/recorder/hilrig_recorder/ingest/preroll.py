@@ -23,7 +23,7 @@ class PreRollBuffer:
     publishers: dict[str, PublisherState] = field(default_factory=dict)
     """The current instance of each service that publishes messages of this rig, by source."""
     pending: list[bytes] = field(default_factory=list)
-    """Messages that are not in a block yet; always the same list object."""
+    """Encoded messages that are not in a block yet. `SessionTracker.accept` appends to this list object."""
     _blocks: deque[tuple[int, list[bytes]]] = field(default_factory=deque)
     _losses: deque[tuple[int, int, int]] = field(default_factory=deque)
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL, parse_message_header
+from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL
+from hilrig_recorder.mcap_format.records import decode_message_head
 
 SECOND_NS: Final = 1_000_000_000
 POSTROLL_NS: Final = SECOND_NS // 2
@@ -29,13 +30,6 @@ class LossCounters:
     """Wall clock steps during the session, on this machine or at a publisher."""
 
 
-class RecordingSink(Protocol):
-    """Destination of the messages of a recording: an open file."""
-
-    def write(self, records: Sequence[bytes], /) -> None:
-        """Write encoded messages. It must not raise: the sink handles write errors itself."""
-
-
 @dataclass(slots=True, eq=False)
 class Recording:
     """A session that is being recorded."""
@@ -49,9 +43,9 @@ class Recording:
     """Start of the session, wall clock of the owner, ns."""
     opened_ns: int
     """When the recording was opened, monotonic clock, ns."""
+    store: "RecordingStore" = field(repr=False)
+    """Has its file."""
     counters: LossCounters = field(default_factory=LossCounters)
-    sink: RecordingSink = field(init=False, repr=False)
-    """Its file; replaced at each rotation."""
     seen: set[tuple[int, int, int]] | None = None
     """(channel id, sequence, publish time) of messages in the previous segment; None: no duplicates are expected."""
     last: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -73,10 +67,10 @@ class Recording:
         if self.seen is not None or self.end_wall_ns is not None or not_before_ns:
             records = [record for record in records if self._accepts(record, not_before_ns)]
         if records:
-            self.sink.write(records)
+            self.store.write(self, records)
 
     def _accepts(self, record: bytes, not_before_ns: int) -> bool:
-        header = parse_message_header(record)
+        header = decode_message_head(record)
         if header.log_time < not_before_ns:
             return False
         if self.end_wall_ns is not None and header.publish_time > self.end_wall_ns + POSTROLL_NS:
@@ -101,11 +95,14 @@ class Recording:
 class RecordingStore(Protocol):
     """Storage of recordings; implemented by `storage.store.FileStore`."""
 
-    def open(self, recording: Recording) -> RecordingSink | None:
-        """Open the file of a recording; None: it must not or can't be recorded.
+    def open(self, recording: Recording) -> bool:
+        """Open the file of a recording; False: it must not or can't be recorded.
 
         It may set `recording.seen`, `recording.last` and `recording.horizon_ns`.
         """
+
+    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
+        """Write encoded messages to the file of a recording. It must not raise: the store handles write errors."""
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
         """Finish the file of a recording; `end` is a machine-readable cause, `reason` a sentence."""

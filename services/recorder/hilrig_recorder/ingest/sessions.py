@@ -22,7 +22,8 @@ from hilrig_recorder.ingest.sources import (
     PublisherState,
     PublisherTracker,
 )
-from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL, encode_message
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
+from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_schemas import Event, LogBatch
 from hilrig_schemas.topics import is_name, parse_rig_key
@@ -108,7 +109,7 @@ class SessionTracker:
                     self._record_loss(publisher, stream, missing, 0)
             stream.expected = sequence + 1
             channel_id = stream.channel_id
-            stream.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
+            stream.pending.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
             if channel_id == EVENT_CHANNEL:
                 self._handle_event(publisher, payload, publish_ns, now_ns)
         for key, dropped in received.dropped.items():
@@ -146,7 +147,7 @@ class SessionTracker:
         if not self._is_assigned(parsed.rig):
             return None
         rig = self._rig(parsed.rig, now_ns)
-        stream = KeyStream(key, rig.name, channel_id, 1 if publisher.restarted else 0, rig.pending.append)
+        stream = KeyStream(key, rig.name, channel_id, 1 if publisher.restarted else 0, rig.pending)
         publisher.streams[key] = stream
         if channel_id != EVENT_CHANNEL:
             publisher.continuous_rigs.add(rig.name)
@@ -233,12 +234,10 @@ class SessionTracker:
             self._reject(f"{owner}: session {session!r} of rig {rig_name!r} has an invalid name")
             return
         rig = self._rig(rig_name, now_ns)
-        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns)
-        sink = self._store.open(recording)
-        if sink is None:
+        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns, self._store)
+        if not self._store.open(recording):
             self._blocked_until[session] = now_ns + RETRY_PERIOD_NS
             return
-        recording.sink = sink
         self._recordings[session] = recording
         for publisher in rig.publishers.values():
             self._store.record_source(recording, publisher.name, publisher.incarnation)

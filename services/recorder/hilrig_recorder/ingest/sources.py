@@ -1,6 +1,6 @@
 """Tracks publishers: detects lost messages by sequence numbers, and wall clock steps by time stamps. Pure."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -23,8 +23,8 @@ class KeyStream:
     channel_id: int
     expected: int
     """Next sequence number; 0: unknown."""
-    append: Callable[[bytes], None]
-    """Adds a message to the pending messages of the rig."""
+    pending: list[bytes]
+    """The encoded messages of the rig that are not written yet: `PreRollBuffer.pending`."""
 
     def missing_before(self, sequence: int) -> int:
         """Number of messages missing before this one; negative: it is a duplicate."""

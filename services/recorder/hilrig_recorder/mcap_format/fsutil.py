@@ -1,8 +1,11 @@
-"""File system helpers: advisory file locks and durable renames."""
+"""File system helpers: mapped files, advisory file locks and durable renames."""
 
+import mmap
 import os
 import sys
 from pathlib import Path
+
+from hilrig_runtime.errors import InputError
 
 if sys.platform != "win32":
     import fcntl
@@ -37,3 +40,18 @@ def lock_file(descriptor: int) -> bool:
         # The file system does not support locks.
         return True
     return True
+
+
+def map_file(path: Path) -> memoryview:
+    """Map a file into memory.
+
+    Raises:
+        InputError: the file can't be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                return memoryview(b"")
+            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise InputError(f"{path}: can't be read: {error.strerror}") from error

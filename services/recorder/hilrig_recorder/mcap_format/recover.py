@@ -5,7 +5,6 @@ The original file is not changed before the new file is synced and renamed.
 
 import contextlib
 import errno
-import mmap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -13,19 +12,18 @@ from pathlib import Path
 from typing import Final
 
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, RECOVERING_SUFFIX
-from hilrig_recorder.mcap_format.fsutil import lock_file
+from hilrig_recorder.mcap_format.file_names import recovering_path
+from hilrig_recorder.mcap_format.fsutil import lock_file, map_file
+from hilrig_recorder.mcap_format.reader import buffer_reader
+from hilrig_recorder.mcap_format.records import MAGIC, Chunk, DamagedError, Message, encode_message
 from hilrig_recorder.mcap_format.scan import (
-    Chunk,
+    MAX_BEGIN_BYTES,
     Damage,
-    DamagedError,
-    Message,
     is_complete,
     read_chunk,
-    read_message_keys,
     scan,
+    session_metadata,
 )
 from hilrig_recorder.mcap_format.writer import LIBRARY, RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
@@ -34,7 +32,6 @@ _REASON_UNFINISHED: Final = (
     "the file was not finished: the recorder was killed, or the file was truncated; the last messages may be missing"
 )
 _REASON_DAMAGED: Final = "the summary of the file was damaged"
-_MAX_BEGIN_BYTES: Final = 64 * 1024
 
 
 @dataclass(slots=True)
@@ -73,21 +70,6 @@ class SegmentTail:
     """Arrival of the last message, wall clock, ns; 0: no message."""
 
 
-def map_file(path: Path) -> memoryview:
-    """Map a file into memory.
-
-    Raises:
-        InputError: the file can't be read.
-    """
-    try:
-        with path.open("rb") as file:
-            if path.stat().st_size == 0:
-                return memoryview(b"")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise InputError(f"{path}: can't be read: {error.strerror}") from error
-
-
 def read_tail(path: Path, tail_ns: int) -> SegmentTail:
     """Read how a file ended and the keys of its messages of the last `tail_ns`.
 
@@ -107,9 +89,10 @@ def read_tail(path: Path, tail_ns: int) -> SegmentTail:
     for chunk in chunks:
         if chunk.last_ns >= last_ns - tail_ns:
             with contextlib.suppress(DamagedError):
-                for key in read_message_keys(chunk):
-                    keys.add(key)
-                    last[key[0]] = key[1:]
+                for item in read_chunk(chunk):
+                    if isinstance(item, Message):
+                        keys.add((item.channel_id, item.sequence, item.publish_time))
+                        last[item.channel_id] = (item.sequence, item.publish_time)
     return SegmentTail(end, keys, last, last_ns)
 
 
@@ -119,10 +102,7 @@ def read_session_metadata(path: Path) -> dict[str, str]:
     Raises:
         InputError: the file can't be read.
     """
-    for _, item in scan(map_file(path)[:_MAX_BEGIN_BYTES]):
-        if isinstance(item, Metadata) and item.name == "hilrig.session":
-            return dict(item.metadata)
-    return {}
+    return session_metadata(map_file(path)[:MAX_BEGIN_BYTES])
 
 
 def recover(source: Path, path: Path, *, should_continue: Callable[[], bool] = lambda: True) -> Recovery:
@@ -137,6 +117,8 @@ def recover(source: Path, path: Path, *, should_continue: Callable[[], bool] = l
         InputError: `source` can't be read, is not an MCAP file, or is being written.
         OperationError: the new file can't be written, or `should_continue` returned False.
     """
+    if source.is_dir():
+        raise InputError(f"{source}: is a folder; give the MCAP files in it")
     with _locked(source):
         return _recover(source, path, should_continue)
 
@@ -149,7 +131,7 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
         return recovery
     if path.exists():
         raise OperationError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
-    temporary_path = path.with_name(path.name + RECOVERING_SUFFIX)
+    temporary_path = recovering_path(path)
     try:
         temporary_path.unlink(missing_ok=True)
         _Copier(view, recovery, finished).write(path, temporary_path, should_continue)
@@ -161,15 +143,16 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
 
 def _is_intact(view: memoryview, source: Path, should_continue: Callable[[], bool]) -> bool:
     """Whether a finished file has no damage: a defective disk may damage chunks and leave the end valid."""
-    for _, item in scan(view):
-        if isinstance(item, Damage):
-            return False
-        if isinstance(item, Chunk):
-            _check_interrupt(should_continue, source)
-            try:
-                read_chunk(item)
-            except DamagedError:
+    try:
+        buffer_reader(view).check_indexes()
+        for _, item in scan(view):
+            if isinstance(item, Damage):
                 return False
+            if isinstance(item, Chunk):
+                _check_interrupt(should_continue, source)
+                read_chunk(item)
+    except DamagedError:
+        return False
     return True
 
 
@@ -214,9 +197,9 @@ class _Copier:
         self._last_ns = 0
 
     def write(self, path: Path, temporary_path: Path, should_continue: Callable[[], bool]) -> None:
-        header = next((item for _, item in scan(self._view[:_MAX_BEGIN_BYTES]) if isinstance(item, Header)), None)
+        header = next((item for _, item in scan(self._view[:MAX_BEGIN_BYTES]) if isinstance(item, Header)), None)
         if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
-            if self._view[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+            if self._view[: len(MAGIC)] != MAGIC:
                 raise InputError(f"{self._recovery.source}: not an MCAP file (bad magic)")
             raise InputError(f"{self._recovery.source}: MCAP file without a complete record: nothing to recover")
         is_hilrig = header is not None and header.library == LIBRARY
@@ -247,7 +230,7 @@ class _Copier:
             elif isinstance(item, Message):
                 # A file with chunks has no messages outside them: this is a damaged record that resembles a message.
                 if is_hilrig or recovery.chunks:
-                    recovery.damaged_bytes += len(item.record)
+                    recovery.damaged_bytes += len(encode_message(*item))
                 else:
                     self._copy_message(writer, item)
             elif isinstance(item, Damage):
@@ -275,7 +258,7 @@ class _Copier:
         except DamagedError as damage:
             self._recovery.damaged_chunks += 1
             self._recovery.damaged_bytes += len(chunk.data)
-            self._recovery.reasons.append(f"chunk at {chunk.offset}: {damage}")
+            self._recovery.reasons.append(f"chunk at {chunk.offset}: {damage.problem}")
             return
         self._recovery.chunks += 1
 
@@ -283,7 +266,7 @@ class _Copier:
         if message.channel_id not in self._declared:
             self._recovery.orphans += 1
             return
-        writer.add(message.record)
+        writer.add(encode_message(*message))
         self._recovery.messages += 1
         self._last_ns = max(self._last_ns, message.log_time)
 
@@ -331,16 +314,3 @@ class _Copier:
                 **{name: str(count) for name, count in self._losses.items()},
             }
         return records
-
-
-def recovered_path(source: Path) -> Path:
-    """The default path of a recovered file: without `.part`, or with `.recovered` before the suffix.
-
-    Raises:
-        InputError: `source` is a folder.
-    """
-    if source.is_dir():
-        raise InputError(f"{source}: is a folder; give the MCAP files in it")
-    if source.name.endswith(PART_SUFFIX):
-        return source.with_name(source.name.removesuffix(PART_SUFFIX))
-    return source.with_name(f"{source.stem}.recovered{source.suffix or MCAP_SUFFIX}")

@@ -1,26 +1,18 @@
 """The summary section at the end of an MCAP file: indexes, statistics and checksum. Pure."""
 
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    DataEnd,
-    Footer,
-    McapRecord,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema, Statistics
 
-from hilrig_recorder.mcap_format.chunk import ChunkInfo
+from hilrig_recorder.mcap_format.records import (
+    ChunkInfo,
+    encode_chunk_index,
+    encode_data_end,
+    encode_records,
+    encode_summary,
+)
 
 
 @dataclass(slots=True)
@@ -39,27 +31,16 @@ class SummarySection:
             size: size of the file so far, bytes.
             chunks: the chunks in the file.
         """
-        data_end = encode_records(DataEnd(0))
-        start = size + len(data_end)
-        summary = bytearray()
-        offsets = bytearray()
-        groups: list[tuple[Opcode, bytes]] = [
-            (Opcode.SCHEMA, encode_records(*self.schemas)),
-            (Opcode.CHANNEL, encode_records(*self.channels)),
-            (Opcode.STATISTICS, encode_records(self._statistics(chunks))),
-            (Opcode.CHUNK_INDEX, b"".join(chunk.index_record() for chunk in chunks)),
-            (Opcode.ATTACHMENT_INDEX, encode_records(*self.attachments)),
-            (Opcode.METADATA_INDEX, encode_records(*self.metadata)),
-        ]
-        for opcode, records in groups:
-            if records:
-                offsets += encode_records(SummaryOffset(opcode.value, start + len(summary), len(records)))
-                summary += records
-        offset_start = start + len(summary)
-        summary += offsets
-        footer_head = struct.pack("<BQQQ", Opcode.FOOTER.value, 20, start, offset_start)
-        checksum = zlib.crc32(footer_head, zlib.crc32(summary))
-        return data_end + bytes(summary) + encode_records(Footer(start, offset_start, checksum)) + MCAP0_MAGIC
+        data_end = encode_data_end()
+        groups = {
+            Opcode.SCHEMA: encode_records(*self.schemas),
+            Opcode.CHANNEL: encode_records(*self.channels),
+            Opcode.STATISTICS: encode_records(self._statistics(chunks)),
+            Opcode.CHUNK_INDEX: b"".join(map(encode_chunk_index, chunks)),
+            Opcode.ATTACHMENT_INDEX: encode_records(*self.attachments),
+            Opcode.METADATA_INDEX: encode_records(*self.metadata),
+        }
+        return data_end + encode_summary(size + len(data_end), groups)
 
     def _statistics(self, chunks: Sequence[ChunkInfo]) -> Statistics:
         totals: dict[int, int] = {}
@@ -77,11 +58,3 @@ class SummarySection:
             metadata_count=len(self.metadata),
             schema_count=len(self.schemas),
         )
-
-
-def encode_records(*records: McapRecord) -> bytes:
-    """Encode records in the MCAP file format."""
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -14,21 +14,20 @@ from pathlib import Path
 from typing import Final
 
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
-from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.mcap_format.channels import CHANNELS, SCHEMAS
 from hilrig_recorder.mcap_format.chunk import (
     CHUNK_BYTES,
-    ChunkInfo,
     Compress,
     compressor,
     encode_chunk,
-    read_chunk_infos,
     split_into_chunks,
 )
 from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
-from hilrig_recorder.mcap_format.summary_section import SummarySection, encode_records
+from hilrig_recorder.mcap_format.reader import RecordReader
+from hilrig_recorder.mcap_format.records import MAGIC, ChunkInfo, DamagedError, encode_records
+from hilrig_recorder.mcap_format.summary_section import SummarySection
 
 LIBRARY: Final = "hilrig"
 
@@ -77,7 +76,7 @@ class RecordingWriter:
         self._summary = SummarySection()
         try:
             # One write: many files may be opened at once, and each file that exists states its session.
-            begin = MCAP0_MAGIC + encode_records(Header(profile, library), *schemas, *channels)
+            begin = MAGIC + encode_records(Header(profile, library), *schemas, *channels)
             self._append(begin + encode_records(*metadata))
         except OSError:
             self.discard()
@@ -108,7 +107,7 @@ class RecordingWriter:
         self._summary.channels.append(channel)
 
     def add(self, record: bytes) -> None:
-        """Add an encoded message (`channels.encode_message`). It is written when the chunk is full."""
+        """Add an encoded message (`records.encode_message`). It is written when the chunk is full."""
         if self._pending and self._pending_bytes + len(record) > CHUNK_BYTES:
             self.close_chunk()
         self._pending.append(record)
@@ -179,8 +178,8 @@ class RecordingWriter:
 
     def _chunks(self) -> list[ChunkInfo]:
         try:
-            return list(read_chunk_infos(self._read, len(MCAP0_MAGIC), self.size))
-        except ValueError as error:
+            return list(RecordReader(self._read, self.size).chunk_infos(len(MAGIC), self.size))
+        except DamagedError as error:
             raise OSError(errno.EIO, f"written data can't be read back: {error}") from error
         finally:
             self._file.seek(self.size)

@@ -12,14 +12,11 @@ import sys
 import time
 from collections.abc import Collection
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self
+from typing import IO, Any, Final
 
 from hilrig_recorder.mcap_format.fsutil import lock_file
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import OperationError, list_names
 
-MAX_NAMES_IN_MESSAGE: Final = 3
-"""Maximum number of rigs named in an error message."""
 _LOCKED_BYTE: Final = 1 << 20
 _ATTEMPTS: Final = 10
 _PAUSE_S: Final = 0.02
@@ -54,24 +51,14 @@ class FolderLock:
     def _refuse_shared(folder: Path, other: Path, rigs: Collection[str]) -> None:
         shared = sorted(set(rigs) & set(_read(other).get("rigs", ())))
         if shared:
-            names = ", ".join(shared[:MAX_NAMES_IN_MESSAGE])
-            if len(shared) > MAX_NAMES_IN_MESSAGE:
-                names += f" and {len(shared) - MAX_NAMES_IN_MESSAGE} more"
             raise OperationError(
-                f"{folder}: {_holder(other)} already records {names} in this folder; stop it, or assign other --rigs"
+                f"{folder}: {_holder(other)} already records {list_names(shared)} in this folder; "
+                "stop it, or assign other --rigs"
             )
 
     def close(self) -> None:
         """Release the lock."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _lock_with_retries(file: IO[str]) -> bool:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from hilrig_recorder.mcap_format.file_names import RECOVERING_SUFFIX, UNFINISHED_SUFFIX
-from hilrig_recorder.mcap_format.recover import recover, recovered_path
+from hilrig_recorder.mcap_format.file_names import RECOVERING_SUFFIX, UNFINISHED_SUFFIX, recovered_path
+from hilrig_recorder.mcap_format.recover import recover
 from hilrig_recorder.storage.retention import finished_recordings, select_expired
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.errors import HilrigError
@@ -93,7 +93,7 @@ class MaintenanceWorker:
                 return
             path = recovered_path(source)
             if path.exists():
-                path = path.with_name(f"{path.stem}.recovered{path.suffix}")
+                path = recovered_path(path)
             recovery = recover(source, path, should_continue=self._pause)
             if recovery.path is None:
                 # The file was finished, but not renamed.

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 
 DAY_S = 86_400
 
@@ -24,7 +24,7 @@ class StoredRecording:
 def finished_recordings(folder: Path) -> list[StoredRecording]:
     """The finished recordings in the folder of a lab: `<folder>/<rig>/<session>.mcap`."""
     found = []
-    for path in folder.glob(f"*/*{MCAP_SUFFIX}"):
+    for path in folder.glob(f"*/{MCAP_PATTERN}"):
         try:
             info = path.stat()
         except OSError:

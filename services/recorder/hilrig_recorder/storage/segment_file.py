@@ -18,7 +18,7 @@ MAX_LOSS_RECORDS: Final = 1000
 
 
 class SegmentFile:
-    """An open file of a recording; implements `ingest.recording.RecordingSink`.
+    """An open file of a recording.
 
     Args:
         recording: the recording.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX, part_path
+from hilrig_recorder.mcap_format.file_names import part_path, recording_name, segment_number
 from hilrig_recorder.mcap_format.recover import SegmentTail, read_tail
 from hilrig_runtime.errors import InputError
 
@@ -38,18 +38,18 @@ def next_segment(folder: Path, session: str, after: str = "") -> NextSegment:
     except FileNotFoundError:
         # The folder is created later.
         names = []
-    number = max(_number(name, session) for name in (*names, after))
-    previous = folder / segment_name(session, number) if number else None
-    return NextSegment(folder / segment_name(session, number + 1), number + 1, previous)
+    number = max(segment_number(name, session) for name in (*names, after))
+    previous = folder / recording_name(session, number) if number else None
+    return NextSegment(folder / recording_name(session, number + 1), number + 1, previous)
 
 
 def read_session_tail(folder: Path, session: str, number: int, tail_ns: int) -> SegmentTail:
     """Read the last `tail_ns` of a session, from segment `number` backward; after restarts, segments may be short."""
-    tail = _read_tail(folder / segment_name(session, number), tail_ns)
+    tail = _read_tail(folder / recording_name(session, number), tail_ns)
     last_ns = tail.last_ns
     while number > 1 and (not last_ns or last_ns - tail.last_ns < tail_ns):
         number -= 1
-        before = _read_tail(folder / segment_name(session, number), tail_ns)
+        before = _read_tail(folder / recording_name(session, number), tail_ns)
         last_ns = last_ns or before.last_ns
         reached_ns = before.last_ns or tail.last_ns
         tail = SegmentTail(tail.end, tail.keys | before.keys, {**before.last, **tail.last}, reached_ns)
@@ -68,20 +68,6 @@ def horizon_by_channel(tail: SegmentTail) -> dict[int, int]:
         horizon_ns[channel_id] = min(horizon_ns[channel_id] or publish_ns, publish_ns)
     horizon_ns[EVENT_CHANNEL] = 0
     return {channel_id: publish_ns or earliest for channel_id, publish_ns in horizon_ns.items()}
-
-
-def segment_name(session: str, number: int) -> str:
-    """File name of a segment; `number` counts from 1."""
-    return f"{session}{MCAP_SUFFIX}" if number == 1 else f"{session}.{number}{MCAP_SUFFIX}"
-
-
-def _number(name: str, session: str) -> int:
-    """Segment number of a file name; 0: not a segment of this session."""
-    stem = name.removesuffix(PART_SUFFIX).removesuffix(MCAP_SUFFIX)
-    if stem == session:
-        return 1
-    number = stem.removeprefix(f"{session}.")
-    return int(number) if number.isdecimal() and number != stem else 0
 
 
 def _read_tail(path: Path, tail_ns: int) -> SegmentTail:

@@ -2,14 +2,14 @@
 
 import errno
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Final
 
 from mcap.records import Metadata
 
-from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording, RecordingSink
+from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording
 from hilrig_recorder.mcap_format.channels import SCHEMA_VERSION
 from hilrig_recorder.mcap_format.chunk import compressor
 from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
@@ -94,19 +94,25 @@ class FileStore:
 
     # -- RecordingStore ---------------------------------------------------------------------------------------------
 
-    def open(self, recording: Recording) -> RecordingSink | None:
-        """Open the next segment of a recording; None: the session has ended, or the file can't be opened."""
+    def open(self, recording: Recording) -> bool:
+        """Open the next segment of a recording; False: the session has ended, or the file can't be opened."""
         folder = self.folder / recording.rig
         segment = self._next_segment(recording)
         if segment is None:
-            return None
+            return False
         if segment.previous is not None:
             tail = read_session_tail(folder, recording.session, segment.number - 1, self._repeated_ns)
             if tail.end == "ended":
-                return None
+                return False
             recording.seen, recording.last = tail.keys, tail.last
             recording.horizon_ns = horizon_by_channel(tail)
-        return None if self._reserve.is_exhausted else self._open(recording, segment)
+        return not self._reserve.is_exhausted and self._open(recording, segment) is not None
+
+    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
+        """Write encoded messages to the file of a recording."""
+        file = self._files.get(recording)
+        if file is not None:
+            file.write(records)
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
         """Finish the file of a recording in the background."""
@@ -237,7 +243,6 @@ class FileStore:
             file.opened_ns = self._clock.monotonic_ns()
             file.is_replaced = False
             return
-        recording.sink = following
         self._finish(file, "continued", f"the session continues in {following.writer.path.name}")
         recording.counters = LossCounters()
         for source, incarnation in file.sources:

@@ -11,15 +11,13 @@ from typing import Final
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, TrayParameters
+from hilrig_sim.arm.model import JOINT_NAMES, ArmParameters, RigParameters, SceneParameters, TrayParameters
 
 POINT_INERTIA: Final = 1e-12
 """Replaces the zero inertia of a point mass, kg·m²."""
 POINT_MASS: Final = 1e-9
 """Replaces the zero mass of the magnet, kg."""
 
-JOINTS: Final = ("theta1", "theta2", "d3", "theta4")
-"""Names of the joints, in joint order."""
 LINKS: Final = ("base", "link1", "link2", "quill", "tool")
 """Names of the links, from the base to the tool; the origin of `tool` is the tip."""
 
@@ -152,7 +150,7 @@ def _joint(
     origin: tuple[float, float, float],
     axis: tuple[float, float, float],
 ) -> None:
-    joint = SubElement(robot, "joint", name=JOINTS[index], type=kind)
+    joint = SubElement(robot, "joint", name=JOINT_NAMES[index], type=kind)
     SubElement(joint, "parent", link=LINKS[index])
     SubElement(joint, "child", link=LINKS[index + 1])
     SubElement(joint, "origin", xyz=_numbers(origin), rpy="0 0 0")

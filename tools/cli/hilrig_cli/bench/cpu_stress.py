@@ -1,7 +1,5 @@
 """CPU stress: processes that keep every processor busy while a lab runs."""
 
-import contextlib
-import os
 import subprocess
 import sys
 import threading
@@ -11,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 
 from hilrig_cli.local.supervisor import own_process_group
+from hilrig_runtime.process.shutdown import stop_with_stdin
 
 
 @contextmanager
@@ -33,20 +32,14 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
         process.stdin.close()
 
 
-def stress_forever() -> None:
+def stress_until_parent_ends() -> None:
     """Compute and move memory through the caches until standard input is closed, that is, the parent has ended."""
-
-    def watch_parent() -> None:
-        with contextlib.suppress(OSError):
-            while os.read(0, 4096):
-                pass
-        os._exit(0)
-
-    threading.Thread(target=watch_parent, name="parent-watch", daemon=True).start()
+    stopping = threading.Event()
+    stop_with_stdin(stopping)
     data = np.ones(1 << 20)
-    while True:
+    while not stopping.is_set():
         data = np.sqrt(data + 1.0)
 
 
 if __name__ == "__main__":
-    stress_forever()
+    stress_until_parent_ends()

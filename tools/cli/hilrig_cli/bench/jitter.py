@@ -25,6 +25,7 @@ from hilrig_cli.local.local_lab import running_lab
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import encode_frame
 from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS
+from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import measure
@@ -90,7 +91,7 @@ def measure_timing(
             round_trips_ns = _poll(lab, seconds, supervisor.poll, on_progress)
             elapsed_s, after_s = time.monotonic() - start_s, steal_time_s()
         stolen = None if before_s is None or after_s is None else (after_s - before_s) / (elapsed_s * processors)
-        recordings = list(Path(folder).rglob("*.mcap"))
+        recordings = list(Path(folder).rglob(MCAP_PATTERN))
         if len(recordings) != 1:
             raise OperationError("the session was not recorded: the lab stopped too early")
         return _evaluate(recordings[0], seconds, loaded, round_trips_ns, stolen)

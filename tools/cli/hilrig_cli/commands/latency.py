@@ -12,7 +12,6 @@ from hilrig_cli.options import AsJson
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hilrig_replay.analysis.distribution import Statistics
     from hilrig_replay.analysis.latency import LatencyReport
 
 
@@ -76,9 +75,6 @@ def latency(
         raise typer.Exit(1)
 
 
-COLUMNS = ("p50", "p95", "p99", "p999", "max", "mean", "std")
-
-
 def print_report(report: "LatencyReport") -> None:
     """Print the latency report of one run: a table, losses, findings and the verdict."""
     from rich.box import SIMPLE_HEAD
@@ -86,6 +82,7 @@ def print_report(report: "LatencyReport") -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = Console()
@@ -93,14 +90,14 @@ def print_report(report: "LatencyReport") -> None:
     # Without lines between the columns the table fits a terminal of 80 characters.
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("ms", no_wrap=True)
-    for column in COLUMNS:
-        table.add_column(column.replace("p999", "p99.9"), justify="right", no_wrap=True)
+    for title in STATISTICS_TITLES:
+        table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
-        table.add_row("loop", *_figures(report.loop_ms), style="bold", end_section=True)
+        table.add_row("loop", *report.loop_ms.cells(), style="bold", end_section=True)
         for stage in LOOP_STAGES:
-            table.add_row(f"  {stage.title}", *_figures(report.stages_ms[stage.key]))
+            table.add_row(f"  {stage.title}", *report.stages_ms[stage.key].cells())
         table.add_section()
-    table.add_row("tick lateness", *_figures(report.jitter_ms.tick_lateness))
+    table.add_row("tick lateness", *report.jitter_ms.tick_lateness.cells())
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
     lost = f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
@@ -138,7 +135,3 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
         note = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
         if note:
             console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))
-
-
-def _figures(statistics: "Statistics") -> list[str]:
-    return [f"{getattr(statistics, column):.3f}" for column in COLUMNS]

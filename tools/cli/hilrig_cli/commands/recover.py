@@ -29,9 +29,8 @@ def recover(
     import json
     from dataclasses import asdict
 
-    from hilrig_recorder.mcap_format.file_names import PART_SUFFIX
+    from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, recovered_path
     from hilrig_recorder.mcap_format.recover import recover as recover_file
-    from hilrig_recorder.mcap_format.recover import recovered_path
     from hilrig_runtime.errors import InputError
 
     if output is not None and len(files) > 1:

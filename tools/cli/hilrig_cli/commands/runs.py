@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AsJson, Config, format_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -153,6 +153,8 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     from rich.console import Console
     from rich.table import Table
 
+    from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+
     if not entries:
         print(f"no matching recordings in {folder}" if read else f"no recordings in {folder}")
         return
@@ -174,10 +176,10 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
         lost = _lost(entry)
         start = _date(entry.start_wall_ns, "%Y-%m-%d %H:%M:%S")
         table.add_row(
-            Path(entry.path).name.removesuffix(".mcap"),
+            Path(entry.path).name.removesuffix(MCAP_SUFFIX),
             *([entry.rig, start] if wide else []),
             _duration(entry.duration_s),
-            _size(entry.size),
+            format_size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
             f"[red]{lost}[/]" if lost else "0",
@@ -210,14 +212,6 @@ def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-def _size(size: float) -> str:
-    for unit in ("B", "KiB", "MiB"):
-        if size < 1024:
-            return f"{size:.0f} {unit}"
-        size /= 1024
-    return f"{size:.1f} GiB"
 
 
 def _number(value: float | None) -> str:

@@ -13,6 +13,7 @@ from typing import Final
 
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_cli.local.local_lab import bind_error
+from hilrig_cli.options import format_size
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.timing.realtime import set_short_slice
 
@@ -115,7 +116,7 @@ def check_disk(lab: LabConfig) -> Iterator[CheckResult]:
     free = shutil.disk_usage(existing).free
     reserve = lab.recorder.min_free_mib * 2**20
     hours = max(0.0, free - reserve) / (BYTES_PER_RIG_HOUR * len(lab.rigs))
-    text = f"{_size(free)} free for recordings in {folder}"
+    text = f"{format_size(free)} free for recordings in {folder}"
     if free <= reserve:
         text += f": recording stops below recorder.min_free_mib ({lab.recorder.min_free_mib} MiB)"
         yield CheckResult.error("disk", text, "delete old recordings")
@@ -124,10 +125,6 @@ def check_disk(lab: LabConfig) -> Iterator[CheckResult]:
         yield CheckResult.warning("disk", f"{text}, enough for about {hours:.1f} h of this lab", fix)
     else:
         yield CheckResult.ok("disk", text)
-
-
-def _size(bytes_: int) -> str:
-    return f"{bytes_ / 2**30:.1f} GiB" if bytes_ >= 2**30 else f"{bytes_ >> 20} MiB"
 
 
 def _all_restricted(lab: LabConfig) -> bool:

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from hilrig_cli.local.local_lab import POLL_S, bind_error, running_lab
 from hilrig_cli.local.supervisor import own_process_group
+from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
@@ -100,7 +101,7 @@ def run_demo(
     with running_lab(lab, config, log, stopping) as supervisor:
         log(f"running {CONTROLLER} for {duration_s or DURATION_S:g} s over Modbus TCP at {lab.edge.host}:{_port(lab)}")
         result = _run_controller(lab, config, duration_s, supervisor.poll, on_progress)
-    found = sorted(recordings.rglob("*.mcap"))
+    found = sorted(recordings.rglob(MCAP_PATTERN))
     if not found:
         raise OperationError(f"{recordings}: no recording: did the controller connect? Its output: {result or 'none'}")
     return DemoRun(found[-1], result)

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.summary import RunSummary, Trajectory, summarize, under_command
+from hilrig_replay.io.columns import JointValues, joint_values
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 
 MOTION_THRESHOLD: Final = (0.01, 0.01, 0.005, 0.01)
 """Minimum speed of a moving joint; rad/s, rad/s, m/s, rad/s."""
 MIN_OVERLAP_S: Final = 0.1
-
-JointValues = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +170,11 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
     return Difference(
         session=other.session,
         overlap_s=float(high - low),
-        position_rms=_four(np.sqrt((position**2).mean(axis=0))),
-        position_max=_four(np.abs(position).max(axis=0)),
+        position_rms=joint_values(np.sqrt((position**2).mean(axis=0))),
+        position_max=joint_values(np.abs(position).max(axis=0)),
         tool_rms_mm=float(np.sqrt((apart_mm**2).mean())),
         tool_max_mm=float(apart_mm.max()),
-        effort_rms=_four(np.sqrt((effort**2).mean(axis=0))),
+        effort_rms=joint_values(np.sqrt((effort**2).mean(axis=0))),
         loop_p50_ms=None if mine is None or its is None else its.p50 - mine.p50,
         loop_p99_ms=None if mine is None or its is None else its.p99 - mine.p99,
     )
@@ -183,7 +182,3 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
 
 def _at(trajectory: Trajectory, values: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.interp(at, trajectory.time_s, column) for column in values.T], axis=1)
-
-
-def _four(values: NDArray[np.float64]) -> JointValues:
-    return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))

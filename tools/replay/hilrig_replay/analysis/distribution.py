@@ -5,7 +5,7 @@ requested ranks are collected and sorted. Means and standard deviations are merg
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +34,10 @@ class Statistics:
     mean: float
     std: float
 
+    def cells(self) -> list[str]:
+        """The values as text, in the order of `STATISTICS_TITLES`."""
+        return [f"{value:.3f}" for value in astuple(self)]
+
     @classmethod
     def of(cls, values_ns: NDArray[np.int64] | Blocks) -> "Statistics":
         """Compute the statistics of values in ns: an array of shape (n,), or blocks; n ≥ 1."""
@@ -56,6 +60,10 @@ class Statistics:
             mean=mean / 1e6,
             std=float(np.sqrt(squares / count)) / 1e6,
         )
+
+
+STATISTICS_TITLES: Final = tuple(field.name.replace("p999", "p99.9") for field in fields(Statistics))
+"""Column titles of the fields of `Statistics`."""
 
 
 def percentiles(blocks: Blocks, shares: Sequence[float], *, max_sorted: int = MAX_SORTED_VALUES) -> Floats:

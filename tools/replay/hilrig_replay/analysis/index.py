@@ -7,21 +7,18 @@ is only a cache: it can be deleted at any time and is rebuilt from the files.
 import contextlib
 import json
 import os
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
-from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Final
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Metadata, MetadataIndex, Statistics
-from mcap.writer import MCAP0_MAGIC
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, UNFINISHED_SUFFIX
+from hilrig_recorder.mcap_format.reader import NoMcapError, RecordReader, TruncatedError, file_reader
+from hilrig_recorder.mcap_format.records import DamagedError, decode_record
+from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.recording_file import DamagedRecordingError
 from hilrig_replay.io.run import open_run
@@ -33,10 +30,6 @@ VERDICT_SUFFIX: Final = ".verified"
 """Suffix of the file next to a recording with the result of `hilrig verify`."""
 IN_PROGRESS: Final = "recording"
 """Value of `RunEntry.ended` for a recording that is being written."""
-
-_HEAD: Final = struct.Struct("<BQ")
-_FOOTER: Final = struct.Struct("<BQQQI")
-_TAIL_BYTES: Final = 64 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,14 +159,18 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
     try:
         with path.open("rb") as stream:
             if relative.endswith(UNFINISHED_SUFFIX):
-                return _unfinished_entry(blank, stream)
-            return _finished_entry(blank, stream, info.st_size)
+                entry = _with_session(blank, session_metadata(stream.read(MAX_BEGIN_BYTES)))
+                return replace(entry, ended=IN_PROGRESS, reason="being written, or not yet recovered")
+            return _finished_entry(blank, file_reader(stream))
     except OSError as error:
         return replace(blank, error=f"can't be read: {error.strerror}")
-    except _UnusableError as error:
+    except NoMcapError as error:
         return replace(blank, error=str(error))
-    except (McapError, struct.error, ValueError, KeyError, IndexError) as error:
-        return replace(blank, error=f"damaged ({error or type(error).__name__}): run `hilrig recover`")
+    except TruncatedError as error:
+        return replace(blank, error=f"{error}: run `hilrig recover` to complete it")
+    except (DamagedError, ValueError) as error:
+        # Metadata has no checksum: a damaged number is a ValueError.
+        return replace(blank, error=f"damaged ({error}): run `hilrig recover`")
 
 
 def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
@@ -215,10 +212,6 @@ def read_verdict(path: Path) -> bool | None:
         return None
 
 
-class _UnusableError(Exception):
-    """A file that can't be used as a recording; the text is the defect."""
-
-
 def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     waiting = [""]
     while waiting:
@@ -239,39 +232,21 @@ def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
                 continue
 
 
-def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
-    magic = len(MCAP0_MAGIC)
-    if size == 0:
-        raise _UnusableError("the file is empty")
-    if stream.read(magic) != MCAP0_MAGIC:
-        raise _UnusableError("not an MCAP file (bad magic)")
-    tail_size = min(size, _TAIL_BYTES)
-    stream.seek(size - tail_size)
-    tail = stream.read(tail_size)
-    footer_size = _FOOTER.size
-    if tail[-magic:] != MCAP0_MAGIC or len(tail) < magic + footer_size:
-        raise _UnusableError("truncated (no footer): run `hilrig recover` to complete it")
-    opcode, _, summary_start, _, checksum = _FOOTER.unpack_from(tail, len(tail) - magic - footer_size)
-    if opcode != Opcode.FOOTER.value or not 0 < summary_start < size:
-        raise _UnusableError("no summary section: run `hilrig recover` to add it")
-    if summary_start < size - tail_size:
-        stream.seek(summary_start)
-        summary = stream.read(size - summary_start)
-    else:
-        summary = tail[summary_start - size :]
-    if checksum not in (0, zlib.crc32(summary[: -magic - 4])):
-        raise _UnusableError("damaged (bad checksum of the summary section): run `hilrig recover`")
+def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
+    summary = reader.summary()
     statistics: Statistics | None = None
     metadata_index: dict[str, MetadataIndex] = {}
-    for opcode, content in _records(summary[: -magic - footer_size]):
-        if opcode == Opcode.STATISTICS.value:
-            statistics = Statistics.read(ReadDataStream(BytesIO(content)))
-        elif opcode == Opcode.METADATA_INDEX.value:
-            position = MetadataIndex.read(ReadDataStream(BytesIO(content)))
-            metadata_index[position.name] = position
+    for record in reader.summary_records(summary) if summary.start else ():
+        # Chunk indexes are most of the summary section of a long recording, and are not used here.
+        if record.opcode in (Opcode.STATISTICS, Opcode.METADATA_INDEX):
+            item = decode_record(record.opcode, record.content, record.offset)
+            if isinstance(item, Statistics):
+                statistics = item
+            elif isinstance(item, MetadataIndex):
+                metadata_index[item.name] = item
     if statistics is None:
-        raise _UnusableError("no statistics record: run `hilrig recover` to add it")
-    session, trailer = (_metadata(stream, metadata_index.get(name)) for name in ("hilrig.session", "hilrig.summary"))
+        return replace(blank, error="no summary section with statistics: run `hilrig recover` to add it")
+    session, trailer = (_metadata(reader, metadata_index.get(name)) for name in ("hilrig.session", "hilrig.summary"))
     written = int(trailer.get("messages", 0)) if "hilrig.recovered" in metadata_index else 0
     entry = _with_session(blank, session)
     return replace(
@@ -291,19 +266,6 @@ def _finished_entry(blank: RunEntry, stream: IO[bytes], size: int) -> RunEntry:
     )
 
 
-def _unfinished_entry(blank: RunEntry, stream: IO[bytes]) -> RunEntry:
-    """Entry of a file that is being written, or whose recorder was killed: from the session metadata at its start."""
-    head = stream.read(_TAIL_BYTES)
-    session: dict[str, str] = {}
-    for opcode, content in _records(head[len(MCAP0_MAGIC) :]):
-        if opcode == Opcode.METADATA.value:
-            metadata = Metadata.read(ReadDataStream(BytesIO(content)))
-            if metadata.name == "hilrig.session":
-                session = metadata.metadata
-                break
-    return replace(_with_session(blank, session), ended=IN_PROGRESS, reason="being written, or not yet recovered")
-
-
 def _with_session(blank: RunEntry, session: dict[str, str]) -> RunEntry:
     return replace(
         blank,
@@ -316,21 +278,6 @@ def _with_session(blank: RunEntry, session: dict[str, str]) -> RunEntry:
     )
 
 
-def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while len(data) - at >= _HEAD.size:
-        opcode, length = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
-        if at + length > len(data):
-            return
-        # Skipped, because chunk indexes are most of the summary section of a long recording and are not used here.
-        if opcode != Opcode.CHUNK_INDEX.value:
-            yield opcode, data[at : at + length]
-        at += length
-
-
-def _metadata(stream: IO[bytes], position: MetadataIndex | None) -> dict[str, Any]:
-    if position is None:
-        return {}
-    stream.seek(position.offset + _HEAD.size)
-    return dict(Metadata.read(ReadDataStream(BytesIO(stream.read(position.length - _HEAD.size)))).metadata)
+def _metadata(reader: RecordReader, index: MetadataIndex | None) -> dict[str, str]:
+    record = None if index is None else reader.indexed_record(index)
+    return dict(record.metadata) if isinstance(record, Metadata) else {}

@@ -1,6 +1,6 @@
 """Summary of a run, computed in one pass: latency, motion, events, grade, and a downsampled trajectory for plots."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
 from types import SimpleNamespace
 from typing import Any, Final
@@ -15,10 +15,11 @@ from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.grade import Grade, Grader
 from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
 from hilrig_replay.grading.task_loading import recorded_task
-from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.columns import JointValues, Rows, joint_values
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.task import TaskConfig
+from hilrig_schemas import Event
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, RigParameters
 
@@ -39,9 +40,9 @@ class Motion:
     """Maximum speed of the tool, m/s."""
     work_j: float
     """Mechanical work of the drives, |effort · velocity| integrated over time and summed over the joints, J."""
-    peak_effort: tuple[float, float, float, float]
+    peak_effort: JointValues
     """Largest magnitude of the applied effort; N·m, N·m, N, N·m."""
-    saturated_share: tuple[float, float, float, float]
+    saturated_share: JointValues
     """Share of the steps with the effort at the limit of its register, by joint, 0 to 1."""
 
 
@@ -76,8 +77,10 @@ class RunSummary:
     ended: str
     latency: LatencyReport
     motion: Motion
-    events: dict[str, int]
-    """Number of events by kind."""
+    events: dict[str, dict[str, int]]
+    """Number of events by kind and severity."""
+    alarms: int
+    """Number of events of severity WARNING and above."""
     placement: PlacementReport | None
     """Placement of the parts at the end of the run; None: the scene has no parts or no places."""
     grade: Grade | None
@@ -102,6 +105,7 @@ class RunSummary:
             "latency": self.latency.as_dict(),
             "motion": asdict(self.motion),
             "events": self.events,
+            "alarms": self.alarms,
             "parts_placed": None if self.placement is None else self.placement.placed,
             "largest_placing_error_mm": None if self.placement is None else self.placement.largest_error_mm,
             "grade": None if self.grade is None else self.grade.as_dict(),
@@ -131,7 +135,8 @@ def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
         ended=run.ended,
         latency=latency,
         motion=collector.motion(),
-        events=dict(sorted(collector.events.items())),
+        events={kind: dict(sorted(counts.items())) for kind, counts in sorted(collector.events.items())},
+        alarms=collector.alarms,
         placement=collector.placement(),
         grade=collector.grade(),
         box_ms=_box_ms(latency),
@@ -172,16 +177,19 @@ class _Collector:
         self._peak, self._saturated = np.zeros(4), np.zeros(4)
         self._poses: dict[str, Any] = {}
         self._held = ""
-        self.events: Counter[str] = Counter()
+        self.events: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self.alarms = 0
         self.torques = TorqueSketch()
 
     def add(self, block: Records) -> None:
-        self.events.update(block.events["kind"].tolist())
+        for event in block.events:
+            self.events[event["kind"]][event["severity"]] += 1
+            self.alarms += event["message"].severity >= Event.WARNING
         names = self._run.names
         written = block.commands[(block.commands["controller"] != names.code("")) & ~block.commands["safe"]]
         self.torques.add(written["effort"])
         if self._grader is not None:
-            dropped = block.events[block.events["kind"] == "PART_DROPPED"]
+            dropped = block.events[block.events["kind"] == Event.Kind.Name(Event.PART_DROPPED)]
             for event, time_s in zip(dropped, self._run.time_s(dropped), strict=True):
                 self._grader.add_drop(event["message"].part_data.part, float(time_s))
         for row in _last_of_each_part(block.parts):
@@ -226,8 +234,8 @@ class _Collector:
             tool_path_m=self._path,
             top_speed=self._top_speed,
             work_j=self._work,
-            peak_effort=_four(self._peak),
-            saturated_share=_four(self._saturated / max(self._seen, 1)),
+            peak_effort=joint_values(self._peak),
+            saturated_share=joint_values(self._saturated / max(self._seen, 1)),
         )
 
     def placement(self) -> PlacementReport | None:
@@ -250,7 +258,3 @@ class _Collector:
 def _last_of_each_part(parts: Rows) -> list[np.void]:
     codes, last = np.unique(parts["part"][::-1], return_index=True)
     return [parts[len(parts) - 1 - at] for at in last[: len(codes)]]
-
-
-def _four(values: Floats) -> tuple[float, float, float, float]:
-    return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))

@@ -15,9 +15,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Rows, StringTable
+from hilrig_replay.io.columns import JointValues, Rows, StringTable, joint_values
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
+from hilrig_schemas import Event
 from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.plant.world import NO_PART
@@ -52,9 +53,9 @@ class Verification:
     """Position and velocity of all compared states are bit-identical to the recording."""
     tolerance: float
     """Allowed deviation; rad, m, rad/s, m/s."""
-    largest_deviation: tuple[float, float, float, float]
+    largest_deviation: JointValues
     """Largest position deviation of each joint; rad, rad, m, rad."""
-    largest_velocity_deviation: tuple[float, float, float, float]
+    largest_velocity_deviation: JointValues
     """Largest velocity deviation of each joint; rad/s, rad/s, m/s, rad/s."""
     largest_part_deviation: float
     """Largest deviation of the center of a part, m."""
@@ -144,7 +145,9 @@ class _Resimulation:
         self._parameters = parameters
         self._tolerance = tolerance
         events = (block.events for block in run.blocks(frozenset({"event"})))
-        self._resets = [int(step) for rows in events for step in rows["step"][rows["kind"] == "RESET"]]
+        self._resets = [
+            int(step) for rows in events for step in rows["step"][rows["kind"] == Event.Kind.Name(Event.RESET)]
+        ]
         self._before: tuple[Rows, Rows] | None = None
         self._probe, self._unfinished = Plant([parameters]), Plant([parameters])
         self._continues = False
@@ -177,8 +180,8 @@ class _Resimulation:
             gaps=self._gaps,
             exact=self._exact,
             tolerance=self._tolerance,
-            largest_deviation=_four(self._largest),
-            largest_velocity_deviation=_four(self._largest_velocity),
+            largest_deviation=joint_values(self._largest),
+            largest_velocity_deviation=joint_values(self._largest_velocity),
             largest_part_deviation=self._largest_part,
             first_diverging_step=self._first,
             machine=machine,
@@ -296,8 +299,3 @@ def _first_part_rows(states: Rows, parts: Rows, count: int) -> Ints:
         if row is not None:
             found[row] = begin
     return found
-
-
-def _four(values: Floats) -> tuple[float, float, float, float]:
-    first, second, third, fourth = values.tolist()
-    return first, second, third, fourth

@@ -15,13 +15,14 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hilrig_recorder.mcap_format.channels import encode_message, file_descriptor_set
+from hilrig_recorder.mcap_format.channels import file_descriptor_set
+from hilrig_recorder.mcap_format.records import Message as RecordedMessage
+from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import Rows, StringTable
-from hilrig_replay.io.recording_file import RawMessage
 from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
 from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
@@ -142,7 +143,7 @@ def export_foxglove(run: Run, path: Path) -> Path:
                     writer.add_attachment(
                         item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
                     )
-                _copy(run, writer, visualization, {channel.topic: channel.id for channel in summary.channels.values()})
+                _copy(run, writer, visualization)
                 writer.finish()
                 if writer.dropped_count:
                     raise OperationError(f"{path}: can't be written: no space left on device")
@@ -155,17 +156,17 @@ def export_foxglove(run: Run, path: Path) -> Path:
     return path
 
 
-def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization", channel_ids: dict[str, int]) -> None:
+def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization") -> None:
     messages = run.file.messages(ALL_TOPICS)
     while block := list(islice(messages, BLOCK_ROWS)):
-        visualization.prepare(block)
-        for topic, sequence, log_ns, publish_ns, payload in block:
-            channel_id = channel_ids[f"/{topic}"]
-            writer.add(encode_message(channel_id, sequence, log_ns, publish_ns, payload))
+        visualization.prepare(message for message in block if run.file.topics[message.channel_id] == "state")
+        for message in block:
+            writer.add(encode_message(*message))
+            topic = run.file.topics[message.channel_id]
             if topic == "state":
-                visualization.add_state(log_ns)
+                visualization.add_state(message.log_time)
             elif topic == "event":
-                visualization.add_event(log_ns, Event.FromString(payload))
+                visualization.add_event(message.log_time, Event.FromString(message.data))
 
 
 class _Visualization:
@@ -198,12 +199,11 @@ class _Visualization:
         self._state_count = 0
         self._poses: Iterator[Any] = iter(())
 
-    def prepare(self, messages: Iterable[RawMessage]) -> None:
+    def prepare(self, state_messages: Iterable[RecordedMessage]) -> None:
         """Compute the joint frames of the next states at once."""
         decoder = Decoder(StringTable(), Timebase())
-        for topic, sequence, log_ns, _, payload in messages:
-            if topic == "state":
-                decoder.add(topic, payload, sequence, log_ns)
+        for _, sequence, log_time, _, payload in state_messages:
+            decoder.add("state", payload, sequence, log_time)
         states = decoder.drain().states
         frames = (joint.transforms(states["position"][:, number]) for number, joint in enumerate(self._arm.joints))
         self._poses = zip(states["wall_ns"].tolist(), *(zip(*both, strict=True) for both in frames), strict=True)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
 
-from hilrig_replay.io.recording_file import RawMessage, RecordingFile
+from hilrig_recorder.mcap_format.records import Message
+from hilrig_replay.io.recording_file import RecordingFile
 from hilrig_replay.io.run import Run
 from hilrig_runtime.bus.api import Bus, Publisher
 from hilrig_runtime.errors import InputError
@@ -34,7 +35,8 @@ class ScheduledMessage:
     """Time since the start of playback, ns."""
     repetition: int
     """Number of previous complete playbacks."""
-    message: RawMessage
+    topic: str
+    message: Message
 
 
 class Player:
@@ -62,7 +64,7 @@ class Player:
         first = next(iter(self._ordered(None)), None)
         if first is None:
             raise InputError(f"{file.path}: nothing to play: no messages of the topics {', '.join(sorted(topics))}")
-        self.origin_ns = first.publish_ns + round(start_s * 1e9)
+        self.origin_ns = first.publish_time + round(start_s * 1e9)
         """Publication time at which playback starts, ns, wall clock of the sender."""
         if next(iter(self._ordered(self.origin_ns)), None) is None:
             raise InputError(f"{file.path}: the recording ends before {start_s:g} s")
@@ -72,22 +74,22 @@ class Player:
         for number in count():
             last_ns = 0
             for message in self._ordered(self.origin_ns):
-                last_ns = round((message.publish_ns - self.origin_ns) / self._speed)
-                yield ScheduledMessage(offset_ns + last_ns, number, message)
+                last_ns = round((message.publish_time - self.origin_ns) / self._speed)
+                yield ScheduledMessage(offset_ns + last_ns, number, self._file.topics[message.channel_id], message)
             if not self._loop:
                 return
             # A minimum interval: the repetitions of a recording of one message must not all be due at once.
             offset_ns += max(last_ns, 1_000_000) + round(1_000_000 / self._speed)
 
-    def _ordered(self, from_publish_ns: int | None) -> Iterator[RawMessage]:
+    def _ordered(self, from_publish_ns: int | None) -> Iterator[Message]:
         """Messages in order of publication; only those within the reorder window are held in memory."""
-        buffer: list[tuple[int, int, RawMessage]] = []
+        buffer: list[tuple[int, int, Message]] = []
         from_log_ns = None if from_publish_ns is None else self._earliest_arrival(from_publish_ns)
         for number, message in enumerate(self._file.messages(self._topics, from_ns=from_log_ns)):
-            if from_publish_ns is not None and message.publish_ns < from_publish_ns:
+            if from_publish_ns is not None and message.publish_time < from_publish_ns:
                 continue
-            heapq.heappush(buffer, (message.publish_ns, number, message))
-            while buffer[0][0] < message.publish_ns - _REORDER_WINDOW_NS:
+            heapq.heappush(buffer, (message.publish_time, number, message))
+            while buffer[0][0] < message.publish_time - _REORDER_WINDOW_NS:
                 yield heapq.heappop(buffer)[2]
         while buffer:
             yield heapq.heappop(buffer)[2]
@@ -112,7 +114,7 @@ def publish_recording(
             wait_ns = start_ns + scheduled.offset_ns - clock.monotonic_ns()
             if stopping.wait(wait_ns * 1e-9) if wait_ns > 0 else stopping.is_set():
                 break
-            name, payload = scheduled.message.topic, scheduled.message.payload
+            name, payload = scheduled.topic, scheduled.message.data
             topic = RECORDED[name]
             if name not in publishers:
                 rig = player.rig if rename is None else rename

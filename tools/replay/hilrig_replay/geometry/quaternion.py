@@ -27,9 +27,14 @@ def rotate(quaternion: Floats, vectors: Floats) -> Floats:
     return np.asarray(vectors + 2 * np.cross(u, np.cross(u, vectors) + w * vectors))
 
 
+def about_z(angles: float | Floats) -> Floats:
+    """Quaternions, (…, 4), of rotations about z by angles, (…), rad."""
+    zero, half = np.zeros_like(angles), np.asarray(angles) / 2
+    return np.stack((zero, zero, np.sin(half), np.cos(half)), axis=-1)
+
+
 def from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """Quaternion, (4,), of a URDF's `rpy` angles, rad: rotations about the fixed axes x, y and z, in this order."""
     about_x = np.array([np.sin(roll / 2), 0.0, 0.0, np.cos(roll / 2)])
     about_y = np.array([0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2)])
-    about_z = np.array([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
-    return multiply(about_z, multiply(about_y, about_x))
+    return multiply(about_z(yaw), multiply(about_y, about_x))

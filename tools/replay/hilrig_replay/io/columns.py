@@ -22,6 +22,9 @@ from hilrig_schemas import JointState, TorqueCommand
 Rows: TypeAlias = NDArray[np.void]
 """A structured array: one row per message, fields by name."""
 
+JointValues: TypeAlias = tuple[float, float, float, float]
+"""One number a joint."""
+
 _STRUCT_CODES: Final = {
     "<i8": "q",
     "<u8": "Q",
@@ -55,6 +58,7 @@ STATE_DTYPE: Final = np.dtype(
         ("missed_steps", "<u4"),
         ("sequence", "<u4"),
         ("limit_flags", "<u2"),
+        ("substeps", "<u2"),
         ("session", "<u2"),
         ("held_part", "<u2"),
         ("magnet", "|b1"),
@@ -112,11 +116,14 @@ PART_DTYPE: Final = np.dtype(
         ("y", "<f8"),
         ("z", "<f8"),
         ("yaw", "<f8"),
+        ("vx", "<f8"),
+        ("vy", "<f8"),
+        ("vz", "<f8"),
         ("part", "<u2"),
         ("held", "|b1"),
     ]
 )
-"""One row per `PartState` in a state: center of the part (world, m) and yaw (rad); `part` is a code of a
+"""One row per `PartState` in a state: center (world, m), yaw (rad) and velocity (m/s) of the part; `part` is a code of a
 `StringTable`."""
 
 
@@ -240,6 +247,7 @@ def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> De
             message.missed_steps,
             sequence,
             message.limit_flags,
+            message.substeps,
             code(message.session),
             code(held_part) if held_part else 0,
             message.magnet,
@@ -247,7 +255,17 @@ def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> De
         )
         for part in message.parts:
             add_part(
-                message.step, message.wall_ns, part.x, part.y, part.z, part.yaw, code(part.name), part.name == held_part
+                message.step,
+                message.wall_ns,
+                part.x,
+                part.y,
+                part.z,
+                part.yaw,
+                part.vx,
+                part.vy,
+                part.vz,
+                code(part.name),
+                part.name == held_part,
             )
 
     return decode
@@ -297,3 +315,9 @@ def _vector(packed: bytes) -> bytes:
 def concatenate_rows(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     """Concatenate arrays; shape (sum of their lengths,)."""
     return np.concatenate(pieces) if pieces else np.empty(0, dtype)
+
+
+def joint_values(values: NDArray[np.float64]) -> JointValues:
+    """Return an array of shape (4,) as numbers of Python."""
+    theta1, theta2, d3, theta4 = values.tolist()
+    return theta1, theta2, d3, theta4

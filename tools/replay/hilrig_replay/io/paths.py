@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN, MCAP_SUFFIX
 from hilrig_runtime.errors import InputError
 
 
@@ -17,7 +17,7 @@ def find_recordings(given: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for path in given:
         if path.is_dir():
-            in_folder = sorted(path.rglob(f"*{MCAP_SUFFIX}"))
+            in_folder = sorted(path.rglob(MCAP_PATTERN))
             if not in_folder:
                 raise InputError(f"{path}: this folder contains no recording ({MCAP_SUFFIX})")
             found.extend(in_folder)

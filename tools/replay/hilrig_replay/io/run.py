@@ -221,10 +221,13 @@ class Run:
             InputError: the file is damaged.
         """
         decoder = Decoder(self.names, self.timebase)
+        topic_of = self.file.topics
         count = 0
         try:
-            for topic, sequence, log_ns, _, payload in self.file.messages(topics, from_ns=from_ns, until_ns=until_ns):
-                decoder.add(topic, payload, sequence, log_ns)
+            for channel_id, sequence, log_ns, _, payload in self.file.messages(
+                topics, from_ns=from_ns, until_ns=until_ns
+            ):
+                decoder.add(topic_of[channel_id], payload, sequence, log_ns)
                 count += 1
                 if count >= rows:
                     count = 0

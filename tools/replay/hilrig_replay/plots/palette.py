@@ -12,7 +12,17 @@ RUN_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#72b7b2", "#ee
 """Colors of compared runs, and of controllers."""
 SEVERITY_COLORS: Final = {"INFO": "#9aa5b1", "WARNING": "#f2b134", "ERROR": "#e45756"}
 EVENT_COLORS: Final = {"PART_PICKED": "#6fd08c", "PART_DROPPED": "#eeca3b", "LIMIT_HIT": "#b279a2"}
-"""Colors of event kinds in plots; all other kinds have the color of their severity."""
+"""Colors of event kinds; all other kinds have the color of their severity."""
+
+
+def event_title(kind: str) -> str:
+    """Name of an event kind in reports and in the viewer."""
+    return kind.replace("_", " ").lower()
+
+
+def severity_color(severity: str) -> str:
+    """Color of a severity; a severity of a later version has that of INFO."""
+    return SEVERITY_COLORS.get(severity, SEVERITY_COLORS["INFO"])
 
 
 def rgb(color: str) -> tuple[int, int, int]:

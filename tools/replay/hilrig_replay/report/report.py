@@ -7,7 +7,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_replay.analysis.distribution import Statistics
+from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
@@ -19,15 +19,12 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
-from hilrig_replay.plots.palette import EFFORT_SYMBOLS
+from hilrig_replay.plots.palette import EFFORT_SYMBOLS, event_title
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.process.process_pool import process_pool
 
-_COLUMNS: Final = ("p50", "p95", "p99", "p999", "max", "mean", "std")
-ALARM_KINDS: Final = ("WATCHDOG_TRIP", "COMMAND_LOST", "OVERRUN", "LEASE_REFUSED")
-"""Event kinds that count as alarms in the overview."""
 _MIN_RUNS_FOR_PROCESSES: Final = 4
 """Fewer runs take less time than the start of worker processes."""
 
@@ -278,24 +275,28 @@ def _latency(summary: RunSummary) -> str:
     latency = summary.latency
     rows = []
     if latency.loop_ms is not None:
-        rows.append(["loop", *_statistics_cells(latency.loop_ms)])
-        rows += [[stage.title, *_statistics_cells(latency.stages_ms[stage.key])] for stage in LOOP_STAGES]
-    rows.append(["tick lateness", *_statistics_cells(latency.jitter_ms.tick_lateness)])
+        rows.append(["loop", *latency.loop_ms.cells()])
+        rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in LOOP_STAGES]
+    rows.append(["tick lateness", *latency.jitter_ms.tick_lateness.cells()])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
         else f'<p class="bad">Not valid for latency measurements: {escape("; ".join(latency.reasons))}.</p>'
     )
     findings = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
-    table = _table(["ms", *(column.replace("p999", "p99.9") for column in _COLUMNS)], rows)
+    table = _table(["ms", *STATISTICS_TITLES], rows)
     return f"{table}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
 
 
 def _events(summary: RunSummary) -> str:
     if not summary.events:
         return "<p>No events.</p>"
-    rows = [[kind.replace("_", " ").lower(), str(count)] for kind, count in summary.events.items()]
-    return _table(["event", "count"], rows)
+    rows = [
+        [event_title(kind), severity.lower(), str(count)]
+        for kind, counts in summary.events.items()
+        for severity, count in counts.items()
+    ]
+    return _table(["event", "severity", "count"], rows)
 
 
 def _overview(pages: Sequence[_Page]) -> str:
@@ -313,7 +314,7 @@ def _overview(pages: Sequence[_Page]) -> str:
                 f"{summary.motion.tool_path_m:.2f}",
                 f"{summary.motion.work_j:.1f}",
                 f"{max(summary.motion.saturated_share):.1%}",
-                str(sum(summary.events.get(kind, 0) for kind in ALARM_KINDS)),
+                str(summary.alarms),
                 "yes" if summary.latency.fit else "no",
             ]
         )
@@ -358,10 +359,6 @@ def _rank(page: _Page) -> tuple[float, ...]:
         return (1.0, 0.0, 0.0, 0.0, path_m)
     error = task.largest_error_mm
     return (1.0, -task.placed, 0.0, float("inf") if error is None else error, path_m)
-
-
-def _statistics_cells(statistics: Statistics) -> list[str]:
-    return [f"{getattr(statistics, column):.3f}" for column in _COLUMNS]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

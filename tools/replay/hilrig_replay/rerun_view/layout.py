@@ -7,6 +7,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind as _Kind
 
+from hilrig_replay.rerun_view import entity_paths as paths
+from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
+
 SIM_TIME: Final = "sim_time"
 WALL: Final = "wall"
 STEP: Final = "step"
@@ -32,17 +35,17 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
     ]
     scene = rrb.Spatial3DView(
         name="Arm",
-        origin=_path(roots[0], "scene") if len(roots) == 1 else "/",
-        contents=[f"+ {path}/**" for root in roots for path in (_path(root, "scene"), f"/{arm_path(root)}")],
+        origin=entity_path(roots[0], paths.SCENE) if len(roots) == 1 else "/",
+        contents=[f"+ {path}/**" for root in roots for path in (entity_path(root, paths.SCENE), f"/{arm_path(root)}")],
         background=rrb.Background(color=_BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=_CAMERA_POSITION, look_target=_CAMERA_TARGET, eye_up=(0.0, 0.0, 1.0)
         ),
-        overrides={_path(root, "scene/trail"): [rrb.VisibleTimeRanges(trail)] for root in roots},
+        overrides={entity_path(root, paths.TRAIL): [rrb.VisibleTimeRanges(trail)] for root in roots},
     )
 
-    def plot(name: str, *paths: str, legend: bool = True) -> rrb.TimeSeriesView:
+    def plot(name: str, *shown: str, legend: bool = True) -> rrb.TimeSeriesView:
         window = rrb.VisibleTimeRange(
             SIM_TIME,
             start=rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S),
@@ -51,7 +54,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         return rrb.TimeSeriesView(
             name=name,
             origin="/",
-            contents=[f"+ {_path(root, path)}/**" for root in roots for path in paths],
+            contents=[f"+ {entity_path(root, path)}/**" for root in roots for path in shown],
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
             axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
             time_ranges=[window] if live else None,
@@ -61,7 +64,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         rrb.TextLogView(
             name="Events",
             origin="/",
-            contents=[f"+ {_path(root, 'events')}/**" for root in roots],
+            contents=[f"+ {entity_path(root, paths.EVENTS)}/**" for root in roots],
             columns=rrb.TextLogColumns(
                 timeline_columns=[SIM_TIME],
                 text_log_columns=[_Kind.LogLevel, _Kind.Body] if len(roots) == 1 else list(_Kind),
@@ -70,19 +73,21 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         rrb.StateTimelineView(
             name="States",
             origin="/",
-            contents=[f"+ {_path(root, 'states')}/**" for root in roots],
+            contents=[f"+ {entity_path(root, paths.STATES)}/**" for root in roots],
         ),
     )
     plots = rrb.Vertical(
         # With several runs, color identifies the run: a legend in one plot is enough.
-        plot("Joint positions (θ in °, d3 in mm)", "position", legend=len(roots) == 1),
+        plot("Joint positions (θ in °, d3 in mm)", paths.POSITION, legend=len(roots) == 1),
         # Event markers are only in plots without a legend, where each kind would take a line.
-        plot("Joint velocities (θ in °/s, d3 in mm/s) and events", "velocity", "markers", legend=False),
-        plot("Joint efforts (τ1, τ2, τ4 in N·m; τ3 in N; thin: commanded)", "effort", legend=False),
-        plot("Loop latency by stage, ms", "stages") if len(roots) == 1 else plot("Loop latency, ms", "loop"),
+        plot("Joint velocities (θ in °/s, d3 in mm/s) and events", paths.VELOCITY, paths.EVENT_MARKERS, legend=False),
+        plot("Joint efforts (τ1, τ2, τ4 in N·m; τ3 in N; thin: commanded)", paths.EFFORT, legend=False),
+        plot("Loop latency by stage, ms", paths.LATENCY_STAGES)
+        if len(roots) == 1
+        else plot("Loop latency, ms", paths.LOOP_LATENCY),
         rrb.Tabs(
-            plot("Tick lateness, ms, and events", "lateness", "markers", legend=False),
-            plot("Modbus requests per second", "modbus"),
+            plot("Tick lateness, ms, and events", paths.TICK_LATENESS, paths.EVENT_MARKERS, legend=False),
+            plot("Modbus requests per second", paths.MODBUS),
         ),
         row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
     )
@@ -99,12 +104,3 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
-
-
-def arm_path(root: str) -> str:
-    """Entity path of a rig's URDF; rerun's URDF loader accepts a path of one element only."""
-    return f"{root}_arm" if root else "arm"
-
-
-def _path(root: str, path: str) -> str:
-    return f"/{root}/{path}" if root else f"/{path}"

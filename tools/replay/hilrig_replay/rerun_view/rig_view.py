@@ -21,6 +21,7 @@ from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_replay.analysis.samples import CommandMatcher, join_commands
 from hilrig_replay.analysis.stages import LOOP_STAGES
+from hilrig_replay.geometry.quaternion import about_z
 from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
@@ -32,10 +33,13 @@ from hilrig_replay.plots.palette import (
     JOINT_SYMBOLS,
     PALE_JOINT_COLORS,
     RUN_COLORS,
-    SEVERITY_COLORS,
+    event_title,
     rgb,
+    severity_color,
 )
-from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL, arm_path
+from hilrig_replay.rerun_view import entity_paths as paths
+from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
+from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.model import JOINT_SCALE, PartParameters, RigParameters
 from hilrig_sim.arm.urdf import urdf
@@ -51,7 +55,6 @@ _MIN_TARGET_RADIUS_M: Final = 0.004
 _YAW_ARROW_LENGTH_M: Final = 0.04
 _UNKNOWN_PART_COLOR: Final = "#c8ccd0"
 _UNKNOWN_PART_SIZE_M: Final = (0.03, 0.03, 0.03)
-_OTHER_EVENT_COLOR: Final = "#9aa5b1"
 _NOT_IN_PATH: Final = re.compile(r"[^\w.-]")
 """Characters that an entity path must not contain."""
 _REQUEST_COLORS: Final = dict(zip(KINDS, ("#4c78a8", "#f58518", "#e45756"), strict=True))
@@ -118,22 +121,22 @@ class RerunRigWriter:
     # -- static entities --------------------------------------------------------------------------------------------
 
     def _write_scene(self) -> None:
-        self._static("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._static(paths.SCENE, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         scene = self._geometry.parameters.scene
         self._write_arm(self._geometry.arm)
         for part in scene.parts:
             self._place_part(part)
         outline = workspace_outline(self._geometry.parameters.arm, scene.table_height + 0.002)
         trail = rgb(self._color or _TRAIL_COLOR)
-        self._static("scene/trail", rr.LineStrips3D.from_fields(colors=[trail], radii=[0.002]))
-        self._static("scene/workspace", rr.LineStrips3D(outline, colors=[rgb(_WORKSPACE_COLOR)], radii=[0.0012]))
+        self._static(paths.TRAIL, rr.LineStrips3D.from_fields(colors=[trail], radii=[0.002]))
+        self._static(paths.WORKSPACE, rr.LineStrips3D(outline, colors=[rgb(_WORKSPACE_COLOR)], radii=[0.0012]))
         if self._geometry.task is not None:
             self._write_task(self._geometry.task)
 
     def _write_task(self, task: TaskConfig) -> None:
         for pose in task.poses:
             at = [length / 1000 for length in pose.position_mm]
-            path, color = f"scene/task/{pose.name}", rgb(_TASK_COLOR)
+            path, color = f"{paths.TASK}/{pose.name}", rgb(_TASK_COLOR)
             radius = max(pose.tolerance_mm / 1000, _MIN_TARGET_RADIUS_M)
             self._static(path, rr.Points3D([at], radii=[radius], colors=[color], labels=[pose.name]))
             if pose.yaw_deg is not None:
@@ -142,7 +145,7 @@ class RerunRigWriter:
                 self._static(f"{path}/yaw", rr.Arrows3D(origins=[at], vectors=[arrow], radii=[0.001], colors=[color]))
         if task.path is not None:
             points = np.array(task.path.points_mm) / 1000
-            self._static("scene/task/path", rr.LineStrips3D([points], radii=[0.0015], colors=[rgb(_TASK_COLOR)]))
+            self._static(paths.TASK_PATH, rr.LineStrips3D([points], radii=[0.0015], colors=[rgb(_TASK_COLOR)]))
 
     def _write_arm(self, arm: ArmGeometry) -> None:
         path = arm_path(self._root)
@@ -159,21 +162,21 @@ class RerunRigWriter:
         tree.log_urdf_to_recording(self._stream)
         # The URDF uses named frames, all other entities use the path tree: this attaches the arm's root to the scene.
         self._static(
-            "scene/arm_root",
-            rr.Transform3D(parent_frame=f"tf#/{self._path('scene')}", child_frame=frames + arm.root),
+            paths.ARM_ROOT,
+            rr.Transform3D(parent_frame=f"tf#{entity_path(self._root, paths.SCENE)}", child_frame=frames + arm.root),
         )
         self._frames = frames
         for link, number, shape in arm.primitives:
-            paths = tree.get_visual_geometry_paths(link)
-            if number < len(paths):
+            visuals = tree.get_visual_geometry_paths(link)
+            if number < len(visuals):
                 # By default rerun draws primitives as transparent shapes with edges.
                 archetype: Any = {"box": rr.Boxes3D, "cylinder": rr.Cylinders3D, "sphere": rr.Ellipsoids3D}[shape]
                 # With several arms in one scene, movable links have the color of their run.
                 colors = None if self._color is None or link == arm.root else [rgb(self._color)]
-                self._stream.log(paths[number], archetype.from_fields(fill_mode="solid", colors=colors), static=True)
+                self._stream.log(visuals[number], archetype.from_fields(fill_mode="solid", colors=colors), static=True)
 
     def _place_part(self, part: PartParameters) -> None:
-        path = f"scene/parts/{part.name}"
+        path = f"{paths.PARTS}/{part.name}"
         self._known_parts.add(part.name)
         color = rgb(part.colour)
         if part.shape == "cylinder":
@@ -184,20 +187,20 @@ class RerunRigWriter:
             half = tuple(length / 2 for length in part.size)
             shape = rr.Boxes3D(half_sizes=[half], colors=[color], fill_mode="solid")
         self._static(path, shape)
-        self._static(path, rr.Transform3D(translation=part.position, rotation=_about_z(part.yaw)))
+        self._static(path, rr.Transform3D(translation=part.position, rotation=rr.Quaternion(xyzw=about_z(part.yaw))))
 
     def _write_legends(self) -> None:
-        self._legend("position", JOINT_SYMBOLS, JOINT_COLORS)
-        self._legend("velocity", JOINT_SYMBOLS, JOINT_COLORS)
-        self._legend("effort/commanded", [f"{name} commanded" for name in EFFORT_SYMBOLS], PALE_JOINT_COLORS, 0.8)
-        self._legend("effort/applied", [f"{name} applied" for name in EFFORT_SYMBOLS], JOINT_COLORS)
+        self._legend(paths.POSITION, JOINT_SYMBOLS, JOINT_COLORS)
+        self._legend(paths.VELOCITY, JOINT_SYMBOLS, JOINT_COLORS)
+        self._legend(paths.COMMANDED_EFFORT, [f"{name} commanded" for name in EFFORT_SYMBOLS], PALE_JOINT_COLORS, 0.8)
+        self._legend(paths.APPLIED_EFFORT, [f"{name} applied" for name in EFFORT_SYMBOLS], JOINT_COLORS)
         ends = ["state sampled", *(f"+ {stage.title}" for stage in LOOP_STAGES)]
         ends[-1] += " = loop"
-        self._legend("stages", ends, [_BASELINE_COLOR, *(stage.color for stage in LOOP_STAGES)])
-        self._legend("loop", ["loop latency"], ["#e0e4e8"])
+        self._legend(paths.LATENCY_STAGES, ends, [_BASELINE_COLOR, *(stage.color for stage in LOOP_STAGES)])
+        self._legend(paths.LOOP_LATENCY, ["loop latency"], ["#e0e4e8"])
         self._state_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
         self._state_legend("part", {part.name: part.colour for part in self._geometry.parameters.scene.parts})
-        self._legend("lateness", ["tick lateness"], ["#e45756"])
+        self._legend(paths.TICK_LATENESS, ["tick lateness"], ["#e45756"])
 
     def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
         shades = [rgb(color) for color in colors] if self._color is None else [rgb(self._color)] * len(names)
@@ -207,7 +210,7 @@ class RerunRigWriter:
 
     def _state_legend(self, name: str, colors: Mapping[str, str]) -> None:
         shades = [rgb(color) for color in colors.values()]
-        self._static(f"states/{name}", rr.StateConfiguration(values=list(colors), colors=shades))
+        self._static(f"{paths.STATES}/{name}", rr.StateConfiguration(values=list(colors), colors=shades))
 
     # -- time-dependent entities ------------------------------------------------------------------------------------
 
@@ -235,10 +238,10 @@ class RerunRigWriter:
     def _add_states(self, states: Rows) -> None:
         times = self._times(states)
         q = np.ascontiguousarray(states["position"])
-        self._scalars("position", times, q * JOINT_SCALE)
-        self._scalars("velocity", times, states["velocity"] * JOINT_SCALE)
-        self._scalars("effort/applied", times, states["effort"])
-        self._scalars("lateness", times, tick_lateness_ns(states, self._geometry.step_ns)[:, None] / 1e6)
+        self._scalars(paths.POSITION, times, q * JOINT_SCALE)
+        self._scalars(paths.VELOCITY, times, states["velocity"] * JOINT_SCALE)
+        self._scalars(paths.APPLIED_EFFORT, times, states["effort"])
+        self._scalars(paths.TICK_LATENESS, times, tick_lateness_ns(states, self._geometry.step_ns)[:, None] / 1e6)
         self._add_pose(times, q)
         self._add_state("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._add_state("part", states, self._names.texts(states["held_part"]))
@@ -253,13 +256,13 @@ class RerunRigWriter:
                 parent_frame=[self._frames + joint.parent] * len(values),
                 child_frame=[self._frames + joint.child] * len(values),
             )
-            self._send(f"scene/joints/{joint.name}", times, columns)
+            self._send(f"{paths.JOINTS}/{joint.name}", times, columns)
         points = tool_positions(self._geometry.parameters.arm, q)
         before = points[:1] if self._last_tip is None else self._last_tip
         # One array: with a list of strips rerun takes thirty times as long.
         segments: Any = np.stack((np.concatenate((before, points[:-1])), points), axis=1)
         self._last_tip = points[-1:]
-        self._send("scene/trail", times, rr.LineStrips3D.columns(strips=segments))
+        self._send(paths.TRAIL, times, rr.LineStrips3D.columns(strips=segments))
 
     def _add_parts(self, parts: Rows) -> None:
         for code in np.unique(parts["part"]):
@@ -270,30 +273,28 @@ class RerunRigWriter:
                     name, "box", _UNKNOWN_PART_SIZE_M, 0.1, True, _UNKNOWN_PART_COLOR, (0.0, 0.0, 0.0), 0.0
                 )
                 self._place_part(unknown)
-            half = rows["yaw"] / 2
-            zero = np.zeros(len(rows))
             self._send(
-                f"scene/parts/{name}",
+                f"{paths.PARTS}/{name}",
                 self._times(rows),
                 rr.Transform3D.columns(
                     translation=np.stack((rows["x"], rows["y"], rows["z"]), axis=1),
-                    quaternion=np.stack((zero, zero, np.sin(half), np.cos(half)), axis=1),
+                    quaternion=about_z(rows["yaw"]),
                 ),
             )
 
     def _add_commands(self, commands: Rows) -> None:
         times = self._times(commands)
-        self._scalars("effort/commanded", times, commands["effort"])
+        self._scalars(paths.COMMANDED_EFFORT, times, commands["effort"])
 
     def _add_latency(self, samples: Rows) -> None:
         times = self._times(samples)
-        self._scalars("loop", times, samples["loop"][:, None] / 1e6)
+        self._scalars(paths.LOOP_LATENCY, times, samples["loop"][:, None] / 1e6)
         ends = np.cumsum(np.stack([samples[stage.key] for stage in LOOP_STAGES], axis=1), axis=1) / 1e6
-        self._scalars("stages", times, np.hstack((np.zeros((len(ends), 1)), ends)))
+        self._scalars(paths.LATENCY_STAGES, times, np.hstack((np.zeros((len(ends), 1)), ends)))
 
     def _add_rates(self, rates: Iterable[Rate]) -> None:
         for client, kind, begins_ns, counts in rates:
-            path = f"modbus/{_NOT_IN_PATH.sub('_', client)}/{kind}"
+            path = f"{paths.MODBUS}/{_NOT_IN_PATH.sub('_', client)}/{kind}"
             if path not in self._known_clients:
                 self._known_clients.add(path)
                 line = rr.SeriesLines(names=[f"{client} {kind}"], colors=[rgb(_REQUEST_COLORS[kind])], widths=[1.5])
@@ -303,24 +304,21 @@ class RerunRigWriter:
             self._scalars(path, self._times(at), counts[:, None] * (1e9 / BIN_NS))
 
     def _add_events(self, events: Rows) -> None:
-        texts = [
-            f"{kind.replace('_', ' ').lower()}: {text}"
-            for kind, text in zip(events["kind"], events["text"], strict=True)
-        ]
+        texts = [f"{event_title(kind)}: {text}" for kind, text in zip(events["kind"], events["text"], strict=True)]
         levels = ["WARN" if severity == "WARNING" else severity for severity in events["severity"]]
-        colors = [rgb(SEVERITY_COLORS.get(severity, _OTHER_EVENT_COLOR)) for severity in events["severity"]]
-        self._send("events", self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
+        colors = [rgb(severity_color(severity)) for severity in events["severity"]]
+        self._send(paths.EVENTS, self._times(events), rr.TextLog.columns(text=texts, level=levels, color=colors))
         for kind in np.unique(events["kind"]):
             rows = events[events["kind"] == kind]
             if kind not in self._known_event_kinds:
                 self._known_event_kinds.add(kind)
-                color = rgb(EVENT_COLORS.get(kind, SEVERITY_COLORS.get(rows["severity"][0], _OTHER_EVENT_COLOR)))
+                color = rgb(EVENT_COLORS.get(kind, severity_color(rows["severity"][0])))
                 markers = rr.SeriesPoints(
-                    names=[kind.replace("_", " ").lower()], colors=[color], markers=["diamond"], marker_sizes=[6.0]
+                    names=[event_title(kind)], colors=[color], markers=["diamond"], marker_sizes=[6.0]
                 )
-                self._static(f"markers/{kind.lower()}", markers)
+                self._static(f"{paths.EVENT_MARKERS}/{kind.lower()}", markers)
             # At zero: the texts are in the event log.
-            self._scalars(f"markers/{kind.lower()}", self._times(rows), np.zeros((len(rows), 1)))
+            self._scalars(f"{paths.EVENT_MARKERS}/{kind.lower()}", self._times(rows), np.zeros((len(rows), 1)))
 
     def _torque_sources(self, states: Rows, commands: Rows) -> NDArray[np.object_]:
         """Source of the applied torque for each state: the address of the controller that wrote the active command."""
@@ -360,7 +358,7 @@ class RerunRigWriter:
         self._current_states[name] = values[-1]
         if changed.any():
             states = [str(value) for value in values[changed]]
-            self._send(f"states/{name}", self._times(rows[changed]), rr.StateChange.columns(state=states))
+            self._send(f"{paths.STATES}/{name}", self._times(rows[changed]), rr.StateChange.columns(state=states))
 
     def _times(self, rows: Rows) -> list[rr.TimeColumn]:
         return [
@@ -373,17 +371,10 @@ class RerunRigWriter:
         self._send(path, times, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
 
     def _send(self, path: str, times: list[rr.TimeColumn], columns: Any) -> None:
-        rr.send_columns(self._path(path), times, columns, recording=self._stream)
+        rr.send_columns(entity_path(self._root, path), times, columns, recording=self._stream)
 
     def _static(self, path: str, archetype: Any) -> None:
-        self._stream.log(self._path(path), archetype, static=True)
-
-    def _path(self, path: str) -> str:
-        return f"{self._root}/{path}" if self._root else path
-
-
-def _about_z(angle: float) -> Any:
-    return rr.Quaternion(xyzw=[0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))])
+        self._stream.log(entity_path(self._root, path), archetype, static=True)
 
 
 def _limits(flags: NDArray[np.uint16]) -> NDArray[np.object_]:

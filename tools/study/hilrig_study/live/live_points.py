@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.config.impairment import (
     BernoulliLoss,
@@ -182,7 +183,7 @@ def _run_point(
     deadline_s = time.monotonic() + _RECORDED_TIMEOUT_S
     while time.monotonic() < deadline_s:
         check_processes()
-        found = sorted((lab.recorder.folder / lab.name / rig).glob("*.mcap"))
+        found = sorted((lab.recorder.folder / lab.name / rig).glob(MCAP_PATTERN))
         if found:
             return open_run(found[-1])
         time.sleep(POLL_S)

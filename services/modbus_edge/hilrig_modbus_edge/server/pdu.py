@@ -8,41 +8,17 @@ checked before the first register changes.
 import struct
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Any, Final, Protocol, TypeVar
+from typing import Final
 
 from pymodbus.constants import DeviceInformation, ExcCodes
 from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
+from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
 
-ClientT = TypeVar("ClientT", contravariant=True)
-"""The device's description of a client; the protocol only passes it on."""
-
-
-class DataModel(Protocol[ClientT]):
-    """Coils and registers of a device; each method raises `ModbusError` for a request that it denies."""
-
-    def read_registers(self, client: ClientT, table: RegisterTable, address: int, count: int) -> bytes:
-        """Return registers, big-endian."""
-
-    def read_bits(self, client: ClientT, table: RegisterTable, address: int, count: int) -> int:
-        """Return coils or discrete inputs as a number, the first one least significant."""
-
-    def check_readable(self, address: int, count: int) -> None:
-        """Check that holding registers can be read now."""
-
-    def check_writable(self, address: int, count: int) -> None:
-        """Check that holding registers exist and may be written."""
-
-    def write_registers(self, client: ClientT, address: int, words: bytes, arrived_ns: int) -> None:
-        """Write holding registers, all or none."""
-
-    def write_coil(self, client: ClientT, address: int, on: bool, arrived_ns: int) -> None:
-        """Write a coil."""
-
-
-Handler = Callable[[DataModel[Any], Any, bytes, int], bytes]
+Handler = Callable[[Device, Client, bytes, int], bytes]
 """Executes a request: device, client, request and its arrival time (ns, monotonic clock) to the response."""
 
 MAX_READ_BITS: Final = 2000
@@ -76,7 +52,7 @@ IDENTITY: Final = {
 """Objects of function 43/14: vendor, product code, revision, product name, model."""
 
 
-def execute(device: DataModel[ClientT], client: ClientT, request: bytes, arrived_ns: int) -> bytes:
+def execute(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     """Execute the PDU of a request (at least the function code) and return the PDU of the response."""
     handler = _HANDLERS.get(request[0])
     if handler is None:
@@ -92,20 +68,20 @@ def exception_response(function: int, code: int) -> bytes:
     return bytes((function | 0x80, code))
 
 
-def _read_registers(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_REGISTERS)
     table = _HOLDING_REGISTER if function == 0x03 else _INPUT_REGISTER
     return _FUNCTION_SIZE.pack(function, 2 * count) + device.read_registers(client, table, address, count)
 
 
-def _read_bits(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_BITS)
     table = RegisterTable.COIL if function == 0x01 else RegisterTable.DISCRETE_INPUT
     size = (count + 7) // 8
     return bytes((function, size)) + device.read_bits(client, table, address, count).to_bytes(size, "little")
 
 
-def _write_coil(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _write_coil(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     _, address, value = _unpack(_ADDRESS_VALUE, request)
     if value not in (_ON, _OFF):
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
@@ -113,13 +89,13 @@ def _write_coil(device: DataModel[Any], client: Any, request: bytes, arrived_ns:
     return request
 
 
-def _write_register(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _write_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     _, address, _ = _unpack(_ADDRESS_VALUE, request)
     device.write_registers(client, address, request[3:], arrived_ns)
     return request
 
 
-def _write_coils(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     address, count = _block(request, MAX_WRITE_BITS, bits=True)
     if count > 1:
         # No two coils have adjacent addresses.
@@ -128,13 +104,13 @@ def _write_coils(device: DataModel[Any], client: Any, request: bytes, arrived_ns
     return request[:5]
 
 
-def _write_registers(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _write_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     address, _ = _block(request, MAX_WRITE_REGISTERS)
     device.write_registers(client, address, request[6:], arrived_ns)
     return request[:5]
 
 
-def _mask_register(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _mask_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     _, address, and_mask, or_mask = _unpack(_MASK, request)
     device.check_writable(address, 1)
     now = int.from_bytes(device.read_registers(client, RegisterTable.HOLDING_REGISTER, address, 1), "big")
@@ -143,7 +119,7 @@ def _mask_register(device: DataModel[Any], client: Any, request: bytes, arrived_
     return request
 
 
-def _read_write(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:
+def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
     if len(request) < _READ_WRITE.size:
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
     _, read, read_count, write, write_count, size = _READ_WRITE.unpack_from(request)
@@ -161,7 +137,7 @@ def _read_write(device: DataModel[Any], client: Any, request: bytes, arrived_ns:
     return bytes((0x17, 2 * read_count)) + words
 
 
-def _identify(device: DataModel[Any], client: Any, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
     if len(request) < 2 or request[1] != _DEVICE_IDENTIFICATION:
         raise ModbusError(ExcCodes.ILLEGAL_FUNCTION)
     if len(request) != 4 or request[2] not in _READ_CODES:

@@ -1,0 +1,43 @@
+"""Reads the newest state of one rig into its register image."""
+
+from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.impairment.delay_line import DelayedStates, ImpairmentSamples
+from hilrig_modbus_edge.registers.image import StateImage
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
+from hilrig_runtime.timing.clock import Clock
+
+
+class StateReader:
+    """Keeps the register image of one rig up to date."""
+
+    def __init__(self, rig: str, clock: Clock, output: DeviceOutput, states: LatestValueCache) -> None:
+        self.image = StateImage()
+        self.delayed: DelayedStates | None = None
+        """The impaired state link; None: states are read where they are received."""
+        self._rig = rig
+        self._monotonic_ns = clock.monotonic_ns
+        self._output = output
+        self._states = states
+
+    def refresh(self) -> StateImage:
+        """Update the register image to the newest state, and return the image."""
+        state = self._states.get(self._rig)
+        if self.delayed is not None:
+            state = self.delayed.newest(self._monotonic_ns())
+        image = self.image
+        if state is not image.arrival and state is not None:
+            image.update(state)
+        return image
+
+    def set_impairment(self, samples: ImpairmentSamples | None) -> None:
+        """Delay and drop states as sampled; None: read states where they are received."""
+        if samples is None:
+            if self.delayed is not None:
+                self.delayed = None
+                self._output.follow_states(None)
+        elif self.delayed is None:
+            # The last served state stays the newest one until the first state is delivered.
+            self.delayed = DelayedStates(samples, self._states.get(self._rig))
+            self._output.follow_states(self.delayed.arrive)
+        else:
+            self.delayed.line.set_samples(samples)
