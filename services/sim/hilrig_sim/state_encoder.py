@@ -158,19 +158,12 @@ class RigStateEncoder:
         A new message each time: a reused one would keep the memory of every part that was ever added.
         """
         world, index = self._world, self.index
-        poses = zip(
-            self._part_names,
-            world.x[:, index].tolist(),
-            world.y[:, index].tolist(),
-            world.z[:, index].tolist(),
-            world.yaw[:, index].tolist(),
-            strict=False,
-        )
+        columns = (world.x, world.y, world.z, world.yaw, *world.velocity)
+        motions = zip(self._part_names, *(column[:, index].tolist() for column in columns), strict=False)
         held = int(world.held[index])
         self._held_part = self._part_names[held] if held != NO_PART else ""
-        velocities = world.velocity(index).T.tolist()
         parts = [
             PartState(name=name, x=x, y=y, z=z, yaw=yaw, vx=vx, vy=vy, vz=vz)
-            for (name, x, y, z, yaw), (vx, vy, vz) in zip(poses, velocities, strict=False)
+            for name, x, y, z, yaw, vx, vy, vz in motions
         ]
         return JointState(parts=parts).SerializeToString()

@@ -156,9 +156,10 @@ class World:
             self._fall_speed[rows, rigs] = -vz
         self._clear_held(rigs)
 
-    def velocity(self, rig: int) -> Floats:
-        """Return the velocities of the parts of a rig, which are those of falling parts, m/s, (3, P)."""
-        return np.stack([*self._drift[:, :, rig], 0.0 - self._fall_speed[:, rig]])
+    @property
+    def velocity(self) -> tuple[Floats, Floats, Floats]:
+        """Velocities of the parts along x, y and z, m/s, (P, N) each; 0 for parts that do not fall."""
+        return self._drift[0], self._drift[1], 0.0 - self._fall_speed
 
     def pick(self, rigs: Ints, tip: Floats) -> Ints:
         """Pick the parts within reach of the magnets of these rigs, which are on and hold no part.

@@ -123,8 +123,8 @@ PART_DTYPE: Final = np.dtype(
         ("held", "|b1"),
     ]
 )
-"""One row per `PartState` in a state: center (world, m), yaw (rad) and velocity (m/s) of the part; `part` is a code of a
-`StringTable`."""
+"""One row per `PartState` in a state: center (world, m), yaw (rad) and velocity (m/s) of the part; `part` is a code of
+a `StringTable`."""
 
 
 class StringTable:
