@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilrig_sim.accuracy import accuracy_warnings
 from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.arm.stability import ERROR_BOUND, MAX_SUBSTEPS
 from hilrig_sim.plant.hard_stops import first_arrival
@@ -141,3 +142,13 @@ def test_first_arrival_is_found_on_the_way_out_and_back() -> None:
     assert found[0] == pytest.approx((1 - np.sqrt(1 - 8 * 0.1)) / 4, rel=1e-6)
     assert found[1] == pytest.approx((1 + np.sqrt(1 + 8 * 0.6)) / 4, rel=1e-6)
     assert found[2] == np.inf
+
+
+def test_check_warns_of_arms_that_one_step_cannot_integrate() -> None:
+    def rigs(substeps: int | str) -> dict[str, RigParameters]:
+        return {name: rig(substeps=substeps) for name in ("a", "b")}
+
+    assert not list(accuracy_warnings(rigs("auto")))
+    (warning,) = accuracy_warnings(rigs(1))
+    assert warning.startswith("a and 1 more: at the largest torques ")
+    assert 'set sim.substeps = "auto"' in warning

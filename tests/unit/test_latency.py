@@ -137,6 +137,17 @@ def test_reports_why_a_recording_is_not_valid(tmp_path: Path, script: Script, wo
     assert any(words in reason for reason in report.reasons), report.reasons
 
 
+def test_counts_steps_with_a_large_error_estimate(tmp_path: Path) -> None:
+    script = Script(seconds=12.0)
+    made = make(script)
+    states = [one.message for one in made if isinstance(one.message, JointState)]
+    for state, error in zip(states[100:103], (0.001, -0.02, 0.003), strict=True):
+        state.integration_error[1] = error
+    report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
+    text = "2 inaccurate steps of the simulation, estimated error up to 1.15 °"
+    assert text in report.reasons
+
+
 def test_counts_a_sequence_gap_as_lost_messages(tmp_path: Path) -> None:
     script = Script(seconds=12.0)
     made = make(script)

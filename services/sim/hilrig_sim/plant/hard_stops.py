@@ -94,7 +94,7 @@ def first_arrival(
     before = np.where(toward_upper, farthest > limit, farthest < limit)
     # The cubic up to its turning point is the interpolant with an end rate of zero.
     fraction = turning * crossing(start, farthest, turning * start_rate, np.where(turns, 0.0, end_rate), limit)
-    # A joint that first moves away from a stop reaches it on its way back: Newton's method starts at the end.
+    # A joint that first moves away from a stop reaches it when it comes back: Newton's method starts at the end.
     back = np.where(toward_upper, lower, upper)
     after = turns & ~before & np.where(toward_upper, end < back, end > back)
     if after.any():

@@ -12,6 +12,8 @@ from hilrig_replay.analysis.distribution import Statistics, median
 from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Losses, Run
+from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.stability import ERROR_BOUND
 
 MIN_SAMPLES: Final = 500
 """Required number of samples; with fewer, p99 depends on fewer than five samples."""
@@ -74,6 +76,7 @@ class DataQuality:
         self._missed = 0
         self._delay_ns: tuple[int, int] | None = None
         self._clock_steps = 0
+        self._inaccurate, self._worst_error = 0, np.zeros(4)
         self._last_state: Rows | None = None
         self._last_command: Rows | None = None
         self._last_write_ns = np.empty(0, np.int64)
@@ -101,6 +104,9 @@ class DataQuality:
         lateness = tick_lateness_ns(states, self._run.step_ns)
         self._ticks.add(lateness.view(_TICK))
         self._missed += int(states["missed_steps"].sum())
+        error = np.abs(states["integration_error"])
+        self._inaccurate += int((error > ERROR_BOUND).any(axis=1).sum())
+        self._worst_error = np.maximum(self._worst_error, error.max(axis=0))
         self._add_stalls(states, lateness)
         delay = states["log_ns"] - states["wall_ns"]
         low, high = int(delay.min()), int(delay.max())
@@ -158,6 +164,10 @@ class DataQuality:
         if overruns:
             steps = f"{_count(self._missed, 'step')} missed, at most {self.stalls.longest_ns / 1e6:.0f} ms late"
             yield f"{_count(overruns, 'overrun')} of the simulation, {steps}"
+        if self._inaccurate:
+            joint = int(np.argmax(self._worst_error / ERROR_BOUND))
+            error = f"{self._worst_error[joint] * JOINT_SCALE[joint]:.3g} {'mm' if joint == 2 else '°'}"
+            yield f"{_count(self._inaccurate, 'inaccurate step')} of the simulation, estimated error up to {error}"
         if self._delay_ns is not None and self._delay_ns[1] - self._delay_ns[0] > MAX_BACKLOG_NS:
             backlog_s = (self._delay_ns[1] - self._delay_ns[0]) / 1e9
             yield f"the recorder lagged by up to {backlog_s:.1f} s"
