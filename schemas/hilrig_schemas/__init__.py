@@ -15,7 +15,7 @@ from hilrig_schemas.v1.impairment_pb2 import ImpairmentRequest, ImpairmentStatus
 from hilrig_schemas.v1.joint_state_pb2 import JointState, PartState
 from hilrig_schemas.v1.lease_pb2 import LeaseRequest, LeaseStatus
 from hilrig_schemas.v1.log_batch_pb2 import LogBatch, OpenSession
-from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusKind, ModbusRequest, ModbusTraffic
+from hilrig_schemas.v1.modbus_traffic_pb2 import ModbusConnection, ModbusKind, ModbusRequest, ModbusTraffic
 from hilrig_schemas.v1.rig_batch_pb2 import RigBatch
 from hilrig_schemas.v1.rig_config_pb2 import RigConfig
 from hilrig_schemas.v1.service_info_pb2 import ServiceInfo
@@ -33,6 +33,7 @@ __all__ = [
     "LeaseRequest",
     "LeaseStatus",
     "LogBatch",
+    "ModbusConnection",
     "ModbusKind",
     "ModbusRequest",
     "ModbusTraffic",

@@ -13,6 +13,7 @@ from hilrig_cli.commands.jitter import jitter
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.server.tls import HANDSHAKE_TIMEOUT_S
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
+from hilrig_recorder.mcap_format.records import COMPRESSION
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentSetting
 from hilrig_runtime.config.lab import (
@@ -116,6 +117,8 @@ CONSTANTS = [
     ("docs/adr/0044-commands-are-throttled-with-a-deadline.md", r"within the last (\S+) ms", COALESCE_WINDOW_NS / 1e6),
     ("docs/adr/0044-commands-are-throttled-with-a-deadline.md", r"beyond (\S+) ms before", DEADLINE_MARGIN_NS / 1e6),
     ("docs/modbus-conformance.md", r"incomplete after (\S+) s is aborted", HANDSHAKE_TIMEOUT_S),
+    ("docs/recordings.md", r"chunks compressed with (\w+)", COMPRESSION),
+    ("CONTRIBUTING.md", r"`HANDSHAKE_TIMEOUT_S` \| (\S+) s", HANDSHAKE_TIMEOUT_S),
     ("docs/recordings.md", r"in chunks of at most (\S+) KiB", CHUNK_BYTES / 1024),
 ]
 
@@ -149,9 +152,10 @@ def test_documented_default_equals_the_configuration(page: str, pattern: str, ke
 
 
 @pytest.mark.parametrize(("page", "pattern", "value"), CONSTANTS, ids=[pattern for _, pattern, _ in CONSTANTS])
-def test_documented_constant_equals_the_code(page: str, pattern: str, value: float) -> None:
+def test_documented_constant_equals_the_code(page: str, pattern: str, value: float | str) -> None:
     stated = re.findall(pattern, (ROOT / page).read_text(encoding="utf-8"))
-    assert [number(text) for text in stated] == [value], f"{page}: {pattern!r} must state {value:g}"
+    found = [text if isinstance(value, str) else number(text) for text in stated]
+    assert found == [value], f"{page}: {pattern!r} must state {value}"
 
 
 def test_rig_parameters_have_the_defaults_of_the_lab_file() -> None:

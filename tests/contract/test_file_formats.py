@@ -76,3 +76,9 @@ def test_name_parts_are_documented() -> None:
     rows = dict(re.findall(r"^\| `([^|]*)` \| (.*) \|$", section, re.MULTILINE))
     assert rows == NAME_PARTS
     assert f"`{NAME_TEMPLATE}`" in page
+
+
+def test_size_of_chunks_is_documented() -> None:
+    from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
+
+    assert f"in chunks of at most {CHUNK_BYTES // 1024} KiB" in (ROOT / "docs/recordings.md").read_text()

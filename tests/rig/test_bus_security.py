@@ -77,7 +77,7 @@ MAY_QUERY: dict[str, set[str]] = {
     "sim": _SERVICE_INFOS,
     "east": _CONFIGS | _SERVICE_INFOS,
     "west": _CONFIGS | _SERVICE_INFOS,
-    "recorder": _CONFIGS | _SERVICE_INFOS | _CONTROLS,
+    "recorder": _CONFIGS | _SERVICE_INFOS,
     "operator": set(QUERIED),
     "viewer": _CONFIGS | _SERVICE_INFOS,
     "student": set(),

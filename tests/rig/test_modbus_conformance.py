@@ -71,7 +71,7 @@ def test_identification_from_unknown_object_starts_at_first(client: RawClient) -
 
 
 def test_shortest_and_longest_requests_are_answered(client: RawClient) -> None:
-    assert client.ask("07").hex() == "8701"
+    assert client.ask("64").hex() == "e401"
     assert client.ask(b"\x64" + bytes(252)).hex() == "e401"
     assert client.ask(b"\x10\x00\x00\x00\x7b\xf6" + bytes(246)).hex() == "9002"
 

@@ -18,6 +18,15 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event, JointState, TorqueCommand
 
 MS = 1_000_000
+EDGE = EdgeConfig(
+    watchdog_ms=1000.0,
+    watchdog_min_ms=100.0,
+    watchdog_max_ms=10_000.0,
+    lease_timeout_ms=5000.0,
+    session_grace_ms=5000.0,
+    repeat_ms=200.0,
+)
+"""Settings of the tests, independent of the defaults."""
 
 
 @dataclass
@@ -45,7 +54,7 @@ class Bench:
         self.timers: list[Timer] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
-        values = replace(DeviceSettings.of(EdgeConfig(), ImpairmentConfig()), **settings)
+        values = replace(DeviceSettings.of(EDGE, ImpairmentConfig()), **settings)
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
         self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
 
@@ -93,8 +102,8 @@ class Bench:
         if self.arrive is not None:
             self.arrive(self.arrival)
 
-    def connect(self, host: str = "10.0.0.1", port: int = 1000, **permissions: bool) -> Client:
-        return self.device.connect(host, port, **permissions)
+    def connect(self, host: str = "10.0.0.1", port: int = 1000, **identity: Any) -> Client:
+        return self.device.connect(host, port, **identity)
 
     def read(
         self, client: Client, address: int, count: int, table: RegisterTable = RegisterTable.HOLDING_REGISTER

@@ -6,7 +6,17 @@ import pytest
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
-from hilrig_modbus_edge.registers.map import ECHO_ADDRESS, INPUT_END, MAGNET_COIL, RESET_COIL, Status, address_of
+from hilrig_modbus_edge.registers.map import (
+    ECHO_ADDRESS,
+    EXTENDED_END,
+    INPUT_END,
+    MAGNET_COIL,
+    PAPER_END,
+    POSITION_ADDRESS,
+    RESET_COIL,
+    Status,
+    address_of,
+)
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
@@ -80,35 +90,147 @@ def test_basis_is_never_from_an_earlier_session(reconnects: bool) -> None:
     assert bench.commands[-1].basis_step == 6
 
 
-def test_read_before_lease_change_is_basis_of_next_writer(bench: Bench) -> None:
+def test_read_in_the_session_of_another_is_no_basis(bench: Bench) -> None:
     holder, next_one = bench.connect(), bench.connect(host="10.0.0.2")
     bench.read(holder, 4, 4)
     bench.write(holder, 0, 1)
     bench.read(next_one, 4, 4)
     bench.device.disconnect(holder, "closed")
     bench.write(next_one, 0, 2)
-    assert bench.commands[-1].basis_step == 1
+    assert bench.commands[-1].basis_step == 0
     assert bench.commands[-1].controller == next_one.address
+    bench.read(next_one, 4, 4)
+    bench.write(next_one, 0, 3)
+    assert bench.commands[-1].basis_step == 1
 
 
-def test_writer_without_reads_uses_basis_of_its_host(bench: Bench) -> None:
+def basis(bench: Bench) -> tuple[int, bool]:
+    """Step of the basis of the last command, and whether another connection was served it."""
+    return bench.commands[-1].basis_step, bench.commands[-1].basis_on_other_connection
+
+
+def test_writer_without_reads_uses_basis_of_its_controller(bench: Bench) -> None:
     reader, writer, stranger = bench.connect(), bench.connect(port=2), bench.connect(host="10.0.0.2")
     bench.state(9)
     bench.read(reader, 4, 1)
     bench.write(writer, 0, 1)
-    assert bench.commands[-1].basis_step == 9
+    # The state was read before the session began: by another program, perhaps.
+    assert basis(bench) == (0, False)
+    bench.read(reader, 4, 1)
+    bench.write(writer, 0, 1)
+    assert basis(bench) == (9, True)
+    bench.read(writer, 4, 1)
+    bench.state(10)
+    bench.read(reader, 4, 1)
+    bench.write(writer, 0, 1)
+    assert basis(bench) == (9, False)
     bench.device.disconnect(writer, "done")
+    bench.write(reader, 0, 1)
+    assert basis(bench) == (10, False)
+    bench.device.disconnect(reader, "done")
     bench.write(stranger, 0, 1)
-    assert bench.commands[-1].basis_step == 0
+    assert basis(bench) == (0, False)
+
+
+def test_first_command_of_a_session_has_no_foreign_basis() -> None:
+    """A program on the same host that only reads goes on between two sessions."""
+    bench = Bench(grace_ns=2_000 * MS)
+    bench.state(5)
+    display = bench.connect(port=2)
+    for port in (3, 4):
+        writer = bench.connect(port=port)
+        bench.read(display, 4, 4)
+        bench.write(writer, 0, port)
+        assert basis(bench) == (0, False)
+        bench.read(display, 4, 4)
+        bench.write(writer, 0, port)
+        assert basis(bench) == (5, True)
+        bench.device.disconnect(writer, "closed")
+        bench.wait(2_000)
+        assert bench.device.session is None
+
+
+def test_internal_command_clears_the_mark_of_the_basis(bench: Bench) -> None:
+    reader, writer = bench.connect(), bench.connect(port=2)
+    bench.write(writer, 0, 1)
+    bench.read(reader, 4, 1)
+    bench.write(writer, 0, 1)
+    assert basis(bench) == (1, True)
+    bench.wait(1000)
+    assert bench.commands[-1].safe
+    assert basis(bench) == (0, False)
+    bench.write(writer, 0, 1)
+    assert basis(bench) == (1, True)
 
 
 def test_one_shot_connections_of_a_host_are_one_loop(bench: Bench) -> None:
-    reader = bench.connect()
-    bench.state(11)
+    one_shot(bench, 1)
+    for step in (11, 12):
+        bench.state(step)
+        reader = bench.connect(port=step)
+        bench.read(reader, 4, 4)
+        bench.device.disconnect(reader, "done")
+        one_shot(bench, 2)
+        assert basis(bench) == (step, True)
+    assert bench.kinds().count("SESSION_START") == 1
+
+
+# -- identity of controllers
+
+
+def test_certificate_names_the_controller_of_all_its_hosts(bench: Bench) -> None:
+    arm, other = (bench.connect(host=f"10.0.0.{number}", certificate="arm") for number in (1, 2))
+    assert arm.controller is other.controller
+    assert arm.controller.name == "CN=arm"
+    assert bench.connect(port=2).controller is not arm.controller
+    bench.write(other, 0, 1)
+    bench.read(arm, 4, 4)
+    bench.write(other, 0, 1)
+    assert basis(bench) == (1, True)
+
+
+@pytest.mark.parametrize(("lease", "same"), [("controller", True), ("connection", False)])
+def test_setting_makes_each_connection_a_controller(lease: str, same: bool) -> None:
+    bench = Bench(lease=lease)
+    bench.state(1)
+    reader, writer = bench.connect(), bench.connect(port=2)
+    assert (reader.controller is writer.controller) == same
+    bench.write(writer, 0, 1)
     bench.read(reader, 4, 4)
-    bench.device.disconnect(reader, "done")
-    bench.write(bench.connect(port=2), 0, 1)
-    assert bench.commands[-1].basis_step == 11
+    bench.write(writer, 0, 1)
+    assert basis(bench) == ((1, True) if same else (0, False))
+
+
+def test_session_keeps_its_controller_among_many_hosts(bench: Bench) -> None:
+    one_shot(bench, 1)
+    for number in range(2, 80):
+        bench.device.disconnect(bench.connect(host=f"10.0.0.{number}"), "done")
+    one_shot(bench, 2)
+    assert bench.kinds().count("SESSION_START") == 1
+
+
+def test_reason_of_each_refusal_is_known_in_advance(bench: Bench) -> None:
+    """`authorize` has no effect: it can be asked before a client writes."""
+    access, now_ns = bench.device._write_access, bench.clock.monotonic_ns()
+    holder, other, observer = bench.connect(), bench.connect(host="10.0.0.2"), bench.connect(port=3, may_write=False)
+    assert access.authorize(holder, now_ns) is None
+    bench.write(holder, 0, 1)
+    for client, reason, code in ((other, "10.0.0.1:1000 holds the lease", 6), (observer, "read-only", 1)):
+        for _ in range(2):
+            refusal = access.authorize(client, now_ns)
+            assert refusal is not None
+            assert refusal.reason.startswith(reason)
+            assert refusal.code == code
+    bench.device.release("revoked")
+    refusal = access.authorize(holder, now_ns)
+    assert refusal is not None
+    assert refusal.reason == "its lease was revoked; write again in 5.0 s"
+    bench.write(other, 0, 1)
+    bench.device.disconnect(other, "done")
+    refusal = access.authorize(bench.connect(host="10.0.0.3"), now_ns)
+    assert refusal is not None
+    assert refusal.reason == "10.0.0.2 acquired the lease less than 1 s ago; write again in 1 s"
+    assert [event for event in bench.kinds() if event == "LEASE_REFUSED"] == []
 
 
 def test_pipelined_write_is_not_based_on_preceding_read(bench: Bench) -> None:
@@ -192,7 +314,7 @@ def test_first_writer_acquires_lease_and_others_get_06(bench: Bench) -> None:
 
 def test_invalid_write_acquires_no_lease(bench: Bench) -> None:
     client = bench.connect()
-    for address in (4, 8, 99, 102):
+    for address in (POSITION_ADDRESS, PAPER_END, ECHO_ADDRESS - 1, EXTENDED_END):
         with pytest.raises(ModbusError) as refusal:
             bench.write(client, address, 1)
         assert refusal.value.code == 2

@@ -50,14 +50,14 @@ class Model:
     def write(self, client: Client) -> bool:
         """Return whether a valid write of this client is accepted."""
         if self.holder is None:
-            if self.session_host not in (None, client.host.address):
+            if self.session_host not in (None, client.host):
                 if self.now_ms < self.host_change_ms:
                     return False
                 self.host_change_ms = self.now_ms + HOST_CHANGE_MS
             self.holder = client
-            if self.session_host != client.host.address:
+            if self.session_host != client.host:
                 self.timeout_ms, self.echo = WATCHDOG_MS, 0
-            self.session_host = client.host.address
+            self.session_host = client.host
         if self.holder is not client:
             return False
         self.fed_ms, self.tripped = self.now_ms, False

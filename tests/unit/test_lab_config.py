@@ -63,7 +63,7 @@ def test_lab_keeps_its_source_text(tmp_path: Path) -> None:
             r"gamma\.mean: unknown key, did you mean mean_ms",
         ),
         ("[impairment.command.delay]\nkind = 'gama'\n", r"kind must be one of 'constant', .*, got 'gama'"),
-        ("[sim]\nintegrator = 'rk'\n", r"sim\.integrator: must be 'rkf45', 'rk4' or 'euler', got 'rk'"),
+        ("[sim]\nintegrator = 'rk'\n", r"sim\.integrator: must be 'rkf45', .*'euler', got 'rk'"),
         ("sim = 3\n", r"sim: must be a table, got 3"),
         ('[sim]\nstep_ms = "fast"\n', r"lab\.toml: sim\.step_ms: must be a number, got 'fast'"),
         ("[sim]\nstep_ms = -1\n", r"sim\.step_ms: must be ≥ 0\.5, got -1"),

@@ -261,7 +261,7 @@ def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     good_file(tmp_path / "run.mcap")
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
     before = (tmp_path / "run.mcap").read_bytes()
-    with pytest.raises(OperationError, match="exists"):
+    with pytest.raises(InputError, match="exists"):
         recover(source, tmp_path / "run.mcap")
     assert (tmp_path / "run.mcap").read_bytes() == before
 

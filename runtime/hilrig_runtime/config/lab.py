@@ -117,6 +117,8 @@ class EdgeConfig(Section):
     """Longest watchdog timeout that a controller may set by register."""
     lease_timeout_ms: Positive = 5000.0
     """Time without a request after which another controller that writes acquires the lease."""
+    lease: Literal["controller", "connection"] = "controller"
+    """Identity of a client without a certificate: its host ("controller"), or each connection ("connection")."""
     session_grace_ms: NotNegative = 5000.0
     """Time within which a controller that reconnects continues its session."""
     repeat_ms: Positive = 200.0

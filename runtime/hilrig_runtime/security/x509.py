@@ -90,6 +90,15 @@ def names_in(certificate: x509.Certificate) -> set[str]:
     return {str(name.value) for name in names}
 
 
+def common_name_of(certificate_der: bytes) -> str:
+    """Return the common name of a certificate's subject; empty: it has none, or the certificate is not readable."""
+    try:
+        names = x509.load_der_x509_certificate(certificate_der).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    except ValueError:
+        return ""
+    return str(names[0].value) if names else ""
+
+
 def role_of(certificate_der: bytes) -> str:
     """Return the role in a client's certificate; empty: no readable role, or more than one."""
     try:

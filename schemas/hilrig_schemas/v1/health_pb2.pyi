@@ -81,7 +81,7 @@ class Health(_message.Message):
     def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., cpu_ns: _Optional[int] = ..., resident_bytes: _Optional[int] = ..., rigs: _Optional[int] = ..., ticks: _Optional[int] = ..., overruns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., lateness_p50_ns: _Optional[int] = ..., lateness_p99_ns: _Optional[int] = ..., lateness_max_ns: _Optional[int] = ..., received_hz: _Optional[float] = ..., published_hz: _Optional[float] = ..., lost_transport: _Optional[int] = ..., lost_recorder: _Optional[int] = ..., queue_depth: _Optional[int] = ..., queue_capacity: _Optional[int] = ..., connections: _Optional[int] = ..., requests: _Optional[int] = ..., malformed: _Optional[int] = ..., refused: _Optional[int] = ..., recordings: _Optional[int] = ..., bytes_written: _Optional[int] = ..., alert: _Optional[str] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., clock_offset_ns: _Optional[int] = ..., clock_uncertainty_ns: _Optional[int] = ..., clock_peer: _Optional[str] = ..., rig_reports: _Optional[_Iterable[_Union[RigReport, _Mapping]]] = ..., realtime_priority: _Optional[int] = ..., inaccurate_steps: _Optional[int] = ...) -> None: ...
 
 class RigReport(_message.Message):
-    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording")
+    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us")
     RIG_FIELD_NUMBER: _ClassVar[int]
     LOOP_US_FIELD_NUMBER: _ClassVar[int]
     SAFE_FIELD_NUMBER: _ClassVar[int]
@@ -90,6 +90,7 @@ class RigReport(_message.Message):
     WATCHDOG_TRIPPED_FIELD_NUMBER: _ClassVar[int]
     CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FIELD_NUMBER: _ClassVar[int]
+    AGE_US_FIELD_NUMBER: _ClassVar[int]
     rig: str
     loop_us: _containers.RepeatedScalarFieldContainer[int]
     safe: bool
@@ -98,4 +99,5 @@ class RigReport(_message.Message):
     watchdog_tripped: bool
     connections: int
     recording: bool
-    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ...) -> None: ...
+    age_us: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ...) -> None: ...

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n&hilrig_schemas/v1/modbus_traffic.proto\x12\thilrig.v1\"\xd7\x01\n\rModbusTraffic\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07wall_ns\x18\x02 \x01(\x03\x12\x11\n\tclosed_ns\x18\x03 \x01(\x03\x12*\n\x08requests\x18\x04 \x03(\x0b\x32\x18.hilrig.v1.ModbusRequest\x12$\n\x05kinds\x18\x05 \x03(\x0b\x32\x15.hilrig.v1.ModbusKind\x12\x14\n\x0ckind_indexes\x18\x06 \x03(\r\x12\x12\n\narrived_ns\x18\x07 \x03(\x10\x12\x19\n\x11\x61nswered_after_ns\x18\x08 \x03(\x04\"e\n\nModbusKind\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x11\n\texception\x18\x04 \x01(\r\x12\x12\n\ncontroller\x18\x05 \x01(\t\"\x91\x01\n\rModbusRequest\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x12\n\narrived_ns\x18\x04 \x01(\x03\x12\x13\n\x0b\x61nswered_ns\x18\x05 \x01(\x03\x12\x11\n\texception\x18\x06 \x01(\r\x12\x12\n\ncontroller\x18\x07 \x01(\tb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n&hilrig_schemas/v1/modbus_traffic.proto\x12\thilrig.v1\"\x89\x02\n\rModbusTraffic\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07wall_ns\x18\x02 \x01(\x03\x12\x11\n\tclosed_ns\x18\x03 \x01(\x03\x12*\n\x08requests\x18\x04 \x03(\x0b\x32\x18.hilrig.v1.ModbusRequest\x12$\n\x05kinds\x18\x05 \x03(\x0b\x32\x15.hilrig.v1.ModbusKind\x12\x14\n\x0ckind_indexes\x18\x06 \x03(\r\x12\x12\n\narrived_ns\x18\x07 \x03(\x10\x12\x19\n\x11\x61nswered_after_ns\x18\x08 \x03(\x04\x12\x30\n\x0b\x63onnections\x18\t \x03(\x0b\x32\x1b.hilrig.v1.ModbusConnection\"S\n\x10ModbusConnection\x12\x12\n\ncontroller\x18\x01 \x01(\t\x12\x12\n\nmin_rtt_us\x18\x02 \x01(\r\x12\x17\n\x0fretransmissions\x18\x03 \x01(\r\"e\n\nModbusKind\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x11\n\texception\x18\x04 \x01(\r\x12\x12\n\ncontroller\x18\x05 \x01(\t\"\x91\x01\n\rModbusRequest\x12\x10\n\x08\x66unction\x18\x01 \x01(\r\x12\x0f\n\x07\x61\x64\x64ress\x18\x02 \x01(\r\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x12\n\narrived_ns\x18\x04 \x01(\x03\x12\x13\n\x0b\x61nswered_ns\x18\x05 \x01(\x03\x12\x11\n\texception\x18\x06 \x01(\r\x12\x12\n\ncontroller\x18\x07 \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,9 +32,11 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.modbus_tr
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODBUSTRAFFIC']._serialized_start=54
-  _globals['_MODBUSTRAFFIC']._serialized_end=269
-  _globals['_MODBUSKIND']._serialized_start=271
-  _globals['_MODBUSKIND']._serialized_end=372
-  _globals['_MODBUSREQUEST']._serialized_start=375
-  _globals['_MODBUSREQUEST']._serialized_end=520
+  _globals['_MODBUSTRAFFIC']._serialized_end=319
+  _globals['_MODBUSCONNECTION']._serialized_start=321
+  _globals['_MODBUSCONNECTION']._serialized_end=404
+  _globals['_MODBUSKIND']._serialized_start=406
+  _globals['_MODBUSKIND']._serialized_end=507
+  _globals['_MODBUSREQUEST']._serialized_start=510
+  _globals['_MODBUSREQUEST']._serialized_end=655
 # @@protoc_insertion_point(module_scope)

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class ModbusTraffic(_message.Message):
-    __slots__ = ("rig", "wall_ns", "closed_ns", "requests", "kinds", "kind_indexes", "arrived_ns", "answered_after_ns")
+    __slots__ = ("rig", "wall_ns", "closed_ns", "requests", "kinds", "kind_indexes", "arrived_ns", "answered_after_ns", "connections")
     RIG_FIELD_NUMBER: _ClassVar[int]
     WALL_NS_FIELD_NUMBER: _ClassVar[int]
     CLOSED_NS_FIELD_NUMBER: _ClassVar[int]
@@ -16,6 +16,7 @@ class ModbusTraffic(_message.Message):
     KIND_INDEXES_FIELD_NUMBER: _ClassVar[int]
     ARRIVED_NS_FIELD_NUMBER: _ClassVar[int]
     ANSWERED_AFTER_NS_FIELD_NUMBER: _ClassVar[int]
+    CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
     rig: str
     wall_ns: int
     closed_ns: int
@@ -24,7 +25,18 @@ class ModbusTraffic(_message.Message):
     kind_indexes: _containers.RepeatedScalarFieldContainer[int]
     arrived_ns: _containers.RepeatedScalarFieldContainer[int]
     answered_after_ns: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, rig: _Optional[str] = ..., wall_ns: _Optional[int] = ..., closed_ns: _Optional[int] = ..., requests: _Optional[_Iterable[_Union[ModbusRequest, _Mapping]]] = ..., kinds: _Optional[_Iterable[_Union[ModbusKind, _Mapping]]] = ..., kind_indexes: _Optional[_Iterable[int]] = ..., arrived_ns: _Optional[_Iterable[int]] = ..., answered_after_ns: _Optional[_Iterable[int]] = ...) -> None: ...
+    connections: _containers.RepeatedCompositeFieldContainer[ModbusConnection]
+    def __init__(self, rig: _Optional[str] = ..., wall_ns: _Optional[int] = ..., closed_ns: _Optional[int] = ..., requests: _Optional[_Iterable[_Union[ModbusRequest, _Mapping]]] = ..., kinds: _Optional[_Iterable[_Union[ModbusKind, _Mapping]]] = ..., kind_indexes: _Optional[_Iterable[int]] = ..., arrived_ns: _Optional[_Iterable[int]] = ..., answered_after_ns: _Optional[_Iterable[int]] = ..., connections: _Optional[_Iterable[_Union[ModbusConnection, _Mapping]]] = ...) -> None: ...
+
+class ModbusConnection(_message.Message):
+    __slots__ = ("controller", "min_rtt_us", "retransmissions")
+    CONTROLLER_FIELD_NUMBER: _ClassVar[int]
+    MIN_RTT_US_FIELD_NUMBER: _ClassVar[int]
+    RETRANSMISSIONS_FIELD_NUMBER: _ClassVar[int]
+    controller: str
+    min_rtt_us: int
+    retransmissions: int
+    def __init__(self, controller: _Optional[str] = ..., min_rtt_us: _Optional[int] = ..., retransmissions: _Optional[int] = ...) -> None: ...
 
 class ModbusKind(_message.Message):
     __slots__ = ("function", "address", "count", "exception", "controller")

@@ -19,7 +19,7 @@ from hilrig_sim.plant.plant import Plant
 
 Floats = NDArray[np.float64]
 
-LIMIT_EVENT_PERIOD_NS: Final = 250_000_000
+LIMIT_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events of one limit of a rig, ns: a joint may chatter at its stop."""
 MAX_LIMITS: Final = 4096
 """Number of limits whose events are rate-limited; a rig has 9."""
@@ -42,7 +42,7 @@ class SimulationEvents:
         self._overruns: RateLimiter[None] = RateLimiter(OVERRUN_EVENT_PERIOD_NS)
         self._inaccurate: RateLimiter[str] = RateLimiter(ACCURACY_EVENT_PERIOD_NS, MAX_RIGS)
         self._errors: dict[str, Floats] = {}
-        """Largest error estimate of each joint since the last event, (4,), by rig."""
+        """Largest error estimate of each joint since the last event, by rig."""
         self.overran = False
         """Whether there are overruns that were not reported yet."""
         self._overrun_step = 0
@@ -97,7 +97,7 @@ class SimulationEvents:
         self._emit(event)
 
     def report_inaccurate(self, rig: int, error: Floats, session: str, step: int, now_ns: int) -> None:
-        """Emit that the error estimate of a step, (4,), exceeds its bound, rate-limited; `step` is the one after it."""
+        """Emit that the error estimate of a step exceeds its bound, rate-limited; `step` is the one after it."""
         name = self._rigs[rig]
         worst = self._errors[name] = np.maximum(self._errors.get(name, error), error)
         count = self._inaccurate.record(name, now_ns)

@@ -41,10 +41,10 @@ class StaticReply:
 class RigRegistry:
     """Registry of the simulated rigs."""
 
-    def __init__(self, service: Service, simulation: Simulation, turns: OwnerThreadExecutor) -> None:
+    def __init__(self, service: Service, simulation: Simulation, executor: OwnerThreadExecutor) -> None:
         self._service = service
         self._simulation = simulation
-        self._turns = turns
+        self._executor = executor
         self._changing = threading.Lock()
         """Serializes the threads of the bus: a change takes more than one call of the simulation's thread."""
         self._served: dict[str, Handle] = {}
@@ -83,7 +83,7 @@ class RigRegistry:
                 raise OperationError(f"rig {rig.name!r} is already simulated here; choose another name")
             parameters = rig_parameters(service.lab, rig)
             plant = Plant([*simulation.parameters, parameters])
-            self._turns.call(lambda: simulation.add(rig.name, plant))
+            self._executor.call(lambda: simulation.add(rig.name, plant))
             self._serve(rig.name, parameters)
             service.set_rigs((*service.rigs, rig))
         return self._emit_result(Event.RIG_ADDED, rig.name, f"{rig.name} is simulated", request.settings_json)
@@ -101,7 +101,7 @@ class RigRegistry:
                 )
             index = names.index(name)
             plant = Plant([parameters for number, parameters in enumerate(simulation.parameters) if number != index])
-            self._turns.call(lambda: simulation.remove(index, plant))
+            self._executor.call(lambda: simulation.remove(index, plant))
             self._served.pop(name).close()
             service.set_rigs(tuple(rig for rig in service.rigs if rig.name != name))
         return self._emit_result(Event.RIG_REMOVED, name, f"{name} is no longer simulated")
@@ -109,7 +109,7 @@ class RigRegistry:
     def _emit_result(self, kind: Event.Kind, rig: str, text: str, settings_json: str = "") -> ControlReply:
         event = Event(kind=kind, severity=Event.INFO, rig=rig, text=text)
         event.configuration_data.text = settings_json
-        self._turns.call(lambda: self._service.emit(event))
+        self._executor.call(lambda: self._service.emit(event))
         return ControlReply(text=text)
 
 

@@ -22,8 +22,8 @@ def run(service: Service) -> None:
     lab = service.lab
     parameters = [rig_parameters(lab, rig) for rig in service.rigs]
     simulation = Simulation(service, parameters)
-    turns = OwnerThreadExecutor()
-    with closing(RigRegistry(service, simulation, turns)):
+    executor = OwnerThreadExecutor()
+    with closing(RigRegistry(service, simulation, executor)):
         freeze_gc()
         service.ready()
         rate, stopping = Rate(lab.sim.step_ns, service.clock), service.stopping
@@ -33,5 +33,5 @@ def run(service: Service) -> None:
                 simulation.pre_encode(rate.next_ns)
                 tick = rate.wait()
                 simulation.tick(tick)
-                turns.run_pending()
+                executor.run_pending()
                 service.beat(service.clock.monotonic_ns())

@@ -7,6 +7,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.plots.palette import JOINT_COLORS, JOINT_SYMBOLS, rgb
 from hilrig_replay.rerun_view.layout import SIM_TIME
 from hilrig_replay.rerun_view.sinks import to_file
@@ -31,7 +32,17 @@ def save_study_rrd(study: StudyConfig, swept: SweepResult, shown: Sequence[Trace
     text = rrb.TextDocumentView(name="study", origin="/about")
     right: list[rrb.Vertical | rrb.TextDocumentView] = [rrb.Vertical(*curves)] if curves else []
     blueprint = rrb.Blueprint(rrb.Horizontal(rrb.Vertical(*planes, text), *right), collapse_panels=True)
-    stream = to_file(path, study.title, blueprint)
+    with output_file(path) as temporary:
+        _write(to_file(temporary, study.title, blueprint), study, swept, shown, names)
+
+
+def _write(
+    stream: rr.RecordingStream,
+    study: StudyConfig,
+    swept: SweepResult,
+    shown: Sequence[Trace],
+    names: Sequence[str],
+) -> None:
     with stream:
         rr.log(
             "about",

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from hilrig_runtime.errors import OperationError
+from hilrig_replay.io.output_file import output_file
 from hilrig_sim.arm.model import JOINT_NAMES
 from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig
@@ -83,9 +83,7 @@ def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dic
         OperationError: a file can't be written.
     """
     written: dict[str, Any] = summary(study, swept) | _plain(more)
-    try:
-        pyarrow.parquet.write_table(run_table(study, swept), folder / "runs.parquet")
-        (folder / "study.json").write_text(json.dumps(written, indent=1), encoding="utf-8")
-    except OSError as error:
-        raise OperationError(f"{folder}: can't write the results: {error.strerror or error}") from error
+    with output_file(folder / "runs.parquet") as table_file, output_file(folder / "study.json") as summary_file:
+        pyarrow.parquet.write_table(run_table(study, swept), table_file)
+        summary_file.write_text(json.dumps(written, indent=1), encoding="utf-8")
     return written

@@ -1,7 +1,7 @@
-"""A connected Modbus client as a device sees it: address, permission, and the state that it was last served."""
+"""A connected Modbus client as a device sees it: identity, permission, and the states that it was served."""
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 from hilrig_modbus_edge.registers.image import NO_STATE_REF, StateRef
 
@@ -18,45 +18,66 @@ def address_of(host: str, port: int) -> str:
 
 
 @dataclass(slots=True, eq=False)
-class Host:
-    """A computer that connections come from: one connection may read and another write."""
+class ConnectedController:
+    """A controller with all its connections: one connection may read and another write."""
 
-    address: str
+    name: str
     clients: "set[Client]" = field(default_factory=set)
     """Its open connections."""
     served: ServedState | None = None
-    """The state that any of its connections was last served."""
+    """The state that any of its connections was last served in this session; None: none was."""
 
     def clear_served(self) -> None:
-        """Clear the states that its connections were served: no later write is based on them."""
+        """Clear the state that any of its connections was served; each connection keeps its own."""
         self.served = None
         for client in self.clients:
-            client.served = client.basis = None
+            client.other_basis = None
 
 
 @dataclass(slots=True, eq=False)
 class Client:
     """One connection."""
 
+    host: str
     address: str
     """ "host:port"."""
-    host: Host
+    certificate: str = ""
+    """Name in its certificate; empty: it has none."""
     may_write: bool = True
+    controller: ConnectedController = field(init=False)
+    """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
     """Time of its last request, ns, monotonic clock."""
     lease_cooldown_until_ns: int = 0
     """It cannot acquire the lease before this time, because its lease was revoked; ns, monotonic clock."""
     served: ServedState | None = None
-    """The state that it was last served."""
+    """The state that it was last served since the previous session ended; None: none was."""
     basis: ServedState | None = None
-    """The state that it had been served when its newest bytes arrived: they cannot be based on a newer one."""
+    """`served` when its newest bytes arrived: they cannot be based on a newer one."""
+    other_basis: ServedState | None = None
+    """`ConnectedController.served` when its newest bytes arrived: the basis of a client that was itself served none."""
 
     def record_request(self, now_ns: int) -> None:
         """Record that a request arrived."""
         self.last_request_ns = now_ns
-        self.basis = self.served or self.host.served
+        self.basis = self.served
+        self.other_basis = self.controller.served
 
     def record_served(self, served: ServedState) -> None:
         """Record the state that it was served."""
         self.served = served
-        self.host.served = served
+        self.controller.served = served
+
+    def clear_served(self) -> None:
+        """Clear the state that it was served: no later write is based on it."""
+        self.served = self.basis = None
+
+
+def controller_of(connection: Client, lease: Literal["controller", "connection"]) -> str:
+    """Return the name of the controller of a connection: its certificate's, else its host.
+
+    With `lease` "connection" (edge.lease), each connection without a certificate is a controller of its own.
+    """
+    if connection.certificate:
+        return f"CN={connection.certificate}"
+    return connection.host if lease == "controller" else connection.address

@@ -22,6 +22,7 @@ _FIELDS_OF_A_WRITE: Final = (
     "controller",
     "basis_incarnation",
     "basis_step",
+    "basis_on_other_connection",
     "state_arrived_ns",
     "state_served_ns",
     "state_injected_ns",
@@ -50,7 +51,8 @@ class CommandPublisher:
         self._seq = 0
         # Client, basis and session of the last command: most writes change none of them.
         self._writer: Client | None = None
-        self._basis: ServedState = NO_STATE
+        self._basis: ServedState | None = NO_STATE
+        """None: the fields of the basis are set again."""
         self._published_session: Session | None = None
         self._echo_published = 0
 
@@ -85,23 +87,26 @@ class CommandPublisher:
         command = self._message
         if client is not self._writer:
             self._writer = client
+            self._basis = None
             command.controller = client.address
             command.safe = False
         # Setting a protobuf field costs as much as a dozen bytecodes: unchanged fields are not set again.
         if self.echo != self._echo_published:
             command.echo = self._echo_published = self.echo
-        basis = client.basis or NO_STATE
+        # A state that the client itself was served proves the loop; one of another connection may not be used by it.
+        basis = client.basis or client.other_basis or NO_STATE
         before = self._basis
         if basis is not before:
             self._basis = basis
             state, command.state_served_ns = basis
-            if state is not before[0]:
+            if before is None or state is not before[0]:
                 (
                     command.basis_incarnation,
                     command.basis_step,
                     command.state_arrived_ns,
                     command.state_injected_ns,
                 ) = state
+            command.basis_on_other_connection = client.basis is None and basis is not NO_STATE
         command.write_arrived_ns = arrived_ns
         self._set_effort_and_session()
         if self.delayed is not None:

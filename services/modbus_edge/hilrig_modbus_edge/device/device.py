@@ -10,7 +10,7 @@ from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.device.client import Client, Host, address_of
+from hilrig_modbus_edge.device.client import Client, ConnectedController, address_of, controller_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import EventEmitter
@@ -33,6 +33,7 @@ from hilrig_modbus_edge.registers.map import (
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
+    WATCHDOG_ADDRESS,
     Status,
     struct_of,
 )
@@ -44,8 +45,8 @@ from hilrig_schemas import Event, LeaseStatus
 # Looking up an enumeration member is a function call: the one that each request needs is looked up once.
 _INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER
 _EXTENDED: Final = struct_of(RegisterTable.HOLDING_REGISTER, ECHO_ADDRESS)
-MAX_REMEMBERED_HOSTS: Final = 64
-"""Number of hosts above which those without a connection are removed."""
+MAX_REMEMBERED_CONTROLLERS: Final = 64
+"""Number of controllers above which those without a connection are removed."""
 
 
 class Device:
@@ -63,7 +64,8 @@ class Device:
     ) -> None:
         self.rig = rig
         self.clients: set[Client] = set()
-        self._hosts: dict[str, Host] = {}
+        self._controllers: dict[str, ConnectedController] = {}
+        self._lease_setting = settings.lease
         self._monotonic_ns = clock.monotonic_ns
         self._session = SessionState()
         self._states = StateReader(rig, clock, output, states)
@@ -74,7 +76,16 @@ class Device:
             rig, settings.impairment, clock, self._states, self._commands, self._events
         )
         self._write_access = WriteAccess(
-            rig, settings, clock, output, self._commands, self.impairment, self._events, self._session, rng
+            rig,
+            settings,
+            clock,
+            output,
+            self._commands,
+            self.impairment,
+            self._events,
+            self._session,
+            self.clients,
+            rng,
         )
         self.lease = self._write_access.lease
         self.watchdog = self._write_access.watchdog
@@ -86,11 +97,13 @@ class Device:
 
     # -- connections
 
-    def connect(self, host: str, port: int, *, may_write: bool = True) -> Client:
-        """Add a connection and return its client."""
-        known = self._hosts.setdefault(host, Host(host))
-        client = Client(address_of(host, port), known, may_write, last_request_ns=self._monotonic_ns())
-        known.clients.add(client)
+    def connect(self, host: str, port: int, *, may_write: bool = True, certificate: str = "") -> Client:
+        """Add a connection and return its client; `certificate`: the name in its certificate."""
+        now_ns = self._monotonic_ns()
+        client = Client(host, address_of(host, port), certificate, may_write, last_request_ns=now_ns)
+        name = controller_of(client, self._lease_setting)
+        client.controller = self._controllers.setdefault(name, ConnectedController(name))
+        client.controller.clients.add(client)
         self.clients.add(client)
         return client
 
@@ -99,12 +112,15 @@ class Device:
         if client not in self.clients:
             return
         self.clients.remove(client)
-        client.host.clients.remove(client)
+        client.controller.clients.remove(client)
         self._write_access.on_disconnect(client, reason)
-        # Within a session, the state that a host was served stays the basis of its next connection: a sequence of
+        # Within a session, the state that a controller was served stays the basis of its next connection: a sequence of
         # one-shot commands is one loop.
-        if len(self._hosts) > MAX_REMEMBERED_HOSTS:
-            self._hosts = {address: host for address, host in self._hosts.items() if host.clients}
+        if len(self._controllers) > MAX_REMEMBERED_CONTROLLERS:
+            known = self._controllers.items()
+            self._controllers = {
+                name: one for name, one in known if one.clients or (self.session and one is self.session.controller)
+            }
 
     def report_refused_connection(self, address: str, reason: str, count: int) -> None:
         """Emit an event for `count` refused connections of a host."""
@@ -113,7 +129,7 @@ class Device:
 
     def connections_of(self, host: str) -> int:
         """Return the number of connections of a host."""
-        return len(self._hosts[host].clients) if host in self._hosts else 0
+        return sum(client.host == host for client in self.clients)
 
     # -- reads
 
@@ -195,13 +211,15 @@ class Device:
             self._publish_write(client, arrived_ns)
             return
         self.check_writable(address, len(words) // 2)
-        if end == EXTENDED_END:
-            timeout_ns = int.from_bytes(words[-2:], "big") * MS
+        sets_timeout = address <= WATCHDOG_ADDRESS < end
+        if sets_timeout:
+            at = 2 * (WATCHDOG_ADDRESS - address)
+            timeout_ns = int.from_bytes(words[at : at + 2], "big") * MS
             self._write_access.check_timeout(timeout_ns)
         self._write_access.authorize_write(client, arrived_ns)
         if address == ECHO_ADDRESS:
             self._commands.echo = int.from_bytes(words[:2], "big")
-        if end == EXTENDED_END:
+        if sets_timeout:
             self._write_access.set_timeout(timeout_ns)
         # These are registers of the edge, so the emulated network does not drop the write.
         self._commands.publish_session()

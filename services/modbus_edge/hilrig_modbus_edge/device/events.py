@@ -68,7 +68,7 @@ class LeaseEventReporter:
 
     def lease_acquired(self, client: Client, now_ns: int) -> None:
         """Report that a client acquired the lease; ns, monotonic clock."""
-        count = self._acquisitions.record(client.host.address, now_ns)
+        count = self._acquisitions.record(client.host, now_ns)
         self._pending_acquire = None if count else (client.address, now_ns)
         if count:
             self._emit_acquired(client.address, count)
@@ -86,7 +86,7 @@ class LeaseEventReporter:
 
     def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
         """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""
-        count = self._denials.record((client.host.address, bool(holder)), now_ns)
+        count = self._denials.record((client.host, bool(holder)), now_ns)
         if count:
             text = f"{client.address}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
             self._events.emit_for_controller(

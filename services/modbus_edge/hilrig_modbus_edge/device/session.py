@@ -1,12 +1,12 @@
 """Session of a rig: starts when a client acquires the lease, ends a grace time after the lease was released.
 
-A client that reconnects from the same host within the grace time continues its session. So a program that reconnects,
+A controller that reconnects within the grace time continues its session. So a program that reconnects,
 or a sequence of one-shot commands, is one recording. Time is passed in.
 """
 
 from dataclasses import dataclass
 
-from hilrig_modbus_edge.device.client import Host
+from hilrig_modbus_edge.device.client import ConnectedController
 from hilrig_schemas import OpenSession
 
 
@@ -18,10 +18,10 @@ class Session:
     id: str
     number: int
     """Number among the rig's sessions since the edge started, from 1."""
-    controller: str
+    address: str
     """Address of the client that started it, "host:port"."""
-    host: Host
-    """Host of that client."""
+    controller: ConnectedController
+    """The controller of that client."""
     start_wall_ns: int
     released_ns: int | None = None
     """Time at which the lease was released, ns, monotonic clock; None: the lease is held."""
@@ -32,7 +32,7 @@ class Session:
 
     def as_message(self) -> OpenSession:
         """Return the session as it is announced to the recorder."""
-        return OpenSession(rig=self.rig, session=self.id, controller=self.controller, start_wall_ns=self.start_wall_ns)
+        return OpenSession(rig=self.rig, session=self.id, controller=self.address, start_wall_ns=self.start_wall_ns)
 
 
 @dataclass(slots=True)

@@ -1,7 +1,7 @@
 """Settings of a device, converted from lab.toml to nanoseconds."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.lab import EdgeConfig
@@ -18,6 +18,7 @@ class DeviceSettings:
     watchdog_min_ns: int
     watchdog_max_ns: int
     lease_ns: int
+    lease: Literal["controller", "connection"]
     grace_ns: int
     repeat_ns: int
     impairment: ImpairmentConfig
@@ -30,6 +31,7 @@ class DeviceSettings:
             watchdog_min_ns=round(edge.watchdog_min_ms * MS),
             watchdog_max_ns=round(edge.watchdog_max_ms * MS),
             lease_ns=round(edge.lease_timeout_ms * MS),
+            lease=edge.lease,
             grace_ns=round(edge.session_grace_ms * MS),
             repeat_ns=round(edge.repeat_ms * MS),
             impairment=impairment,

@@ -6,7 +6,8 @@ with a lease and ends a grace time after it. Time is passed in or read from the 
 """
 
 import random
-from typing import Final, Generic, NoReturn, Protocol, TypeVar
+from collections.abc import Set as AbstractSet
+from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from pymodbus.constants import ExcCodes
 
@@ -24,9 +25,17 @@ from hilrig_runtime.process.session_id import session_id
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import Event, LeaseStatus
 
-HOST_CHANGE_PERIOD_NS: Final = 1_000 * MS
-"""Shortest time between two changes of the host that writes, ns: two hosts that write alternately would otherwise
-create a recording per write."""
+CONTROLLER_CHANGE_PERIOD_NS: Final = 1_000 * MS
+"""Shortest time between two changes of the controller that writes, ns: two controllers that write alternately would
+otherwise create a recording per write."""
+
+
+class Refusal(NamedTuple):
+    """A write that is refused."""
+
+    reason: str
+    """Human-readable."""
+    code: ExcCodes
 
 
 class Holder(Protocol):
@@ -75,11 +84,13 @@ class WriteAccess:
         impairment: ImpairmentController,
         events: EventEmitter,
         session: SessionState,
+        clients: AbstractSet[Client],
         rng: random.Random | None,
     ) -> None:
         self.lease: Lease[Client] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
         self._session = session
+        self._clients = clients
         self._rig = rig
         self._settings = settings
         self._monotonic_ns = clock.monotonic_ns
@@ -92,8 +103,8 @@ class WriteAccess:
         self._lease_events = LeaseEventReporter(rig, events)
         self._session_count = 0
         self._last_writer = ""
-        self._host_change_ns = 0
-        """Earliest time at which another host may end a session, ns, monotonic clock."""
+        self._controller_change_ns = 0
+        """Earliest time at which another controller may end a session, ns, monotonic clock."""
         self._watchdog_timer: TimerHandle | None = None
 
     def authorize_write(self, client: Client, now_ns: int) -> None:
@@ -102,8 +113,41 @@ class WriteAccess:
         Raises:
             ModbusError: 06 another client holds the lease, 01 the client is read-only.
         """
-        if self.lease.holder is not client:
-            self._acquire_lease(client, now_ns)
+        if self.lease.holder is client:
+            return
+        refusal = self.authorize(client, now_ns)
+        if refusal is not None:
+            self._lease_events.lease_denied(client, refusal.reason, self._holder, now_ns)
+            raise ModbusError(refusal.code)
+        self._acquire_lease(client, now_ns)
+
+    def authorize(self, client: Client, now_ns: int) -> Refusal | None:
+        """Return why a client may not write to the rig now; None: it may. The only place of these reasons.
+
+        Args:
+            client: connection that writes; its controller is that of `controller_of`.
+            now_ns: time, ns, monotonic clock.
+        """
+        if not client.may_write:
+            return Refusal(
+                "read-only: the client certificate lacks the role operator; use a certificate with that role",
+                ExcCodes.ILLEGAL_FUNCTION,
+            )
+        if now_ns < client.lease_cooldown_until_ns:
+            wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
+            return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
+        if self.lease.holder not in (None, client):
+            return Refusal(
+                f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release",
+                ExcCodes.DEVICE_BUSY,
+            )
+        session = self._session.current
+        if session is not None and session.controller is not client.controller and now_ns < self._controller_change_ns:
+            return Refusal(
+                f"{session.controller.name} acquired the lease less than 1 s ago; write again in 1 s",
+                ExcCodes.DEVICE_BUSY,
+            )
+        return None
 
     def feed_watchdog(self, client: Client, now_ns: int) -> None:
         """Feed the watchdog with an authorized write that was not dropped; ns, monotonic clock."""
@@ -195,30 +239,13 @@ class WriteAccess:
 
     def _acquire_lease(self, client: Client, now_ns: int) -> None:
         session = self._session.current
-        if not client.may_write:
-            reason = "read-only: the client certificate lacks the role operator; use a certificate with that role"
-            self._deny(client, now_ns, reason, ExcCodes.ILLEGAL_FUNCTION)
-        if now_ns < client.lease_cooldown_until_ns:
-            wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
-            reason = f"its lease was revoked; write again in {wait_s:.1f} s"
-            self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
-        if self.lease.holder is not None:
-            reason = f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release"
-            self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
-        if session is not None and session.host.address != client.host.address:
-            if now_ns < self._host_change_ns:
-                reason = f"{session.host.address} acquired the lease less than 1 s ago; write again in 1 s"
-                self._deny(client, now_ns, reason, ExcCodes.DEVICE_BUSY)
-            self._host_change_ns = now_ns + HOST_CHANGE_PERIOD_NS
+        if session is not None and session.controller is not client.controller:
+            self._controller_change_ns = now_ns + CONTROLLER_CHANGE_PERIOD_NS
             self._end_session(f"{client.address} acquired the lease")
         self.lease.acquire(client)
         self._last_writer = client.address
         self._start_or_continue_session(client)
         self._lease_events.lease_acquired(client, now_ns)
-
-    def _deny(self, client: Client, now_ns: int, reason: str, code: ExcCodes) -> NoReturn:
-        self._lease_events.lease_denied(client, reason, self._holder, now_ns)
-        raise ModbusError(code)
 
     def _release_lease(self, reason: str, *, disconnected: bool = False) -> None:
         holder = self.lease.release()
@@ -239,7 +266,9 @@ class WriteAccess:
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._rng)
         number = self._session_count
-        self._session.current = Session(self._rig, identity, number, client.address, client.host, wall_ns)
+        self._session.current = Session(self._rig, identity, number, client.address, client.controller, wall_ns)
+        # What another connection read before the session is no basis in it: it may have been another program.
+        client.controller.clear_served()
         # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
         self._commands.echo = 0
@@ -254,10 +283,11 @@ class WriteAccess:
         session = self._session.current
         if session is None:
             return
-        # The first command of the next session must not be based on a state that was read in this one.
-        session.host.clear_served()
+        # No command of the next session is based on a state that was read in this one.
+        for client in self._clients:
+            client.clear_served()
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
-        event.session_data.controller = session.controller
+        event.session_data.controller = session.address
         event.session_data.reason = reason
         # This command tells the simulation that the session has ended. It is a new one, because it has no session.
         self._session.current = None

@@ -189,6 +189,7 @@ TORQUE_ADDRESS: Final = address_of("tau1")
 POSITION_ADDRESS: Final = address_of("theta1")
 PAPER_END: Final = REGISTERS["theta4"].end
 ECHO_ADDRESS: Final = address_of("echo")
+WATCHDOG_ADDRESS: Final = address_of("watchdog_timeout_set")
 EXTENDED_END: Final = end_of(RegisterTable.HOLDING_REGISTER)
 MAGNET_COIL: Final = address_of("magnet")
 RESET_COIL: Final = address_of("reset")

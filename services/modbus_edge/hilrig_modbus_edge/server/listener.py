@@ -64,10 +64,17 @@ class RigServer:
             self.attach(transport, *peer)
 
     def attach(
-        self, transport: asyncio.Transport, host: str, port: int, may_write: bool = True, early: bytes = b""
+        self,
+        transport: asyncio.Transport,
+        host: str,
+        port: int,
+        may_write: bool = True,
+        certificate: str = "",
+        early: bytes = b"",
     ) -> None:
-        """Serve an admitted client; `early`: data that it has already sent."""
-        connection = Connection(self, transport, self.device.connect(host, port, may_write=may_write))
+        """Serve an admitted client; `certificate`: name in its certificate, `early`: data that it has already sent."""
+        client = self.device.connect(host, port, may_write=may_write, certificate=certificate)
+        connection = Connection(self, transport, client)
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
@@ -76,7 +83,7 @@ class RigServer:
     def report_malformed(self, client: Client, defect: str) -> None:
         """Count a connection that is closed because of malformed data, and log it, rate-limited."""
         self.counters.malformed += 1
-        count = self._rate_limiter.record(client.host.address, self.monotonic_ns())
+        count = self._rate_limiter.record(client.host, self.monotonic_ns())
         if count:
             logger.warning(
                 "rig %s: closed the connection of %s, which did not send Modbus TCP: %s%s; check protocol and port of "

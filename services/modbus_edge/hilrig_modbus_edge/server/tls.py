@@ -22,8 +22,9 @@ from hilrig_runtime.errors import InputError
 Role = Literal["operator", "observer", "refuse"]
 """Permission of a client: write and read, read only, or no connection."""
 
-Serve = Callable[[asyncio.Transport, str, int, bool, bytes], None]
-"""Serves a client: its transport, host and port, whether it may write, and the data that it has already sent."""
+Serve = Callable[[asyncio.Transport, str, int, bool, str, bytes], None]
+"""Serves a client: its transport, host and port, whether it may write, the name in its certificate, and the data that
+it has already sent."""
 
 HANDSHAKE_TIMEOUT_S: Final = 5.0
 """Timeout of the TLS handshake and of the TLS shutdown, s."""
@@ -41,9 +42,10 @@ class TlsPolicy:
 
     def __init__(self, tls: TlsConfig) -> None:
         # Imported here: an edge without TLS does not load the certificate library.
-        from hilrig_runtime.security.x509 import role_of
+        from hilrig_runtime.security.x509 import common_name_of, role_of
 
         self._role_of = role_of
+        self.name_of = common_name_of
         self._no_role: Role = tls.no_role
         self.context = context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -123,7 +125,8 @@ class TlsHandshake(asyncio.Protocol):
             return
         if secured.is_closing():
             return
-        role = self._policy.role_of(secret.getpeercert(binary_form=True) or b"")
+        certificate = secret.getpeercert(binary_form=True) or b""
+        role = self._policy.role_of(certificate)
         if role == "refuse":
             self._admission.refuse(
                 host,
@@ -132,7 +135,7 @@ class TlsHandshake(asyncio.Protocol):
             )
             secured.abort()
             return
-        self._serve(secured, host, port, role == "operator", bytes(self._early))
+        self._serve(secured, host, port, role == "operator", self._policy.name_of(certificate), bytes(self._early))
 
     async def _do_handshake(self) -> asyncio.Transport | None:
         loop, context = asyncio.get_running_loop(), self._policy.context

@@ -14,7 +14,6 @@ from mcap.records import AttachmentIndex, Channel, McapRecord, MetadataIndex, Sc
 
 from hilrig_recorder.mcap_format.records import (
     CHUNK_HEAD_BYTES,
-    COMPRESSION,
     FOOTER_BYTES,
     MAGIC,
     MESSAGE,
@@ -255,7 +254,7 @@ def decompress(chunk: Chunk) -> bytes:
     """
     size = chunk.uncompressed_size
     try:
-        if chunk.compression == COMPRESSION:
+        if chunk.compression == "zstd":
             stated = zstandard.frame_content_size(chunk.data)
             if stated not in (-1, size):
                 raise DamagedError(f"chunk with inconsistent lengths: {stated}, expected {size}", chunk.offset)

@@ -33,7 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 MAGIC: Final = MCAP0_MAGIC
 """First and last bytes of a file."""
 COMPRESSION: Final = "zstd"
-"""Compression of the chunks that hilrig writes."""
+"""Compression of the chunks that hilrig writes; `chunk.compressor` makes it, `reader.decompress` reads it."""
 MAX_CHUNK_BYTES: Final = 128 << 20
 """Maximum uncompressed size of a chunk, bytes. A chunk that states a larger size is treated as damaged."""
 MAX_TIME_NS: Final = (1 << 63) - 1
@@ -48,7 +48,8 @@ _MESSAGE_CONTENT: Final = struct.Struct("<HIQQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
-_CHUNK_INDEX_TAIL: Final = struct.Struct("<QI4sQQ")
+_CHUNK_INDEX_TAIL: Final = struct.Struct("<QI")
+_SIZES: Final = struct.Struct("<QQ")
 _CHANNEL_OFFSET: Final = struct.Struct("<HQ")
 _CHANNEL_AND_LOG_TIME: Final = struct.Struct("<9xH4xQ").unpack_from
 _FOOTER: Final = struct.Struct("<BQQQI")
@@ -305,7 +306,9 @@ def encode_chunk_index(chunk: ChunkInfo) -> bytes:
     content = (
         _CHUNK_INDEX_HEAD.pack(chunk.first_ns, chunk.last_ns, chunk.start, chunk_size, len(channel_offsets))
         + channel_offsets
-        + _CHUNK_INDEX_TAIL.pack(offset - begin, len(name), name, chunk.data_size, chunk.raw_size)
+        + _CHUNK_INDEX_TAIL.pack(offset - begin, len(name))
+        + name
+        + _SIZES.pack(chunk.data_size, chunk.raw_size)
     )
     return RECORD_HEAD.pack(Opcode.CHUNK_INDEX.value, len(content)) + content
 

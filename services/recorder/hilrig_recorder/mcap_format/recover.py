@@ -114,7 +114,7 @@ def recover(source: Path, path: Path, *, should_continue: Callable[[], bool] = l
         should_continue: called between chunks; if it returns False, the new file is removed.
 
     Raises:
-        InputError: `source` can't be read, is not an MCAP file, or is being written.
+        InputError: `source` can't be read, is not an MCAP file, or is being written; or `path` exists.
         OperationError: the new file can't be written, or `should_continue` returned False.
     """
     if source.is_dir():
@@ -130,7 +130,7 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
     if finished and _is_intact(view, source, should_continue):
         return recovery
     if path.exists():
-        raise OperationError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
+        raise InputError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
     temporary_path = recovering_path(path)
     try:
         temporary_path.unlink(missing_ok=True)

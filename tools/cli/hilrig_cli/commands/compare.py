@@ -39,16 +39,18 @@ def compare(
     Exit code 1: at least one of several recordings could not be compared; it is listed with the reason.
     """
     from hilrig_replay.analysis.compare import compare as compare_runs
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_replay.plots.comparison_plot import save_comparison_plot
     from hilrig_replay.rerun_view.view import save_rrd
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.errors import HilrigError, InputError
 
     opened, unreadable = [], []
     for path in runs:
         try:
-            opened.append(open_run(path))
-        except InputError as error:
+            with isolated(path):
+                opened.append(open_run(path))
+        except HilrigError as error:
             # One unreadable recording of several is skipped; the reference is required.
             if not opened or len(runs) == 2:
                 raise

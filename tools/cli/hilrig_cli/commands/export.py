@@ -24,16 +24,18 @@ def export(
 ) -> None:
     """Convert a recording for other tools; print the path of each file that was written."""
     from hilrig_replay.export.export import export_foxglove, export_tables
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
 
     if foxglove is None and csv is None and parquet is None:
         raise InputError("no output given: add --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
-    opened = open_run(run)
     written: list[Path] = []
-    if foxglove is not None:
-        written.append(export_foxglove(opened, foxglove))
-    for folder, kind in ((csv, "csv"), (parquet, "parquet")):
-        if folder is not None:
-            written += export_tables(opened, folder, kind)
+    with isolated(run):
+        opened = open_run(run)
+        if foxglove is not None:
+            written.append(export_foxglove(opened, foxglove))
+        for folder, kind in ((csv, "csv"), (parquet, "parquet")):
+            if folder is not None:
+                written += export_tables(opened, folder, kind)
     sys.stdout.writelines(f"{path}\n" for path in written)

@@ -96,9 +96,11 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
         }
         if trace is not None:
             from hilrig_replay.export.delay_trace import delay_trace
+            from hilrig_replay.io.isolation import isolated
             from hilrig_replay.io.run import open_run
 
-            delays["command"] = delay_trace(open_run(trace))
+            with isolated(trace):
+                delays["command"] = delay_trace(open_run(trace))
         losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
         links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
         return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **links})

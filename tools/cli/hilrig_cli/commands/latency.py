@@ -34,9 +34,10 @@ def latency(
     Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
     from hilrig_replay.analysis.latency import measure
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import display_names, find_recordings
     from hilrig_replay.io.run import open_run
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.errors import HilrigError, InputError
 
     paths = find_recordings(runs)
     if plot is not None:
@@ -45,13 +46,14 @@ def latency(
 
         if len(paths) > 1:
             raise InputError(f"--plot: expected one recording, got {len(paths)}")
-        check_plot_path(plot)
+        check_plot_path(plot, paths)
     reports, unreadable = [], []
     for path in paths:
         try:
-            run = open_run(path)
-            report = measure(run)
-        except InputError as error:
+            with isolated(path):
+                run = open_run(path)
+                report = measure(run)
+        except HilrigError as error:
             # An unreadable recording of several is reported in its own line.
             if len(paths) == 1:
                 raise

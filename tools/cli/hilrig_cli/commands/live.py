@@ -25,6 +25,7 @@ def live(
 ) -> None:
     """Show a running rig in the rerun viewer, like `replay`, until the viewer is closed or Ctrl-C."""
     from hilrig_cli.client import check_rig
+    from hilrig_replay.io.output_file import output_file
     from hilrig_replay.rerun_view.layout import layout
     from hilrig_replay.rerun_view.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
     from hilrig_replay.rerun_view.sinks import to_file, to_viewer
@@ -50,7 +51,7 @@ def live(
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         check_rig(bus, lab, name)
         if save is not None:
-            stream = to_file(save, f"live-{name}", blueprint)
+            stream = to_file(closing.enter_context(output_file(save)), f"live-{name}", blueprint)
 
             def is_closed() -> bool:
                 return False

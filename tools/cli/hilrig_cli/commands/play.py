@@ -25,6 +25,7 @@ def play(
     import threading
 
     from hilrig_replay.export.player import Player, publish_recording, rig_config
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
@@ -33,7 +34,8 @@ def play(
     from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
 
     lab = load_lab(config)
-    opened = open_run(run)
+    with isolated(run):
+        opened = open_run(run)
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
         raise InputError(f"--rig: {name!r} is not a valid rig name")

@@ -1,5 +1,6 @@
 """`hilrig recover`: recovers truncated or damaged MCAP files."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,20 +25,28 @@ def recover(
     """Write complete, indexed files from truncated or damaged ones; originals are kept until the new files are stored.
 
     `RUN.mcap.part` becomes `RUN.mcap`; any other file is recovered to a new `.recovered.mcap` file in the same folder.
-    Exit code 1: data was lost.
+    Exit code 1: data was lost, or one of several files can't be recovered.
     """
     import json
     from dataclasses import asdict
 
     from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, recovered_path
     from hilrig_recorder.mcap_format.recover import recover as recover_file
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.errors import HilrigError, InputError
 
     if output is not None and len(files) > 1:
         raise InputError(f"--out: expected one input file, got {len(files)}")
-    recoveries = []
+    recoveries, failed = [], []
     for source in files:
-        recovery = recover_file(source, output or recovered_path(source))
+        try:
+            recovery = recover_file(source, output or recovered_path(source))
+        except HilrigError as error:
+            # A file of several that can't be recovered is reported in its own line.
+            if len(files) == 1:
+                raise
+            failed.append(str(error))
+            print(error, file=sys.stderr)
+            continue
         if recovery.path is not None and output is None and source.name.endswith(PART_SUFFIX):
             source.unlink()
         recoveries.append(recovery)
@@ -45,7 +54,7 @@ def recover(
             _print(recovery)
     if as_json:
         print(json.dumps([asdict(recovery) for recovery in recoveries], indent=2, default=str))
-    if any(recovery.damaged_bytes or recovery.orphans for recovery in recoveries):
+    if failed or any(recovery.damaged_bytes or recovery.orphans for recovery in recoveries):
         raise typer.Exit(1)
 
 

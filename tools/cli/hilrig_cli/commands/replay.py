@@ -20,6 +20,7 @@ def replay(
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
     """Show recordings in the rerun viewer: the arm in 3D, its curves, the loop latency and its stages, events."""
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_replay.rerun_view.view import save_rrd, send_runs
     from hilrig_replay.rerun_view.viewer import browser_address, free_port, running_viewer, wait_for_end
@@ -28,9 +29,13 @@ def replay(
 
     if save is not None and web:
         raise InputError("--save and --web can't be combined: use one of them")
-    opened = [open_run(path) for path in runs]
+    opened = []
+    for path in runs:
+        with isolated(path):
+            opened.append(open_run(path))
     if save is not None:
-        save_rrd(opened, save)
+        with isolated(save if len(runs) > 1 else runs[0]):
+            save_rrd(opened, save)
         return
     stopping = threading.Event()
     stop_on_signals(stopping)

@@ -38,29 +38,26 @@ def report(
     from rich.progress import Progress
 
     from hilrig_replay.grading.task_loading import load_task
+    from hilrig_replay.io.output_file import check_output, output_file
     from hilrig_replay.io.paths import find_recordings
-    from hilrig_replay.io.recording_file import refuse_recording
     from hilrig_replay.report.report import build_report
-    from hilrig_runtime.errors import InputError, OperationError
 
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: the folder {out.parent} does not exist")
-    refuse_recording(out)
+    paths = find_recordings(runs)
+    inputs = paths if task is None else [*paths, task]
+    check_output(out, inputs)
     graded_by = None if task is None else load_task(task)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
         result = build_report(
-            find_recordings(runs),
+            paths,
             verified=verify,
             task=graded_by,
             on_progress=lambda share: progress.update(bar, completed=share),
             workers=None,
         )
-    try:
-        out.write_text(result.html, encoding="utf-8")
-    except OSError as error:
-        raise OperationError(f"{out}: can't be written: {error.strerror or error}") from error
+    with output_file(out, inputs) as page:
+        page.write_text(result.html, encoding="utf-8")
     if as_json:
         print(
             json.dumps(

@@ -60,7 +60,10 @@ def runs(
     rebuild: Annotated[bool, typer.Option("--rebuild", help="Rebuild the index: read every file again.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason."""
+    """List recordings with duration, size, loop latency, losses and ending; unusable files with the reason.
+
+    Exit code 1: a listed recording is unusable.
+    """
     from hilrig_replay.analysis.index import RunIndex
     from hilrig_runtime.config.lab import load_lab
 
@@ -90,6 +93,8 @@ def runs(
         _print_json(index.folder, entries, total)
     else:
         _print_table(index.folder, entries, total, read)
+    if any(entry.error for entry in entries):
+        raise typer.Exit(1)
 
 
 def _wall_ns(option: str, text: str) -> int | None:

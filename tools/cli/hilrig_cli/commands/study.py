@@ -75,6 +75,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
     if live and not chosen.live:
         raise InputError(f"{file}: --live requires live points, but the study has none: add [[live]] with x and y")
     # Imported after the validation, so that errors in the study are reported without delay.
+    from hilrig_replay.io.output_file import check_output
     from hilrig_study.plots import Marker, plane_figure, save_plots, traces
     from hilrig_study.rerun_plots import save_study_rrd
     from hilrig_study.results import save_results
@@ -84,6 +85,8 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OperationError(f"{out}: results can't be written there: {error.strerror}") from error
+    for name in ("runs.parquet", "study.json", "study.rrd"):
+        check_output(out / name, [file, *controllers])
     columns = (*Progress.get_default_columns(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("sweep", total=1.0)
@@ -165,12 +168,13 @@ def _ms(seconds: float | None) -> str:
 
 
 def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Console") -> None:
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_study.live.from_recording import evaluate_gains
     from hilrig_study.study_config import load_study
 
     study = None if file is None else load_study(file)
-    with console.status("evaluating gains"):
+    with console.status("evaluating gains"), isolated(path):
         evaluation = evaluate_gains(open_run(path), study).as_dict()
     if as_json:
         print(json.dumps(evaluation))

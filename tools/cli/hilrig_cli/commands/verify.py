@@ -1,6 +1,7 @@
 """`hilrig verify`: re-simulates recordings and compares every state."""
 
 import json
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -28,19 +29,31 @@ def verify(
 ) -> None:
     """Re-simulate recordings from their torques and compare every state; the verdict is stored next to each file.
 
-    Exit code 1: re-simulation does not reproduce at least one recording.
+    Exit code 1: re-simulation does not reproduce at least one recording, or one of several can't be read.
     """
     from rich.console import Console
     from rich.text import Text
 
     from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
+    from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import find_recordings
+    from hilrig_runtime.errors import HilrigError
 
     console = Console()
-    verifications = []
-    for path in find_recordings(runs):
-        verification = resimulate(path, tolerance)
+    verifications, unreadable = [], []
+    paths = find_recordings(runs)
+    for path in paths:
+        try:
+            with isolated(path):
+                verification = resimulate(path, tolerance)
+        except HilrigError as error:
+            # An unreadable recording of several is reported in its own line.
+            if len(paths) == 1:
+                raise
+            unreadable.append({"path": str(path), "reason": str(error)})
+            print(error, file=sys.stderr)
+            continue
         # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
         with suppress(OSError):
             write_verdict(path, verification.same, verification.sentence())
@@ -50,6 +63,6 @@ def verify(
             console.print(Text(f"{path.name}: {verification.sentence()}", style=style), soft_wrap=True)
     if as_json:
         plain = [each.as_dict() for each in verifications]
-        print(json.dumps(plain[0] if len(plain) == 1 else {"runs": plain}))
-    if not all(each.same for each in verifications):
+        print(json.dumps(plain[0] if len(paths) == 1 else {"runs": plain, "unreadable": unreadable}))
+    if unreadable or not all(each.same for each in verifications):
         raise typer.Exit(1)

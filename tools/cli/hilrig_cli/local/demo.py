@@ -22,7 +22,7 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.config.lab import LabConfig, load_lab
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas import PartState
 from hilrig_sim.arm.model import RigParameters
 
@@ -32,7 +32,11 @@ OVERTIME_S: Final = 20.0
 """Extra time for the controller to finish its work, if no duration was given, s."""
 CONTROLLER_GRACE_S: Final = 15.0
 """Time for the controller to start and to end, besides its duration, s."""
-LAB_TEMPLATE: Final = """# The lab of `hilrig demo`: one rig with default settings, on free ports.
+LAB_NAME: Final = "demo"
+LAB_HEADING: Final = "# The lab of `hilrig demo`: one rig with default settings, on free ports."
+LAB_TEMPLATE: Final = (
+    LAB_HEADING
+    + """
 name = "demo"
 
 [edge]
@@ -46,6 +50,7 @@ first_port = {bus_port}
 [recorder]
 folder = {folder}
 """
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +83,17 @@ def run_demo(
         on_progress: receives the elapsed share of the duration.
 
     Raises:
+        InputError: the folder has a `lab.toml` of another lab.
         OperationError: the folder can't be written, a service could not start, or nothing was recorded.
     """
     recordings = out / "recordings"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # The folder holds the results of one demo only.
-        shutil.rmtree(recordings, ignore_errors=True)
         config = out / "lab.toml"
+        if config.exists() and not config.read_bytes().startswith(LAB_HEADING.encode()):
+            raise InputError(f"{config}: is not of a demo and is not overwritten: choose another folder with --out")
+        # The folder holds the results of one demo only. Recordings of other labs are kept.
+        shutil.rmtree(recordings / LAB_NAME, ignore_errors=True)
         config.write_text(
             LAB_TEMPLATE.format(
                 modbus_port=free_ports(LabConfig().edge.first_port),
@@ -101,7 +109,7 @@ def run_demo(
     with running_lab(lab, config, log, stopping) as supervisor:
         log(f"running {CONTROLLER} for {duration_s or DURATION_S:g} s over Modbus TCP at {lab.edge.host}:{_port(lab)}")
         result = _run_controller(lab, config, duration_s, supervisor.poll, on_progress)
-    found = sorted(recordings.rglob(MCAP_PATTERN))
+    found = sorted((recordings / LAB_NAME).rglob(MCAP_PATTERN))
     if not found:
         raise OperationError(f"{recordings}: no recording: did the controller connect? Its output: {result or 'none'}")
     return DemoRun(found[-1], result)

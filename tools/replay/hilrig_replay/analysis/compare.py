@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.summary import RunSummary, Trajectory, summarize, under_command
 from hilrig_replay.io.columns import JointValues, joint_values
+from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.run import Run
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import HilrigError, InputError
 
 MOTION_THRESHOLD: Final = (0.01, 0.01, 0.005, 0.01)
 """Minimum speed of a moving joint; rad/s, rad/s, m/s, rad/s."""
@@ -93,15 +94,17 @@ def compare(runs: Sequence[Run], align: str = "motion") -> Comparison:
     """
     if len(runs) < 2:
         raise InputError(f"a comparison requires at least two runs, got {len(runs)}")
-    reference, origin = _aligned(runs[0], align)
+    with isolated(runs[0].path):
+        reference, origin = _aligned(runs[0], align)
     kept, summaries, origins = [runs[0]], [reference], [origin]
     differences: list[Difference] = []
     left_out: list[str] = []
     for run in runs[1:]:
         try:
-            summary, origin = _aligned(run, align)
-            differences.append(_difference(reference, summary))
-        except InputError as error:
+            with isolated(run.path):
+                summary, origin = _aligned(run, align)
+                differences.append(_difference(reference, summary))
+        except HilrigError as error:
             left_out.append(str(error))
             continue
         kept.append(run)

@@ -20,6 +20,7 @@ from hilrig_recorder.mcap_format.reader import NoMcapError, RecordReader, Trunca
 from hilrig_recorder.mcap_format.records import DamagedError, decode_record
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.isolation import EvaluationError, isolated
 from hilrig_replay.io.recording_file import DamagedRecordingError
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import HilrigError, InputError
@@ -177,10 +178,11 @@ def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
     """Add the loop latency of a recording to its entry; damage of the file is reported in `error`."""
     path = folder / entry.path
     try:
-        report = measure(open_run(path))
+        with isolated(path):
+            report = measure(open_run(path))
     except HilrigError as error:
-        # `error` is for damaged files only: for others, the list shows how the recording ended.
-        damage = error.description if isinstance(error, DamagedRecordingError) else ""
+        # `error` is for unusable files only: for others, the list shows how the recording ended.
+        damage = error.description if isinstance(error, DamagedRecordingError | EvaluationError) else ""
         return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), error=damage)
     loop = report.loop_ms
     return replace(

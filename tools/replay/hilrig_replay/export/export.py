@@ -23,6 +23,7 @@ from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import Rows, StringTable
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
 from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
@@ -77,6 +78,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
     """Write `state`, `command`, `event` and `traffic` tables as `csv` or `parquet` into a folder.
 
     Raises:
+        InputError: a table would replace the recording.
         OperationError: the folder can't be written.
     """
     paths = {name: folder / f"{name}.{kind}" for name in TABLES}
@@ -88,7 +90,8 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
             for name, rows_of in TABLES.items():
                 schema = table(run, rows_of(empty)).schema
                 writer = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
-                writers[name] = closing.enter_context(writer(paths[name], schema))
+                temporary = closing.enter_context(output_file(paths[name], [run.path]))
+                writers[name] = closing.enter_context(writer(temporary, schema))
             for block in run.blocks():
                 for name, rows_of in TABLES.items():
                     rows = rows_of(block)

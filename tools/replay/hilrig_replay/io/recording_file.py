@@ -21,7 +21,7 @@ from hilrig_recorder.mcap_format.reader import (
     chunk_records,
     file_reader,
 )
-from hilrig_recorder.mcap_format.records import MAGIC, MAX_TIME_NS, Chunk, ChunkIndex, DamagedError, Message
+from hilrig_recorder.mcap_format.records import MAX_TIME_NS, Chunk, ChunkIndex, DamagedError, Message
 from hilrig_recorder.mcap_format.scan import Damage, read_chunk, scan
 from hilrig_replay.io.columns import RowBuffer, Rows
 from hilrig_runtime.errors import InputError
@@ -139,22 +139,6 @@ class _FileContents:
             self.counts[record.channel_id] = self.counts.get(record.channel_id, 0) + 1
             self.start_ns = min(self.start_ns, record.log_time)
             self.end_ns = max(self.end_ns, record.log_time)
-
-
-def refuse_recording(output: Path) -> None:
-    """Refuse to overwrite a recording: a file with the suffix of a recording or with the MCAP magic bytes.
-
-    Raises:
-        InputError: `output` is a recording.
-    """
-    try:
-        with output.open("rb") as file:
-            has_magic = file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        # Missing or unreadable: writing the file reports the error.
-        return
-    if has_magic or output.name.removesuffix(PART_SUFFIX).endswith(MCAP_SUFFIX):
-        raise InputError(f"{output} is a recording and is not overwritten: choose another output name")
 
 
 def open_recording(path: Path) -> RecordingFile:

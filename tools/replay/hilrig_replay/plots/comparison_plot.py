@@ -21,8 +21,9 @@ def save_comparison_plot(comparison: Comparison, path: Path) -> None:
         InputError: the path is not usable.
         OperationError: the file can't be written.
     """
-    check_plot_path(path)
-    save_figure(comparison_figure(comparison.summaries), path)
+    inputs = [run.path for run in comparison.runs]
+    check_plot_path(path, inputs)
+    save_figure(comparison_figure(comparison.summaries), path, inputs)
 
 
 def comparison_figure(runs: Sequence[RunSummary]) -> Figure:

@@ -1,38 +1,36 @@
 """Writing of figures to files."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 from matplotlib.figure import Figure
 
-from hilrig_replay.io.recording_file import refuse_recording
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_replay.io.output_file import check_output, output_file
+from hilrig_runtime.errors import InputError
 
 FORMATS: Final = (".png", ".svg", ".pdf")
 
 
-def check_plot_path(path: Path) -> None:
+def check_plot_path(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Check the output path of a plot, before the plot is computed.
 
     Raises:
-        InputError: its suffix is not a supported format, its folder does not exist, or it is a recording.
+        InputError: unsupported format, missing folder, or it is a recording or one of the inputs.
     """
     if path.suffix.lower() not in FORMATS:
         raise InputError(
             f"{path}: unsupported plot format {path.suffix!r}; the file name must end in {', '.join(FORMATS)}"
         )
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: folder {path.parent} does not exist")
-    refuse_recording(path)
+    check_output(path, inputs)
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path, inputs: Iterable[Path] = ()) -> None:
     """Write a figure to a file; the suffix selects the format.
 
     Raises:
+        InputError: the file is a recording or one of the inputs.
         OperationError: the file can't be written.
     """
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+    with output_file(path, inputs) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:].lower())

@@ -14,6 +14,7 @@ from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots.distribution_plot import distribution_figure
@@ -22,7 +23,7 @@ from hilrig_replay.plots.motion_plot import motion_figure
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, event_title
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.errors import InputError
+from hilrig_runtime.errors import HilrigError, InputError, OperationError
 from hilrig_runtime.process.process_pool import process_pool
 
 _MIN_RUNS_FOR_PROCESSES: Final = 4
@@ -160,7 +161,7 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
 
 def _pages(
     paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
-) -> Iterator[_Page | InputError]:
+) -> Iterator[_Page | HilrigError]:
     """Page of each run, or the reason why it is missing, in the order of `paths`."""
     names = display_names(paths)
     tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
@@ -171,11 +172,13 @@ def _pages(
             yield from executor.map(_page_or_error, *tasks)
 
 
-def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | InputError:
+def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | HilrigError:
     try:
-        return _page(open_run(path), name, verified, task)
-    except InputError as error:
-        return error
+        with isolated(path):
+            return _page(open_run(path), name, verified, task)
+    except HilrigError as error:
+        # The exceptions of recordings can't be sent between processes.
+        return OperationError(str(error)) if isinstance(error, OperationError) else InputError(str(error))
 
 
 def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:

@@ -7,28 +7,18 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hilrig_replay.io.recording_file import refuse_recording
 from hilrig_replay.rerun_view.csp_proxy import LOOPBACK
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.errors import OperationError
 
 APPLICATION = "hilrig"
 
 
 def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """Open a recording stream into a file.
+    """Open a recording stream into a file of `io.output_file.output_file`.
 
     Raises:
-        InputError: the folder does not exist, or the path is a recording.
         OperationError: the file can't be written.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: folder {path.parent} does not exist")
-    refuse_recording(path)
-    try:
-        # Opened here first, because the operating system's error is clearer than rerun's.
-        path.open("wb").close()
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
     stream = rr.RecordingStream(APPLICATION, recording_id=name)
     with _reports_write_errors(path):
         stream.save(path, default_blueprint=blueprint)

@@ -7,6 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
@@ -31,11 +32,12 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
     """Write runs as one rerun recording with its layout; several runs share one scene and the plots.
 
     Raises:
-        InputError: a run can't be read.
+        InputError: a run can't be read, or the file is one of the runs or another recording.
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    _write(to_file(path, _name(chosen), _layout(chosen)), chosen, file=path)
+    with output_file(path, [run.path for run in chosen]) as temporary:
+        _write(to_file(temporary, _name(chosen), _layout(chosen)), chosen, file=path)
 
 
 def send_runs(runs: Sequence[Run], grpc_port: int, is_closed: Callable[[], bool]) -> None:
