@@ -331,7 +331,7 @@ def test_released_part_flies_ballistically_and_stays(step_ns: int) -> None:
     assert plant.world.at_rest(0)
 
 
-def test_part_thrown_over_the_edge_of_the_table_falls_to_the_ground() -> None:
+def test_part_thrown_over_the_edge_falls_to_the_ground() -> None:
     table = SceneParameters(table_size=(1.0, 1.0), parts=(part("a", 0.45, 0.0),))
     plant = Plant([RigParameters(scene=table)])
     plant.world.set_state(0, [(0.45, 0.0, 0.2, 0.0)], NO_PART, plant.tool(np.array([0]))[:, 0])
@@ -344,7 +344,7 @@ def test_part_thrown_over_the_edge_of_the_table_falls_to_the_ground() -> None:
     assert plant.world.x[0, 0] > 0.7
 
 
-def test_recordings_of_the_first_plant_version_release_parts_at_rest() -> None:
+def test_plant_version_1_releases_parts_at_rest() -> None:
     plant, velocity = thrown(20_000_000, 0.08, version=1)
     start = plant.world.x[0, 0], plant.world.y[0, 0]
     assert np.hypot(*velocity[:2]) > 0.2

@@ -18,8 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.samples import MATCH_WINDOW_ROWS
-from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, JointValues, Rows, StringTable, joint_values
+from hilrig_replay.io.columns import JointValues, Rows, StringTable, joint_values
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
@@ -39,6 +38,9 @@ MIN_INTERVAL_STEPS: Final = 50
 BLOCK_STATES: Final = 16_384
 """Number of states in memory."""
 
+COMMAND_WINDOW_ROWS: Final = 1024
+"""States and commands of previous blocks that are searched for a match."""
+_DRIVE: Final = np.dtype([("key", "<u8"), ("effort", "<f8", (4,)), ("magnet", "?")])
 _OPTIONAL_FIELDS: Final = ("integration error", "sub-steps", "velocity of the parts")
 _EFFORT_RANGE: Final = (-LARGEST_EFFORT, LARGEST_EFFORT)
 
@@ -339,36 +341,37 @@ class _CommandCheck:
     """Compares the effort and magnet of each command with those of the state at which it first acts."""
 
     def __init__(self) -> None:
-        self._states = np.empty(0, STATE_DTYPE)
-        self._waiting = np.empty(0, COMMAND_DTYPE)
+        self._applied = np.empty(0, _DRIVE)
+        self._waiting = np.empty(0, _DRIVE)
 
     def add(self, states: Rows, commands: Rows) -> int:
         """Add a block; return the number of commands that differ from their state. A command may never act."""
         acting = states[(states["command_seq"] > 0) & ~states["safe"]]
-        known = np.concatenate((self._states, acting))
+        applied = np.concatenate((self._applied, _drives(acting, acting["command_seq"])))
         # The first state of each command.
-        _, first = np.unique(_keys(known["session"], known["command_seq"]), return_index=True)
-        known = known[np.sort(first)]
-        waiting = np.concatenate((self._waiting, commands))
-        wanted, keys = _keys(waiting["session"], waiting["seq"]), _keys(known["session"], known["command_seq"])
-        order = np.argsort(keys, kind="stable")
-        differing = 0
-        found = np.zeros(len(waiting), dtype=np.bool_)
-        if len(known):
-            rows = order[np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)]
-            found = keys[rows] == wanted
-            sent, applied = waiting[found], known[rows[found]]
-            effort = np.clip(np.nan_to_num(sent["effort"], nan=0.0, posinf=np.inf, neginf=-np.inf), *_EFFORT_RANGE)
-            differs = (effort != applied["effort"]).any(axis=1) | (sent["magnet"] != applied["magnet"])
+        applied = applied[np.sort(np.unique(applied["key"], return_index=True)[1])]
+        waiting = np.concatenate((self._waiting, _drives(commands, commands["seq"])))
+        order = np.argsort(applied["key"], kind="stable")
+        differing, found = 0, np.zeros(len(waiting), dtype=np.bool_)
+        if len(applied):
+            places = np.searchsorted(applied["key"][order], waiting["key"])
+            rows = order[np.minimum(places, len(order) - 1)]
+            found = applied["key"][rows] == waiting["key"]
+            sent, acts = waiting[found], applied[rows[found]]
+            effort = np.clip(np.nan_to_num(sent["effort"], posinf=np.inf, neginf=-np.inf), *_EFFORT_RANGE)
+            differs = (effort != acts["effort"]).any(axis=1) | (sent["magnet"] != acts["magnet"])
             differing = int(np.count_nonzero(differs))
-        self._states = known[-MATCH_WINDOW_ROWS:].copy()
-        self._waiting = waiting[~found][-MATCH_WINDOW_ROWS:].copy()
+        self._applied = applied[-COMMAND_WINDOW_ROWS:].copy()
+        self._waiting = waiting[~found][-COMMAND_WINDOW_ROWS:].copy()
         return differing
 
 
-def _keys(session: NDArray[Any], seq: NDArray[Any]) -> NDArray[np.uint64]:
-    """One number for each command: a session code has 16 bits, a sequence number less than 48."""
-    return np.asarray((session.astype(np.uint64) << np.uint64(48)) | seq)
+def _drives(rows: Rows, seq: NDArray[Any]) -> NDArray[np.void]:
+    drives = np.empty(len(rows), _DRIVE)
+    # A session code has 16 bits, a sequence number less than 48.
+    drives["key"] = (rows["session"].astype(np.uint64) << np.uint64(48)) | seq
+    drives["effort"], drives["magnet"] = rows["effort"], rows["magnet"]
+    return drives
 
 
 def _indices(codes: Rows, names: StringTable, parts: Sequence[str]) -> Ints:
