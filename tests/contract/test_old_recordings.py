@@ -32,7 +32,14 @@ def test_measures_the_same_latencies() -> None:
     assert report.loop_ms is not None
     assert (report.loop_ms.p50, report.loop_ms.max) == pytest.approx((39.999632, 60.0488), abs=1e-6)
     assert (report.lost.transport, report.lost.recorder) == (0, 0)
-    assert report.reasons == ("only 94 samples: 500 are required for a 99th percentile",)
+    assert [(reason.code, reason.text) for reason in report.reasons] == [
+        (
+            "too_few_samples",
+            "only 94 samples: 500 are required for a 99th percentile: record 11 s or longer at your 21 ms period",
+        )
+    ]
+    assert report.age_ms is not None
+    assert (report.age_ms.p50, report.age_ms.max) == pytest.approx((40.002267, 80.019113), abs=1e-6)
 
 
 def test_verifies_the_steps() -> None:

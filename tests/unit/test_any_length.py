@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.analysis import compare, diagnosis, disk_table, distribution, samples, summary, verify
+from hilrig_replay.analysis import compare, diagnosis, distribution, samples, summary, verify
 from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export import export
+from hilrig_replay.io import disk_table
 from hilrig_replay.io.run import Run, open_run
 from hilrig_replay.plots import latency_plot
 from hilrig_replay.plots.latency_plot import latency_figure

@@ -35,7 +35,7 @@ def test_counts_messages_of_a_damaged_chunk_as_lost_in_file(tmp_path: Path, numb
     recover(damaged, whole)
     report = measure(open_run(whole))
     assert (report.lost.transport, report.lost.recorder, report.lost.file) == (0, 0, messages)
-    assert any(f"{messages} messages lost in the damaged file" in reason for reason in report.reasons)
+    assert any(f"{messages} messages lost in the damaged file" in reason.text for reason in report.reasons)
     [entry] = RunIndex(tmp_path / "lab").load()
     assert (entry.lost_transport, entry.lost_recorder, entry.lost_file) == (0, 0, messages)
     assert f", {messages} in the file" in hilrig("latency", whole).stdout.replace("\n", " ")

@@ -133,7 +133,7 @@ def test_writer_without_reads_uses_basis_of_its_controller(bench: Bench) -> None
 
 
 def test_first_command_of_a_session_has_no_foreign_basis() -> None:
-    """A program on the same host that only reads goes on between two sessions."""
+    """A program on the same host that only reads continues between two sessions."""
     bench = Bench(grace_ns=2_000 * MS)
     bench.state(5)
     display = bench.connect(port=2)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.disk_table import DiskTable
 from hilrig_runtime.errors import OperationError
 
 ROW = np.dtype([("number", "<u8"), ("small", "<u2"), ("when", "<i8"), ("flag", "|b1")])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import Blocks
 from hilrig_replay.analysis.distribution import Statistics, complementary_cdf, differences, median, percentiles
+from hilrig_replay.io.disk_table import Blocks
 
 SHARES = (0, 1, 5, 25, 50, 75, 95, 99, 99.9, 100)
 

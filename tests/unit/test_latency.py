@@ -134,18 +134,7 @@ def test_report_dict_has_the_documented_keys(tmp_path: Path) -> None:
 def test_reports_why_a_recording_is_not_valid(tmp_path: Path, script: Script, words: str) -> None:
     report = measured(tmp_path, script)
     assert not report.fit
-    assert any(words in reason for reason in report.reasons), report.reasons
-
-
-def test_counts_steps_with_a_large_error_estimate(tmp_path: Path) -> None:
-    script = Script(seconds=12.0)
-    made = make(script)
-    states = [one.message for one in made if isinstance(one.message, JointState)]
-    for state, error in zip(states[100:103], (0.001, -0.02, 0.003), strict=True):
-        state.integration_error[1] = error
-    report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
-    text = "2 inaccurate steps of the simulation, estimated error up to 1.15 °"
-    assert text in report.reasons
+    assert any(words in reason.text for reason in report.reasons), report.reasons
 
 
 def test_counts_a_sequence_gap_as_lost_messages(tmp_path: Path) -> None:
@@ -153,7 +142,7 @@ def test_counts_a_sequence_gap_as_lost_messages(tmp_path: Path) -> None:
     made = make(script)
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script, missing={"state": {77, 78}})))
     assert report.lost.transport == 2
-    assert any("2 messages lost" in reason for reason in report.reasons)
+    assert any("2 messages lost" in reason.text for reason in report.reasons)
 
 
 def test_counts_samples_without_a_command(tmp_path: Path) -> None:
@@ -161,7 +150,7 @@ def test_counts_samples_without_a_command(tmp_path: Path) -> None:
     run = open_run(write(tmp_path / "run.mcap", make(script), script=script))
     used = int(run.states["command_seq"][300])
     report = measure(open_run(write(tmp_path / "less.mcap", make(script), script=script, missing={"command": {used}})))
-    assert any("the commands of 1 sample are not in the recording" in reason for reason in report.reasons)
+    assert any("the commands of 1 sample are not in the recording" in reason.text for reason in report.reasons)
 
 
 def test_reports_contradictory_timestamps(tmp_path: Path) -> None:
@@ -170,19 +159,19 @@ def test_reports_contradictory_timestamps(tmp_path: Path) -> None:
     state = next(one.message for one in made if isinstance(one.message, JointState) and one.message.step == 200)
     state.command_arrived_ns += 40 * MS
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
-    assert any("negative stage duration" in reason for reason in report.reasons)
+    assert any("negative stage duration" in reason.text for reason in report.reasons)
 
 
 def test_reports_a_lagging_recorder(tmp_path: Path) -> None:
     script = Script(seconds=12.0)
     run = open_run(write(tmp_path / "run.mcap", make(script), script=script, arrival_lag_ns=2_500_000_000))
-    assert any("the recorder lagged by up to 2.5 s" in reason for reason in measure(run).reasons)
+    assert any("the recorder lagged by up to 2.5 s" in reason.text for reason in measure(run).reasons)
 
 
 def test_measures_ticks_without_a_controller(tmp_path: Path) -> None:
     report = measure(open_run(record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))))
     assert (report.samples, report.loop_ms, report.stages_ms, report.fit) == (0, None, {}, False)
-    assert report.reasons == ("no closed loop: no controller wrote commands in this session",)
+    assert report.reason_text() == "no closed loop: no controller wrote commands in this session"
     assert report.jitter_ms.tick_lateness.max > 0
 
 
@@ -193,8 +182,8 @@ def test_torques_without_a_basis_do_not_close_a_loop(tmp_path: Path) -> None:
         if isinstance(one.message, JointState | TorqueCommand):
             one.message.basis_step = 0
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=Script(seconds=1.0))))
-    assert report.reasons == (
-        "no closed loop: no torque was applied that a controller wrote after it had read a state",
+    assert report.reason_text() == (
+        "no closed loop: no torque was applied that a controller wrote after it had read a state"
     )
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, RequestRates
 from hilrig_replay.io.columns import TRAFFIC_DTYPE, Rows, StringTable
+from hilrig_replay.rerun_view.request_rates import BIN_NS, MAX_CLIENTS, OTHER_CLIENTS, RequestRates
 
 
 def requests(names: StringTable, at_ms: list[float], *, controller: str = "a:1", **values: int) -> Rows:

@@ -171,7 +171,7 @@ def test_initial_zero_torque_is_not_a_controller_command(tmp_path: Path) -> None
     summary = summarize(
         run, parse_lab("[[task.poses]]\nname = 'here'\nposition_mm = [300, 0, 0]\ntolerance_mm = 900\n").task
     )
-    assert summary.latency.reasons == ("no closed loop: no controller wrote commands in this session",)
+    assert summary.latency.reason_text() == "no closed loop: no controller wrote commands in this session"
     assert summary.grade is not None
     assert summary.grade.score == 0
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
 from hilrig_study.live.from_recording import evaluate_gains, recorded_ages
@@ -19,7 +20,7 @@ def recorded(folder: Path, **script: object) -> Path:
 
 def test_ages_equal_loop_latency_and_grow_for_held_command(tmp_path: Path) -> None:
     run = open_run(recorded(tmp_path, injected_command_ms=45.0))
-    (ages,) = recorded_ages(run)
+    (ages,) = recorded_ages(measure(run))
     new = run.states[run.states["basis_step"] != 0]
     assert int(np.median(ages)) == round(float(np.median(new["loop_latency_ns"])) / 20e6)
     assert (np.diff(ages) <= 1).all()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilrig_modbus_edge.request_log import RequestLog
-from hilrig_replay.io.columns import TRAFFIC_DTYPE, RowBuffer, Rows, StringTable
+from hilrig_replay.io.columns import CONNECTION_DTYPE, TRAFFIC_DTYPE, RowBuffer, Rows, StringTable
 from hilrig_replay.io.traffic import traffic_decoder
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
@@ -16,7 +16,8 @@ READ, WRITE = bytes.fromhex("03 0004 0004"), bytes.fromhex("10 0000 0004 08 0001
 
 def rows_of(message: ModbusTraffic, names: StringTable | None = None) -> Rows:
     table = RowBuffer(TRAFFIC_DTYPE)
-    traffic_decoder(table, names or StringTable())(message.SerializeToString(), 1, 0)
+    decode = traffic_decoder(table, RowBuffer(CONNECTION_DTYPE), names or StringTable())
+    decode(message.SerializeToString(), 1, 0)
     return table.drain()
 
 
@@ -90,3 +91,13 @@ def test_batch_of_many_requests_is_small() -> None:
     for now_ns in np.arange(10**15, 10**15 + 256 * 20_000, 20_000).tolist():
         log.record(READ, now_ns, now_ns + 15_000, 0, "192.168.100.100:50000")
     assert len(log.drain(10**15, 10**18).SerializeToString()) < 256 * 12 + 100
+
+
+def test_reads_the_tcp_figures_of_connections() -> None:
+    message = ModbusTraffic(rig="rig1", wall_ns=7_000)
+    message.connections.add(controller="10.0.0.1:1", min_rtt_us=8_400, retransmissions=3)
+    table, names = RowBuffer(CONNECTION_DTYPE), StringTable()
+    traffic_decoder(RowBuffer(TRAFFIC_DTYPE), table, names)(message.SerializeToString(), 1, 0)
+    (row,) = table.drain()
+    assert (row["wall_ns"], row["min_rtt_us"], row["retransmissions"]) == (7_000, 8_400, 3)
+    assert names[int(row["controller"])] == "10.0.0.1:1"

@@ -46,6 +46,11 @@ class BusConfig(Section):
     tls: BusTlsConfig | None = None
     """Require certificates of this lab."""
 
+    @property
+    def router_host(self) -> str:
+        """Host name or address in the endpoint of the router."""
+        return self.router.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
+
     @model_validator(mode="after")
     def _router_and_tls_agree(self) -> "BusConfig":
         if self.topology == "router" and self.router.startswith("tls/") != (self.tls is not None):

@@ -80,7 +80,6 @@ class RecordingCatalog:
         self.error = "the recordings are being listed"
         """Reason why the list is missing or outdated; empty: none."""
         self._entries: list[RunEntry] = []
-        self._by_path: dict[str, RunEntry] = {}
         self._due_s = 0.0
         self._list_worker = Worker(ListWorker, folder)
         self._report_worker = Worker(ReportWorker)
@@ -102,7 +101,6 @@ class RecordingCatalog:
         self._due_s = time.monotonic() + max(LIST_PERIOD_S, LIST_REST_FACTOR * spent_s)
         if (entries, message) != (self._entries, self.error):
             self._entries, self.error = entries, message
-            self._by_path = {entry.path: entry for entry in entries}
             self.version += 1
 
     def search(self, query: str) -> dict[str, Any]:
@@ -126,9 +124,9 @@ class RecordingCatalog:
         Raises:
             InputError: the recording is not listed or does not exist anymore.
         """
-        entry = self._by_path.get(path)
-        found = None if entry is None else (self.folder / entry.path).resolve()
-        if found is None or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
+        found = (self.folder / path).resolve()
+        is_listed = any(entry.path == path for entry in self._entries)
+        if not is_listed or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
             raise InputError(f"unknown recording {path!r}")
         return found
 
@@ -179,6 +177,6 @@ def _row(entry: RunEntry) -> dict[str, Any]:
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = recording_stem(Path(entry.path).name)
-    row["unfit"] = "; ".join(entry.unfit_reasons)
+    row["unfit"] = "; ".join(reason.text for reason in entry.unfit_reasons)
     row["open"] = entry.ended == IN_PROGRESS
     return row

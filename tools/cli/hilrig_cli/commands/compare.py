@@ -101,6 +101,8 @@ def _print(comparison: "Comparison") -> None:
     for name, values in (
         ("Δ loop latency p50, ms", [one.loop_p50_ms for one in each]),
         ("Δ loop latency p99, ms", [one.loop_p99_ms for one in each]),
+        ("Δ age p50, ms", [one.age_p50_ms for one in each]),
+        ("Δ age p99, ms", [one.age_p99_ms for one in each]),
     ):
         table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
     console = Console()

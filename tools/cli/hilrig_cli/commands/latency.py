@@ -29,7 +29,9 @@ def latency(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the loop latency of recordings: its stages, percentiles, jitter, losses, and a diagnosis.
+    """Measure loop latency and age of recordings: stages, percentiles, jitter, losses, and a diagnosis.
+
+    The loop latency is measured once per command, the age of the basis of the acting torque at every step.
 
     Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
     """
@@ -99,6 +101,8 @@ def print_report(report: "LatencyReport") -> None:
         for stage in LOOP_STAGES:
             table.add_row(f"  {stage.title}", *report.stages_ms[stage.key].cells())
         table.add_section()
+    if report.age_ms is not None:
+        table.add_row("age", *report.age_ms.cells(), style="bold", end_section=True)
     table.add_row("tick lateness", *report.jitter_ms.tick_lateness.cells())
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
@@ -106,12 +110,14 @@ def print_report(report: "LatencyReport") -> None:
     if report.lost.file:
         lost += f", {report.lost.file} in the file"
     console.print(lost if report.loop_ms is None else jitter + lost)
+    for note in report.notes():
+        console.print(Text(note))
     for finding in report.findings:
         console.print(Text(f"• {finding.text}"))
     if report.fit:
         console.print(Text("valid for latency measurements", style="green"))
     else:
-        console.print(Text("not valid for latency measurements: " + "; ".join(report.reasons), style="yellow"))
+        console.print(Text(f"not valid for latency measurements: {report.reason_text()}", style="yellow"))
 
 
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
@@ -125,15 +131,17 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     title = f"Loop latency of {len(reports)} runs, ms"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("run", overflow="fold")
-    for column in ("samples", "p50", "p99", "p99.9", "max"):
+    for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("valid")
     for name, report in reports.items():
         loop = report.loop_ms
         figures = [f"{value:.2f}" for value in (loop.p50, loop.p99, loop.p999, loop.max)] if loop else ["–"] * 4
+        age = report.age_ms
+        figures += [f"{value:.2f}" for value in (age.p50, age.p99)] if age else ["–"] * 2
         table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
     console.print(table)
     for name, report in reports.items():
-        note = "; ".join(report.reasons) or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
+        note = report.reason_text() or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
         if note:
             console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))

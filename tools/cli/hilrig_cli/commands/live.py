@@ -1,25 +1,23 @@
 """`hilrig live`: shows a running rig in the rerun viewer."""
 
-import sys
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def live(
     rig: Annotated[
         str | None,
-        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig.", show_default=False),
+        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig."),
     ] = None,
     config: Config = None,
     save: Annotated[
         Path | None,
-        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
+        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
@@ -40,11 +38,7 @@ def live(
         raise InputError("--save and --web can't be combined: use one of them")
     lab = load_lab(config)
     name = rig or lab.rigs[0].name
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-
-    def log(line: str) -> None:
-        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+    stopping = stop_on_signals()
 
     blueprint = layout(live=True)
     with ExitStack() as closing:

@@ -170,7 +170,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     if wide:
         table.add_column("rig", no_wrap=True)
         table.add_column("start (UTC)", no_wrap=True)
-    for column in ("duration", "size", "p50 ms", "p99 ms", "lost"):
+    for column in ("duration", "size", "p50 ms", "p99 ms", "age p99", "lost"):
         table.add_column(column, justify="right", no_wrap=True)
     if wide:
         table.add_column("controller", no_wrap=True)
@@ -187,6 +187,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             format_size(entry.size),
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
+            _number(entry.age_p99_ms),
             f"[red]{lost}[/]" if lost else "0",
             *([entry.controller, _yes_no(entry.verified)] if wide else []),
             _yes_no(entry.fit),

@@ -15,14 +15,12 @@ if TYPE_CHECKING:
 def study(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="STUDY.TOML", help="Definition of the study (docs/studies.md).", show_default=False),
+        typer.Argument(metavar="STUDY.TOML", help="Definition of the study (docs/studies.md)."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("study-out"),
     controller: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE.PY", help="Add a controller: a file that defines class Controller.", show_default=False
-        ),
+        typer.Option(metavar="FILE.PY", help="Add a controller: a file that defines class Controller."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Also run the study's live points over Modbus TCP, on a separate lab.")
@@ -33,7 +31,6 @@ def study(
             "--from",
             metavar="RUN.MCAP",
             help="Use the latency of this recording: evaluate which gains are stable, and their margins.",
-            show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
@@ -188,10 +185,11 @@ def _print_gains(evaluation: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    latency = evaluation["latency"]
+    latency, age = evaluation["latency"], evaluation["age_ms"]
     title = (
         f"{evaluation['session']}: loop latency p50 {latency['p50_ms']:.1f}, p99 {latency['p99_ms']:.1f}, "
-        f"max {latency['max_ms']:.1f} ms; step {evaluation['step_ms']:g} ms"
+        f"max {latency['max_ms']:.1f} ms; age p50 {age['p50']:.1f}, p99 {age['p99']:.1f} ms; "
+        f"step {evaluation['step_ms']:g} ms"
     )
     table = Table(title=title, title_justify="left", title_style="bold")
     for column in ("controller", "gain", "stable", "mean-square growth", "expected cost", "delay margin, ms"):

@@ -333,12 +333,12 @@ function showRuns(list) {
     }
     if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
     if (run.error) {
-      row.append(html("td", {class: "long", colspan: "8"}, run.error), links);
+      row.append(html("td", {class: "long", colspan: "9"}, run.error), links);
       return row;
     }
     const lost = run.lost_transport + run.lost_recorder + run.lost_file;
     const fit = html("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
-    const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1)];
+    const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1), fixed(run.age_p99_ms, 1)];
     row.append(html("td", {}, run.controller || "none"), ...figures.map((text) => html("td", {class: "n"}, text)),
       html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, run.open ? "recording" : run.ended), links);
     return row;

@@ -41,6 +41,9 @@ class Difference:
     loop_p50_ms: float | None
     """Median loop latency minus that of the reference, ms; None: one of the runs has no samples."""
     loop_p99_ms: float | None
+    age_p50_ms: float | None
+    """Median age of the acting torque's basis minus that of the reference, ms; None: one of the runs has no age."""
+    age_p99_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +173,7 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
     effort = _at(theirs, theirs.effort, at) - _at(ours, ours.effort, at)
     apart_mm = np.linalg.norm(_at(theirs, theirs.tip, at) - _at(ours, ours.tip, at), axis=1) * 1e3
     mine, its = reference.latency.loop_ms, other.latency.loop_ms
+    my_age, its_age = reference.latency.age_ms, other.latency.age_ms
     return Difference(
         session=other.session,
         overlap_s=float(high - low),
@@ -180,6 +184,8 @@ def _difference(reference: RunSummary, other: RunSummary) -> Difference:
         effort_rms=joint_values(np.sqrt((effort**2).mean(axis=0))),
         loop_p50_ms=None if mine is None or its is None else its.p50 - mine.p50,
         loop_p99_ms=None if mine is None or its is None else its.p99 - mine.p99,
+        age_p50_ms=None if my_age is None or its_age is None else its_age.p50 - my_age.p50,
+        age_p99_ms=None if my_age is None or its_age is None else its_age.p99 - my_age.p99,
     )
 
 

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.data_quality import Stalls
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.distribution import Statistics, differences, median, percentiles
 from hilrig_replay.analysis.stages import CONTROLLER, EDGE, INJECTED, TICK_WAIT
 from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.disk_table import DiskTable
+from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_sim.arm.model import JOINT_SCALE
 
@@ -46,25 +47,26 @@ class Evidence:
     run: Run
     samples: DiskTable
     """Samples in the order of their states, fields as `SAMPLE_DTYPE`."""
-    loop_ms: Statistics | None
-    """Statistics of the loop latency; None: no samples."""
-    stages_ms: Mapping[str, Statistics]
-    """Statistics of the stages; empty: no samples."""
     step_ns: int
     stalls: Stalls
     """Ticks that were late by more than one step."""
+    reported_edge_stalls: Stalls
+    """Stalls that the edge reported."""
     cycle_ns: float
     """Median time between two writes; 0: fewer than two writes."""
-    _windows: list[tuple[Rows, Rows, Rows]] = field(default_factory=list)
+    loop_ms: Statistics | None = None
+    """Statistics of the loop latency; None: no samples."""
+    stages_ms: Mapping[str, Statistics] = field(default_factory=dict)
+    """Statistics of the stages; empty: no samples."""
+    _windows: list[Records] = field(default_factory=list)
 
-    def windows(self) -> list[tuple[Rows, Rows, Rows]]:
-        """States, commands and requests of up to `MAX_WINDOWS` windows, evenly spread over the run."""
+    def windows(self) -> list[Records]:
+        """Messages of up to `MAX_WINDOWS` windows, evenly spread over the run."""
         if not self._windows:
             duration = self.run.duration_s
             count = min(MAX_WINDOWS, max(1, round(duration / WINDOW_S)))
             for start in np.linspace(0, max(duration - WINDOW_S, 0), count):
-                records = self.run.between(float(start), float(start) + WINDOW_S)
-                self._windows.append((records.states, records.commands, records.traffic))
+                self._windows.append(self.run.between(float(start), float(start) + WINDOW_S))
         return self._windows
 
 
@@ -95,9 +97,24 @@ def simulation_stall(evidence: Evidence) -> Finding | None:
 
 
 def edge_stall(evidence: Evidence) -> Finding | None:
-    """Late responses of the Modbus edge, or writes that were published late as commands."""
+    """Stalls of the Modbus edge."""
+    stalls = edge_stalls(evidence)
+    if not stalls.count:
+        return None
+    longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
+    return Finding(
+        "edge_stall",
+        f"the Modbus edge stalled {stalls} (at {at_s:.1f} s), and delayed the requests: its host was overloaded",
+        {"stalls": stalls.count, "longest_ms": longest_ms, "at_s": at_s},
+    )
+
+
+def edge_stalls(evidence: Evidence) -> Stalls:
+    """Stalls that the edge reported; else late responses, or writes that were published late as commands."""
+    if evidence.reported_edge_stalls.count:
+        return evidence.reported_edge_stalls
     run, samples = evidence.run, evidence.samples
-    requests = [requests for _, _, requests in evidence.windows() if len(requests)]
+    requests = [window.traffic for window in evidence.windows() if len(window.traffic)]
 
     def waits() -> Iterator[tuple[NDArray[np.int64], Rows]]:
         for rows in samples.blocks(EDGE.key, "sampled_ns", "incarnation"):
@@ -106,7 +123,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
             yield rows["answered_ns"] - rows["arrived_ns"], rows
 
     if not len(samples) and not requests:
-        return None
+        return Stalls()
     limit_ns = max(EDGE_STALL_THRESHOLD_NS, 20 * median(lambda: (waited_ns for waited_ns, _ in waits())))
     longest_ns, at_ns = limit_ns, 0
     for waited_ns, rows in waits():
@@ -114,7 +131,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
         if waited_ns[worst] > longest_ns:
             longest_ns, at_ns = float(waited_ns[worst]), int(run.time_ns(rows[worst : worst + 1])[0])
     if longest_ns == limit_ns:
-        return None
+        return Stalls()
 
     def late_ns() -> Iterator[NDArray[np.int64]]:
         """Times of the late samples and requests, in chronological order."""
@@ -127,14 +144,8 @@ def edge_stall(evidence: Evidence) -> Finding | None:
             others = others[before:]
         yield others
 
-    stalls = 1 + sum(int((apart_ns > STALL_MERGE_WINDOW_NS).sum()) for apart_ns in differences(late_ns)())
-    longest_ms, at_s = longest_ns / MS, at_ns / 1e9
-    return Finding(
-        "edge_stall",
-        f"the Modbus edge stalled {_times(stalls)}, longest {longest_ms:.0f} ms at {at_s:.1f} s, and delayed the "
-        "requests: its host was overloaded",
-        {"stalls": stalls, "longest_ms": longest_ms, "at_s": at_s},
-    )
+    count = 1 + sum(int((apart_ns > STALL_MERGE_WINDOW_NS).sum()) for apart_ns in differences(late_ns)())
+    return Stalls(count, int(longest_ns), at_ns)
 
 
 def injected_delay(evidence: Evidence) -> Finding | None:
@@ -226,7 +237,7 @@ SLOW_NETWORK_SHARE: Final = 0.9
 def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
     """Requests that wait for an acknowledgment, because the client delays small segments (Nagle's algorithm)."""
     gaps = []
-    for _, _, requests in evidence.windows():
+    for requests in (window.traffic for window in evidence.windows()):
         for controller in np.unique(requests["controller"]):
             mine = requests[requests["controller"] == controller]
             gaps.append((mine["arrived_ns"][1:] - mine["answered_ns"][:-1]) / MS)
@@ -251,7 +262,7 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
 
 def previous_poll(evidence: Evidence) -> Finding | None:
     """Torques that are computed from the state of the previous poll: a pipeline delay of one cycle."""
-    found = [residuals for states, commands, _ in evidence.windows() for residuals in _residuals(states, commands)]
+    found = [residuals for window in evidence.windows() for residuals in _residuals(window.states, window.commands)]
     if len(found) < 3:
         return None
     newest, previous = np.median(np.array(found), axis=0)

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import Blocks
+from hilrig_replay.io.disk_table import Blocks
 
 MAX_SORTED_VALUES: Final = 1 << 18
 """Maximum number of values that are sorted at once (2 MB)."""

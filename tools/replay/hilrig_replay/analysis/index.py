@@ -19,6 +19,7 @@ from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, UNFINISHED_SUFFI
 from hilrig_recorder.mcap_format.reader import NoMcapError, RecordReader, TruncatedError, file_reader
 from hilrig_recorder.mcap_format.records import DamagedError, decode_record
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
+from hilrig_replay.analysis.data_quality import Reason
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.isolation import EvaluationError, isolated
 from hilrig_replay.io.recording_file import DamagedRecordingError
@@ -26,7 +27,7 @@ from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import HilrigError, InputError
 
 INDEX_NAME: Final = ".hilrig-index.json"
-INDEX_VERSION: Final = 3
+INDEX_VERSION: Final = 4
 VERDICT_SUFFIX: Final = ".verified"
 """Suffix of the file next to a recording with the result of `hilrig verify`."""
 IN_PROGRESS: Final = "recording"
@@ -65,12 +66,16 @@ class RunEntry:
     error: str = ""
     """Error that makes the file unusable; empty: no error."""
     measured: bool = False
-    """Whether the next four fields were measured."""
+    """Whether the next fields, up to `verified`, were measured."""
     loop_p50_ms: float | None = None
     loop_p99_ms: float | None = None
+    age_p50_ms: float | None = None
+    """Age of the acting torque's basis, over all steps."""
+    age_p99_ms: float | None = None
+    control_period_ms: float | None = None
     fit: bool | None = None
     """Whether the recording is valid for latency measurements."""
-    unfit_reasons: tuple[str, ...] = ()
+    unfit_reasons: tuple[Reason, ...] = ()
     verified: bool | None = None
     """Whether the re-simulation reproduced the states; None: not verified."""
 
@@ -145,7 +150,7 @@ class RunIndex:
             reasons = names.index("unfit_reasons")
             known = {}
             for row in index["runs"]:
-                row[reasons] = tuple(row[reasons])
+                row[reasons] = tuple(Reason(**reason) for reason in row[reasons])
                 known[row[0]] = RunEntry(*row)
             return known
         except (OSError, ValueError, KeyError, TypeError, IndexError):
@@ -183,15 +188,18 @@ def measure_entry(folder: Path, entry: RunEntry) -> RunEntry:
     except HilrigError as error:
         # `error` is for unusable files only: for others, the list shows how the recording ended.
         damage = error.description if isinstance(error, DamagedRecordingError | EvaluationError) else ""
-        return replace(entry, measured=True, fit=False, unfit_reasons=(str(error),), error=damage)
-    loop = report.loop_ms
+        return replace(entry, measured=True, fit=False, unfit_reasons=(Reason("unreadable", str(error)),), error=damage)
+    loop, age = report.loop_ms, report.age_ms
     return replace(
         entry,
         measured=True,
         loop_p50_ms=None if loop is None else round(loop.p50, 6),
         loop_p99_ms=None if loop is None else round(loop.p99, 6),
+        age_p50_ms=None if age is None else round(age.p50, 6),
+        age_p99_ms=None if age is None else round(age.p99, 6),
+        control_period_ms=None if report.control_period_ms is None else round(report.control_period_ms, 6),
         fit=report.fit,
-        unfit_reasons=tuple(report.reasons),
+        unfit_reasons=report.reasons,
     )
 
 

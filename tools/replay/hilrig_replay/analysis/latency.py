@@ -1,22 +1,29 @@
-"""Loop latency of a recording: samples with their stages, statistics, data quality and diagnosis.
+"""Loop latency and age of a recording: samples with their stages, statistics, data quality and diagnosis.
 
 A sample is a state at which a new command took effect. Its loop latency is t_k − t_b on the clock of the simulation,
 where b is the last state that was served to the controller. Each stage except `transport` is a difference of two
 timestamps of one clock; `transport`, the time on the bus in both directions, is the remainder. The stages therefore add
 up exactly, and timestamps of different clocks are never compared (docs/timing.md).
+
+A sample is only as good as its basis. A command of a connection that did not read itself is based on the state that
+another connection of the same controller was served. Its latency is measured only if the torques follow the positions.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from hilrig_replay.analysis.data_quality import DataQuality, Lost
-from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose
+from hilrig_replay.analysis.age import AgeTable
+from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
+from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose, edge_stalls
 from hilrig_replay.analysis.distribution import Statistics, percentiles
+from hilrig_replay.analysis.feedback import follows_positions
+from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
+from hilrig_replay.io.sequence_order import Repairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,25 +49,71 @@ class LatencyReport:
     loop_ms: Statistics | None
     """None: no closed loop (see `reasons`)."""
     stages_ms: dict[str, Statistics]
+    age_ms: Statistics | None
+    """Age of the loop at each step; None: no command that is based on a state took effect."""
+    control_period_ms: float | None
+    """Mean time from a command's effect to that of the next command."""
+    longest_hold_ms: float | None
+    """Longest time that one command acted."""
+    uncontrolled_share: float | None
+    """Share of the steps without an age, 0 to 1."""
+    older_than_steps: dict[str, float]
+    """Share of the steps whose age exceeds a number of steps, by this number."""
+    read_on_other_connection: bool
+    """Whether positions were read on another connection than torques were written."""
+    kernel_timestamps: bool
+    """Whether the kernel's timestamps separate *controller* from *edge*; else *controller* includes the wake-up of the
+    edge."""
+    network: NetworkShare | None
+    """Share of the network in *controller*; None: not recorded."""
     jitter_ms: Jitter
     lost: Lost
+    repaired: Repairs
+    """Duplicates that were dropped, and messages that were put in order."""
     fit: bool
     """Whether the recording is valid for latency measurements."""
-    reasons: tuple[str, ...]
+    reasons: tuple[Reason, ...]
     """Reasons why it is not valid; empty: it is valid."""
     findings: tuple[Finding, ...]
     """Probable causes of the latency."""
     table: SampleTable = field(repr=False, compare=False)
     """The samples, fields as `samples.SAMPLE_DTYPE`; `table["loop"]` is a column, shape (samples,)."""
+    ages: AgeTable | None = field(repr=False, compare=False)
+    """The age at each step; None: no loop, or removed."""
 
     def without_table(self) -> "LatencyReport":
-        """Copy without the samples, to save memory when many reports are kept."""
-        return replace(self, table=SampleTable())
+        """Copy without the samples and ages, to save memory when many reports are kept."""
+        return replace(self, table=SampleTable(), ages=None)
+
+    def notes(self) -> list[str]:
+        """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
+        notes = []
+        if self.age_ms is not None and self.control_period_ms is not None and self.longest_hold_ms is not None:
+            older = ", ".join(f"{share:.1%} > {steps}" for steps, share in self.older_than_steps.items())
+            notes.append(
+                f"control period {self.control_period_ms:.1f} ms, longest hold {self.longest_hold_ms:.0f} ms; "
+                f"age in steps: {older}; uncontrolled {self.uncontrolled_share or 0.0:.1%}"
+            )
+        if self.network is not None and str(self.network):
+            notes.append(str(self.network))
+        if self.loop_ms is not None and self.read_on_other_connection:
+            notes.append("read on another connection: positions and torques of the controller have one each")
+        if self.loop_ms is not None and not self.kernel_timestamps:
+            notes.append("without kernel timestamps: controller includes the wake-up of the edge")
+        if self.repaired.duplicates:
+            notes.append(f"dropped duplicate messages: {self.repaired.duplicates}")
+        if self.repaired.reordered:
+            notes.append(f"messages put in order by their sequence number: {self.repaired.reordered}")
+        return notes
+
+    def reason_text(self) -> str:
+        """Reasons why the recording is not valid, as one text; empty: it is valid."""
+        return "; ".join(reason.text for reason in self.reasons)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples."""
         plain = asdict(self.without_table())
-        del plain["table"]
+        del plain["table"], plain["ages"]
         return plain
 
 
@@ -74,30 +127,42 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
     Raises:
         InputError: the file is damaged.
     """
-    matcher, table, quality = CommandMatcher(), SampleTable(), DataQuality(run)
-    for block in run.blocks(frozenset({"state", "command", "event"})):
+    matcher, table, quality, ages = CommandMatcher(), SampleTable(), DataQuality(run), AgeTable(run)
+    for block in run.blocks(frozenset({"state", "command", "event"}), repairs=quality.repairs):
         if on_block is not None:
             on_block(block)
         samples = matcher.add(block.states, block.commands)
         table.add(samples)
-        quality.add(block.states, block.commands, samples)
+        ages.add(block)
+        quality.add(block, samples)
     table.finish()
-    reasons = tuple(quality.reasons(matcher.unmatched))
-    loop, stages, spread = None, {}, 0.0
+    ages.finish()
+    age, loop, stages, spread = ages.statistics(), None, {}, 0.0
+    evidence = Evidence(
+        run=run,
+        samples=table,
+        step_ns=run.step_ns,
+        stalls=quality.stalls,
+        reported_edge_stalls=quality.edge_stalls,
+        cycle_ns=quality.cycle_ns(),
+    )
+    other_connection = _other_connection_share(table) >= 0.5
+    open_loop = other_connection and not follows_positions(
+        (window.states, window.commands) for window in evidence.windows()
+    )
+    if open_loop:
+        # The basis of the commands is not their basis.
+        table, age = SampleTable(), None
+        evidence = replace(evidence, samples=table)
     if len(table):
         loop = Statistics.of(table.column("loop"))
         stages = {stage: Statistics.of(table.column(stage)) for stage in STAGES}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
-    evidence = Evidence(
-        run=run,
-        samples=table,
-        loop_ms=loop,
-        stages_ms=stages,
-        step_ns=run.step_ns,
-        stalls=quality.stalls,
-        cycle_ns=quality.cycle_ns(),
-    )
+        evidence = replace(evidence, loop_ms=loop, stages_ms=stages)
+    reasons = tuple(quality.reasons(matcher.unmatched, loop, age, edge_stalls(evidence)))
+    if open_loop:
+        reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
     return LatencyReport(
         session=run.session,
         rig=run.rig,
@@ -106,10 +171,34 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
         stages_ms=stages,
+        age_ms=age.age_ms if age else None,
+        control_period_ms=age.control_period_ms if age else None,
+        longest_hold_ms=age.longest_hold_ms if age else None,
+        uncontrolled_share=age.uncontrolled_share if age else None,
+        older_than_steps=age.older_than_steps if age else {},
+        read_on_other_connection=other_connection,
+        kernel_timestamps=_kernel_timestamps(table),
+        network=network_share(evidence),
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),
+        repaired=quality.repairs,
         fit=not reasons,
         reasons=reasons,
         findings=tuple(diagnose(evidence)),
         table=table,
+        ages=ages if age else None,
     )
+
+
+def _other_connection_share(samples: SampleTable) -> float:
+    """Share of the samples whose basis was served to another connection than the one that wrote."""
+    marked = sum(int(values.sum()) for values in samples.column("basis_on_other_connection")())
+    return marked / max(len(samples), 1)
+
+
+def _kernel_timestamps(samples: SampleTable) -> bool:
+    """Whether the kernel's timestamp of each write is recorded."""
+    if not len(samples):
+        return False
+    rows = samples.blocks("write_received_ns", "write_arrived_ns")
+    return all(bool((block["write_received_ns"] != block["write_arrived_ns"]).all()) for block in rows)

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.disk_table import DiskTable
 from hilrig_replay.analysis.stages import LOOP_STAGES, STAGES, fill_stages
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
+from hilrig_replay.io.disk_table import DiskTable
 
 SAMPLE_DTYPE: Final = np.dtype(
     [
@@ -24,11 +24,13 @@ SAMPLE_DTYPE: Final = np.dtype(
         ("loop", "<i8"),
         *((stage, "<i8") for stage in STAGES),
         ("write_arrived_ns", "<i8"),
+        ("write_received_ns", "<i8"),
         ("state_served_ns", "<i8"),
+        ("basis_on_other_connection", "|b1"),
     ]
 )
-"""One row per sample: `loop` and the stages in ns, `sampled_ns` on the clock of the simulation, the last two fields on
-the clock of the edge."""
+"""One row per sample: `loop` and the stages in ns, `sampled_ns` on the clock of the simulation, `write_arrived_ns`,
+`write_received_ns` and `state_served_ns` on the clock of the edge."""
 
 MATCH_WINDOW_ROWS: Final = 4096
 """Rows of previous blocks that are searched for a match: more than a minute at a step of 20 ms."""
@@ -105,7 +107,7 @@ def _samples(states: Rows, commands: Rows) -> NDArray[np.void]:
     samples = np.empty(len(states), SAMPLE_DTYPE)
     for name in ("step", "incarnation", "sampled_ns", "wall_ns", "basis_step", "command_seq"):
         samples[name] = states[name]
-    for name in ("write_arrived_ns", "state_served_ns"):
+    for name in ("write_arrived_ns", "write_received_ns", "state_served_ns", "basis_on_other_connection"):
         samples[name] = commands[name]
     samples["loop"] = states["loop_latency_ns"]
     fill_stages(samples, LOOP_STAGES, states, commands)

@@ -45,19 +45,19 @@ CONTROLLER: Final = Stage(
     key="controller",
     title="controller",
     color="#f58518",
-    span="served → write arrived: network round trip and computation of the controller",
+    span="served → write received: network round trip and computation of the controller",
     clock="edge",
-    added=("write_arrived_ns",),
+    added=("write_received_ns",),
     subtracted=("state_served_ns",),
 )
 EDGE: Final = Stage(
     key="edge",
     title="edge",
     color="#54a24b",
-    span="write arrived → command sent",
+    span="write received → command sent",
     clock="edge",
     added=("sent_ns",),
-    subtracted=("write_arrived_ns", "command_injected_ns"),
+    subtracted=("write_received_ns", "command_injected_ns"),
 )
 INJECTED: Final = Stage(
     key="injected",

@@ -78,6 +78,7 @@ COMMAND_DTYPE: Final = np.dtype(
         ("state_arrived_ns", "<i8"),
         ("state_served_ns", "<i8"),
         ("write_arrived_ns", "<i8"),
+        ("write_received_ns", "<i8"),
         ("sent_ns", "<i8"),
         ("state_injected_ns", "<i8"),
         ("command_injected_ns", "<i8"),
@@ -89,10 +90,11 @@ COMMAND_DTYPE: Final = np.dtype(
         ("controller", "<u2"),
         ("magnet", "|b1"),
         ("safe", "|b1"),
+        ("basis_on_other_connection", "|b1"),
     ]
 )
 """One row per `TorqueCommand`, units as in torque_command.proto; `session` and `controller` are codes of a
-`StringTable`."""
+`StringTable`. `write_received_ns`: `write_arrived_ns` if the kernel's timestamp is unavailable."""
 
 TRAFFIC_DTYPE: Final = np.dtype(
     [
@@ -107,6 +109,11 @@ TRAFFIC_DTYPE: Final = np.dtype(
     ]
 )
 """One row per Modbus request, units as in modbus_traffic.proto; `wall_ns` is `arrived_ns` on the wall clock."""
+
+CONNECTION_DTYPE: Final = np.dtype(
+    [("wall_ns", "<i8"), ("min_rtt_us", "<u4"), ("retransmissions", "<u4"), ("controller", "<u2")]
+)
+"""One row per `ModbusConnection`, units as in modbus_traffic.proto; `wall_ns`: time of its batch."""
 
 PART_DTYPE: Final = np.dtype(
     [
@@ -287,6 +294,7 @@ def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
             message.state_arrived_ns,
             message.state_served_ns,
             message.write_arrived_ns,
+            message.write_received_ns or message.write_arrived_ns,
             message.sent_ns,
             message.state_injected_ns,
             message.command_injected_ns,
@@ -298,6 +306,7 @@ def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
             code(message.controller),
             message.magnet,
             message.safe,
+            message.basis_on_other_connection,
         )
 
     return decode

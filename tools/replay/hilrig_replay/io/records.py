@@ -8,6 +8,7 @@ import numpy as np
 
 from hilrig_replay.io.columns import (
     COMMAND_DTYPE,
+    CONNECTION_DTYPE,
     PART_DTYPE,
     STATE_DTYPE,
     TRAFFIC_DTYPE,
@@ -52,11 +53,13 @@ class Records:
     """Shape (n,), fields as `columns.TRAFFIC_DTYPE`: one row per Modbus request."""
     parts: Rows
     """Shape (n,), fields as `columns.PART_DTYPE`: poses of the scene's parts, from the states that contain them."""
+    connections: Rows
+    """Shape (n,), fields as `columns.CONNECTION_DTYPE`: TCP figures of the connections."""
 
     @property
-    def arrays(self) -> tuple[Rows, Rows, Rows, Rows, Rows]:
+    def arrays(self) -> tuple[Rows, Rows, Rows, Rows, Rows, Rows]:
         """All arrays, in the order of the fields."""
-        return self.states, self.commands, self.events, self.traffic, self.parts
+        return self.states, self.commands, self.events, self.traffic, self.parts, self.connections
 
 
 class Decoder:
@@ -70,7 +73,7 @@ class Decoder:
             RowBuffer(COMMAND_DTYPE),
             RowBuffer(TRAFFIC_DTYPE),
         )
-        self._parts = RowBuffer(PART_DTYPE)
+        self._parts, self._connections = RowBuffer(PART_DTYPE), RowBuffer(CONNECTION_DTYPE)
         self._events: list[tuple[Any, ...]] = []
         self._decoders = self._new_decoders()
 
@@ -81,7 +84,7 @@ class Decoder:
             "state": state_decoder(self._states, self._parts, self._names),
             "command": command_decoder(self._commands, self._names),
             "event": lambda payload, *_: events.append(_event_row(payload)),
-            "traffic": traffic_decoder(self._traffic, self._names),
+            "traffic": traffic_decoder(self._traffic, self._connections, self._names),
         }
 
     def add(self, topic: str, payload: bytes, sequence: int, log_ns: int) -> None:
@@ -97,7 +100,12 @@ class Decoder:
         events = np.array(self._events, EVENT_DTYPE)
         self._events.clear()
         records = Records(
-            self._states.drain(), self._commands.drain(), events, self._traffic.drain(), self._parts.drain()
+            self._states.drain(),
+            self._commands.drain(),
+            events,
+            self._traffic.drain(),
+            self._parts.drain(),
+            self._connections.drain(),
         )
         self._timebase.update(records.states)
         # A protobuf message that is reused for parsing never frees memory: new decoders bound its growth.
@@ -122,7 +130,7 @@ def enum_name(enum: Any, number: int) -> str:
 
 def concatenate_records(blocks: Sequence[Records]) -> Records:
     """Concatenate blocks in the given order."""
-    dtypes = (STATE_DTYPE, COMMAND_DTYPE, EVENT_DTYPE, TRAFFIC_DTYPE, PART_DTYPE)
+    dtypes = (STATE_DTYPE, COMMAND_DTYPE, EVENT_DTYPE, TRAFFIC_DTYPE, PART_DTYPE, CONNECTION_DTYPE)
     return Records(
         *(concatenate_rows([block.arrays[at] for block in blocks], dtype) for at, dtype in enumerate(dtypes))
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile, open_recording
 from hilrig_replay.io.records import Decoder, Records, concatenate_records
+from hilrig_replay.io.sequence_order import Repairs, in_sequence
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError
 
@@ -36,7 +37,7 @@ class Losses:
     recorder: int
     """Messages that arrived and could not be written."""
     file: int = 0
-    """Messages of a damaged file that could not be recovered."""
+    """Messages that were written, but are not in the file: it was damaged, truncated or edited."""
 
 
 class Run:
@@ -131,7 +132,7 @@ class Run:
         if transport is None or recorder is None:
             return None
         written = self.number("summary", "messages") or 0
-        missing = max(0, written - sum(self.file.counts.values())) if self.damaged else 0
+        missing = max(0, written - sum(self.file.counts.values()))
         return Losses(transport, recorder, missing)
 
     @property
@@ -140,6 +141,12 @@ class Run:
         damaged_bytes = self.number("recovered", "damaged_bytes") or 0
         truncated_bytes = self.number("recovered", "torn_bytes") or 0
         return damaged_bytes > truncated_bytes or bool(self.number("recovered", "orphans"))
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the file was recovered without its last bytes."""
+        ended = self._metadata_text("summary", "ended")
+        return self.recovered and (ended == "recovered" or bool(self.number("recovered", "torn_bytes")))
 
     @property
     def recovered(self) -> bool:
@@ -205,8 +212,9 @@ class Run:
         rows: int = BLOCK_ROWS,
         from_ns: int | None = None,
         until_ns: int | None = None,
+        repairs: Repairs | None = None,
     ) -> Iterator[Records]:
-        """Iterate over the run in blocks of about `rows` messages, in file order.
+        """Iterate over the run in blocks of about `rows` messages; each sender's in the order in which it sent them.
 
         Messages of different senders are in their order of arrival, so the command of a state can be in the block
         before or after it.
@@ -216,10 +224,16 @@ class Run:
             rows: messages per block.
             from_ns: start of the range of arrival times at the recorder, wall clock; None: the beginning.
             until_ns: end of the range, excluded; None: the end.
+            repairs: counts the messages that are not in this order in the file.
 
         Raises:
             InputError: the file is damaged.
         """
+        return in_sequence(self._in_file_order(topics, rows, from_ns, until_ns), repairs or Repairs())
+
+    def _in_file_order(
+        self, topics: frozenset[str], rows: int, from_ns: int | None, until_ns: int | None
+    ) -> Iterator[Records]:
         decoder = Decoder(self.names, self.timebase)
         topic_of = self.file.topics
         count = 0

@@ -8,8 +8,14 @@ from hilrig_replay.io.columns import DecodeFunction, RowBuffer, StringTable
 from hilrig_schemas import ModbusKind, ModbusRequest, ModbusTraffic
 
 
-def traffic_decoder(requests: RowBuffer, names: StringTable) -> DecodeFunction:
-    """Return a function that adds the requests of `ModbusTraffic` messages to a `columns.TRAFFIC_DTYPE` buffer."""
+def traffic_decoder(requests: RowBuffer, connections: RowBuffer, names: StringTable) -> DecodeFunction:
+    """Return a function that adds `ModbusTraffic` messages to two buffers.
+
+    Args:
+        requests: rows as `columns.TRAFFIC_DTYPE`.
+        connections: TCP figures, rows as `columns.CONNECTION_DTYPE`.
+        names: texts of the codes in the rows.
+    """
     message = ModbusTraffic()
     parse, add = message.ParseFromString, requests.append
 
@@ -30,5 +36,7 @@ def traffic_decoder(requests: RowBuffer, names: StringTable) -> DecodeFunction:
         for request in message.requests:
             arrived_ns = request.arrived_ns
             add(wall_from_monotonic + arrived_ns, arrived_ns, request.answered_ns, *fields(request))
+        for tcp in message.connections:
+            connections.append(message.wall_ns, tcp.min_rtt_us, tcp.retransmissions, names.code(tcp.controller))
 
     return decode

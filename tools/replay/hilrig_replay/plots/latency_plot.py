@@ -1,20 +1,25 @@
-"""Plot of a run's loop latency: histogram, stages, tail distribution, and course over time."""
+"""Plot of a run's loop latency and age: histogram, stages, tail distribution, and course over time."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.latency import LatencyReport
 from hilrig_replay.analysis.stages import LOOP_STAGES
+from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
-from hilrig_replay.plots.palette import LOOP_COLOR, TEXT_COLOR
+from hilrig_replay.plots.palette import AGE_COLOR, LOOP_COLOR, TEXT_COLOR
 from hilrig_runtime.errors import InputError
+
+Floats = NDArray[np.float64]
 
 _PERCENTILE_COLOR: Final = "#d62728"
 _MAX_HISTORY_POINTS: Final = 4000
@@ -48,7 +53,7 @@ def latency_figure(report: LatencyReport, run: Run) -> Figure:
     _tail(above, report)
     _history(history, run, report)
     verdict = "valid" if report.fit else "not valid"
-    reason = "" if report.fit else f": {report.reasons[0]}"
+    reason = "" if report.fit else f": {report.reasons[0].text}"
     figure.suptitle(
         f"Loop latency of {report.session}\n"
         f"{report.samples} samples, step {report.step_ms:g} ms, controller {report.controller or '(none)'} · "
@@ -123,7 +128,11 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
 
 def _tail(axes: Axes, report: LatencyReport) -> None:
     loop_ns, share_above = complementary_cdf(report.table.column("loop"))
-    axes.step(loop_ns / 1e6, share_above, where="post", color=LOOP_COLOR, linewidth=1.4)
+    axes.step(loop_ns / 1e6, share_above, where="post", color=LOOP_COLOR, linewidth=1.4, label="loop latency")
+    if report.ages is not None:
+        age_ns, share_older = complementary_cdf(report.ages.ages_ns)
+        axes.step(age_ns / 1e6, share_older, where="post", color=AGE_COLOR, linewidth=1.4, label="age at each step")
+        share_above = np.append(share_above, min(share_above[-1], share_older[-1]))
     set_log_scale(axes)
     axes.grid(color="#e5e5e5", linewidth=0.6)
     for share, name in ((0.5, "p50"), (0.05, "p95"), (0.01, "p99"), (0.001, "p99.9")):
@@ -139,21 +148,20 @@ def _tail(axes: Axes, report: LatencyReport) -> None:
                 color=_PERCENTILE_COLOR,
             )
     axes.set_xlim(left=max(0.0, float(loop_ns[0]) / 1e6 - 0.1 * report.step_ms))
-    label_axes(axes, "Loop latency, tail distribution", "loop latency, ms", "share of slower samples")
+    axes.legend(fontsize=8, loc="upper right", bbox_to_anchor=(0.94, 1.0))
+    label_axes(axes, "Tail distributions", "loop latency, age, ms", "share of slower samples, older steps")
 
 
 def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
-    # Downsampling keeps the slowest sample of each bin.
-    bin_size = -(-report.samples // _MAX_HISTORY_POINTS)
-    count = -(-report.samples // bin_size)
-    time_s, slowest = np.zeros(count), np.zeros(count)
-    start = 0
-    for samples in report.table.blocks("loop", "sampled_ns", "incarnation"):
-        bins = np.arange(start, start + len(samples)) // bin_size
-        np.maximum.at(slowest, bins, samples["loop"] / 1e6)
-        # In reverse order, so that each bin gets the time of its first sample in the block.
-        time_s[bins[::-1]] = run.time_s(samples)[::-1]
-        start += len(samples)
+    top_ms = 0.0
+    if report.ages is not None:
+        rows = report.ages.rows("age_ns", "sampled_ns", "incarnation")
+        count = sum(len(ages) for ages in report.ages.ages_ns())
+        time_s, oldest = _downsampled(run, (block[block["age_ns"] > 0] for block in rows), "age_ns", count)
+        axes.plot(time_s, oldest, color=AGE_COLOR, linewidth=0.7, rasterized=True, zorder=1)
+        top_ms = float(oldest.max())
+    samples = report.table.blocks("loop", "sampled_ns", "incarnation")
+    time_s, slowest = _downsampled(run, samples, "loop", report.samples)
     axes.plot(
         time_s,
         slowest,
@@ -163,6 +171,21 @@ def _history(axes: Axes, run: Run, report: LatencyReport) -> None:
         color=LOOP_COLOR,
         rasterized=True,
     )
-    axes.set_ylim(0, 1.1 * float(slowest.max()))
+    axes.set_ylim(0, 1.1 * max(top_ms, float(slowest.max())))
     axes.axhline(report.step_ms, color="#bbbbbb", linewidth=0.8, zorder=0)
-    label_axes(axes, "Loop latency over time", "time since start, s", "loop latency, ms")
+    label_axes(axes, "Loop latency (dots) and age (line) over time", "time since start, s", "loop latency, age, ms")
+
+
+def _downsampled(run: Run, blocks: Iterable[Rows], name: str, count: int) -> tuple[Floats, Floats]:
+    """Times, s, and values, ms, of a column in ns of `count` rows; of each bin of rows the largest value."""
+    bin_size = -(-count // _MAX_HISTORY_POINTS)
+    bins = -(-count // bin_size)
+    time_s, largest = np.zeros(bins), np.zeros(bins)
+    start = 0
+    for rows in blocks:
+        at = np.arange(start, start + len(rows)) // bin_size
+        np.maximum.at(largest, at, rows[name] / 1e6)
+        # In reverse order, so that each bin gets the time of its first row in the block.
+        time_s[at[::-1]] = run.time_s(rows)[::-1]
+        start += len(rows)
+    return time_s, largest

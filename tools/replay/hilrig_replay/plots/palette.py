@@ -4,6 +4,8 @@ from typing import Final
 
 TEXT_COLOR: Final = "#333333"
 LOOP_COLOR: Final = "#4c78a8"
+AGE_COLOR: Final = "#e45756"
+"""Age of the loop at each step."""
 JOINT_SYMBOLS: Final = ("θ1", "θ2", "d3", "θ4")
 JOINT_COLORS: Final = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
 PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")

@@ -236,9 +236,11 @@ def _facts(page: _Page) -> str:
         facts.append((f"{summary.placement.placed} of {len(summary.placement.parts)}", f"parts placed; {within}"))
     loop = summary.latency.loop_ms
     if loop is None:
-        facts.append(("–", f"loop latency: {summary.latency.reasons[-1]}"))
+        facts.append(("–", f"loop latency: {summary.latency.reasons[-1].text}"))
     else:
         facts.append((f"{loop.p50:.1f} ms", f"loop latency p50; p99 {loop.p99:.1f} ms"))
+    if (age := summary.latency.age_ms) is not None:
+        facts.append((f"{age.p50:.1f} ms", f"age of the acting torque p50; p99 {age.p99:.1f} ms"))
     facts.append((f"{summary.motion.tool_path_m:.2f} m", f"tool path; top speed {summary.motion.top_speed:.2f} m/s"))
     facts.append((f"{summary.motion.work_j:.1f} J", "drive work"))
     if page.verified is not None:
@@ -280,15 +282,18 @@ def _latency(summary: RunSummary) -> str:
     if latency.loop_ms is not None:
         rows.append(["loop", *latency.loop_ms.cells()])
         rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in LOOP_STAGES]
+    if latency.age_ms is not None:
+        rows.append(["age", *latency.age_ms.cells()])
     rows.append(["tick lateness", *latency.jitter_ms.tick_lateness.cells()])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
-        else f'<p class="bad">Not valid for latency measurements: {escape("; ".join(latency.reasons))}.</p>'
+        else f'<p class="bad">Not valid for latency measurements: {escape(latency.reason_text())}.</p>'
     )
+    notes = "".join(f'<p class="quiet">{escape(note)}</p>' for note in latency.notes())
     findings = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
     table = _table(["ms", *STATISTICS_TITLES], rows)
-    return f"{table}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
+    return f"{table}{notes}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
 
 
 def _events(summary: RunSummary) -> str:
@@ -305,15 +310,16 @@ def _events(summary: RunSummary) -> str:
 def _overview(pages: Sequence[_Page]) -> str:
     graded = any(page.summary.grade is not None for page in pages)
     header = ["run", *(("goals", "time, s", "error, mm") if graded else ("parts placed", "placement error, mm"))]
-    header += ["loop p50 / p99, ms", "path, m", "work, J", "saturation", "alarms", "latency valid"]
+    header += ["loop p50 / p99, ms", "age p99, ms", "path, m", "work, J", "saturation", "alarms", "latency valid"]
     rows = []
     for number, page in enumerate(pages, start=1):
-        summary, loop = page.summary, page.summary.latency.loop_ms
+        summary, loop, age = page.summary, page.summary.latency.loop_ms, page.summary.latency.age_ms
         rows.append(
             [
                 f"{number}. {summary.name}",
                 *(_grade_cells(summary) if graded else _placement_cells(summary)),
                 "–" if loop is None else f"{loop.p50:.1f} / {loop.p99:.1f}",
+                _or_dash(None if age is None else age.p99, 1),
                 f"{summary.motion.tool_path_m:.2f}",
                 f"{summary.motion.work_j:.1f}",
                 f"{max(summary.motion.saturated_share):.1%}",

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
-from hilrig_replay.analysis.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_replay.analysis.samples import CommandMatcher, join_commands
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.geometry.quaternion import about_z
@@ -40,6 +39,7 @@ from hilrig_replay.plots.palette import (
 from hilrig_replay.rerun_view import entity_paths as paths
 from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
 from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL
+from hilrig_replay.rerun_view.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.model import JOINT_SCALE, PartParameters, RigParameters
 from hilrig_sim.arm.urdf import urdf

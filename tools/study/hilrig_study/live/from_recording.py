@@ -5,13 +5,15 @@ Under it, the loop of a controller that polls once per step is a Markov jump lin
 and expected cost are exact.
 """
 
+from bisect import bisect_left
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Rows
+from hilrig_replay.analysis.distribution import Statistics
+from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import AUTO, RigParameters
@@ -63,49 +65,49 @@ class GainReport:
     session: str
     step_ms: float
     samples: int
-    ages_ms: tuple[float, float, float]
+    latency_ms: tuple[float, float, float]
     """Loop latency of new commands: p50, p99, maximum."""
+    age_ms: Statistics
+    """Age of the acting command's basis at each step, as in `hilrig latency`."""
     gains: tuple[GainVerdict, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values."""
-        p50, p99, largest = self.ages_ms
+        p50, p99, largest = self.latency_ms
         return {
             "session": self.session,
             "step_ms": self.step_ms,
             "latency": {"samples": self.samples, "p50_ms": p50, "p99_ms": p99, "max_ms": largest},
+            "age_ms": asdict(self.age_ms),
             "gains": [asdict(gain) for gain in self.gains],
         }
 
 
-def recorded_ages(run: Run) -> list[Ints]:
-    """Return the ages of the acting command, steps, (T,), from the first command on, per incarnation of the simulation.
+def recorded_ages(report: LatencyReport) -> list[Ints]:
+    """Return the ages of the acting command, steps, (T,), of each stretch of steps that have an age.
+
+    The ages are those of `hilrig latency`; they are clipped to `MAX_RECORDED_AGE_STEPS`.
 
     Raises:
         InputError: no command took effect, or states are missing.
     """
-    sequences = []
-    states = run.states
-    for incarnation in np.unique(states["incarnation"]):
-        rows: Rows = states[states["incarnation"] == incarnation]
-        steps = rows["step"].astype(np.int64)
-        new = np.flatnonzero(rows["basis_step"])
-        if not len(new):
-            continue
-        gaps = np.flatnonzero(np.diff(steps[new[0] :]) != 1)
-        if len(gaps):
-            at = int(steps[new[0] + gaps[0]])
-            missing = int(steps[new[0] + gaps[0] + 1]) - at - 1
-            raise InputError(
-                f"{run.path}: {missing} states are missing after step {at} ({len(gaps)} gaps in total), so the age "
-                "of the acting command is unknown there; use a recording without losses"
-            )
-        last = np.maximum.accumulate(np.where(rows["basis_step"] != 0, np.arange(len(rows)), -1))[new[0] :]
-        ages = steps[new[0] :] - rows["basis_step"][last].astype(np.int64)
-        sequences.append(np.clip(ages[: new[-1] - new[0] + 1], 1, MAX_RECORDED_AGE_STEPS))
-    if not sequences:
-        raise InputError(f"{run.path}: no loop latency: no command of a controller took effect in this session")
-    return sequences
+    if report.ages is None:
+        raise InputError(f"{report.session}: no loop latency: {report.reason_text()}")
+    rows = np.concatenate(list(report.ages.rows("step", "incarnation", "basis_step", "age_ns")))
+    steps = rows["step"].astype(np.int64)
+    continues = np.diff(rows["incarnation"]) == 0
+    gaps = np.flatnonzero(continues & (np.diff(steps) != 1))
+    if len(gaps):
+        at = int(steps[gaps[0]])
+        missing = int(steps[gaps[0] + 1]) - at - 1
+        raise InputError(
+            f"{report.session}: {missing} states are missing after step {at} ({len(gaps)} gaps in total), so the age "
+            "of the acting command is unknown there; use a recording without losses"
+        )
+    ages = np.where(rows["age_ns"] > 0, steps - rows["basis_step"].astype(np.int64), 0)
+    ends = np.flatnonzero(~continues | (np.diff((ages > 0).astype(np.int8)) != 0)) + 1
+    stretches = np.split(np.clip(ages, 0, MAX_RECORDED_AGE_STEPS), ends)
+    return [stretch for stretch in stretches if stretch[0] > 0]
 
 
 def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
@@ -114,8 +116,10 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     Raises:
         InputError: as `recorded_ages`; or the recording has no parameters of its rig.
     """
-    sequences = recorded_ages(run)
-    chain = age_chain(sequences)
+    report = measure(run)
+    chain = age_chain(recorded_ages(report))
+    assert report.loop_ms is not None
+    assert report.age_ms is not None
     rig = RigParameters.from_json(run.parameters_json)
     pose = np.clip(
         np.median(run.states["position"], axis=0),
@@ -126,15 +130,14 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     plant_model = linearize(rig.arm, pose.tolist())
     method = () if rig.sim.substeps == AUTO else (rig.sim.integrator, rig.sim.substeps)
     phi, gamma = plant_model.discretize(step_s, *method)
-    latency = run.states["loop_latency_ns"][run.states["basis_step"] != 0] / 1e6
-    p50, p99 = np.percentile(latency, (50, 99))
+    loop_ms = report.loop_ms
     plane = study or StudyConfig(x=AxisConfig(what="delay_ms", values=(0.0,)), y=AxisConfig(what="gain", values=(1.0,)))
     offset, ticks = plane.task.scenario().offset, round(plane.loop.duration_s / step_s)
     verdicts = []
     for config in plane.controllers:
         for gain in _gains(study).tolist():
             controller = _law(config, rig, near_period=step_s, gain=gain, pose=pose.tolist())
-            law = linearize_law(controller, plant_model, step_s, float(p50) / 1e3)
+            law = linearize_law(controller, plant_model, step_s, loop_ms.p50 / 1e3)
 
             def radius(added: int, law: Any = law) -> float:
                 shifted = AgeChain(np.where(chain.ages > 0, chain.ages + added, 0), chain.transition, chain.start)
@@ -143,11 +146,18 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
             growth = radius(0)
             stable = growth < 1.0
             cost = expected_cost(plant_model, phi, gamma, controller, law, chain, offset, ticks) if stable else None
-            spare = _largest(lambda added, growth_of=radius: growth_of(added) < 1.0) if stable else None
+            # The number of added steps, from 1 on, with which the loop is stable.
+            tried = range(1, MAX_SPARE_STEPS + 1)
+            spare = bisect_left(tried, 1.0, key=radius) if stable else None
             spare_ms = None if spare is None else spare * run.step_ns / 1e6
             verdicts.append(GainVerdict(config.name, gain, stable, growth, cost, spare_ms, spare == MAX_SPARE_STEPS))
     return GainReport(
-        run.session, run.step_ns / 1e6, len(latency), (float(p50), float(p99), float(latency.max())), tuple(verdicts)
+        run.session,
+        run.step_ns / 1e6,
+        report.samples,
+        (loop_ms.p50, loop_ms.p99, loop_ms.max),
+        report.age_ms,
+        tuple(verdicts),
     )
 
 
@@ -169,12 +179,3 @@ def _law(
     built = config.build(rig, linearize(rig.arm, pose), near_period, np.array([gain]))
     assert isinstance(built, LawController)
     return built
-
-
-def _largest(holds: Any) -> int:
-    """Return the largest number up to `MAX_SPARE_STEPS` for which `holds` is true, given that it is true for 0."""
-    low, high = 0, MAX_SPARE_STEPS + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low

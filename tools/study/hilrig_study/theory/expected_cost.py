@@ -21,7 +21,6 @@ from hilrig_runtime.errors import InputError
 from hilrig_study.controllers.control_laws import LawController, Measurement
 from hilrig_study.linear_model import LinearPlant
 from hilrig_study.simulation.simulated_loop import EFFORT_COST, ERROR_SCALE
-from hilrig_study.simulation.timing import NO_POLL, Timeline
 from hilrig_study.theory.margins import LinearLaw
 
 Floats = NDArray[np.float64]
@@ -48,13 +47,6 @@ class AgeChain:
     def max_age(self) -> int:
         """Largest age."""
         return int(self.ages.max())
-
-
-def ages_by_tick(line: Timeline) -> Ints:
-    """Return the age of the acting command at every tick, steps, (T,); 0: no command acts."""
-    acts = line.in_force != NO_POLL
-    ages = np.arange(len(line.in_force)) - line.basis[np.maximum(line.in_force, 0)]
-    return np.where(acts, ages, 0)
 
 
 def age_chain(sequences: Sequence[Ints]) -> AgeChain:

@@ -1,0 +1,142 @@
+"""Test whether torques follow the positions that were served: feedback, or an open loop beside a reader.
+
+Smooth torques and the positions that they cause are always related, so a good fit of a control law is no evidence. The
+positions in the registers, however, are rounded to 0.01° or 0.01 mm. The rounding error of a served position is known
+from the recording, and unrelated to everything that a program without these positions can know. Torques that contain it
+were computed from them. The statistic is that of a generalized least-squares fit in blocks of commands, each with its
+own trend in time and its own gains; for comparison it is computed with the rounding errors of other times.
+
+With a small gain, rounding hides in the resolution of the torque registers. There, a law that restores a set point and
+explains each torque register to its resolution is evidence, too.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hilrig_replay.io.columns import Rows
+from hilrig_sim.arm.model import JOINT_SCALE
+
+Floats = NDArray[np.float64]
+Series = tuple[Floats, Floats, Floats]
+"""Time of each command, s, (n,); positions that were served before it, 0.01° or 0.01 mm, not rounded, (n, 4); torques,
+mN·m or mN, (n, 4)."""
+
+BLOCK_COMMANDS: Final = 16
+LAGS: Final = 3
+"""Number of polls whose positions a torque may contain."""
+MIN_BLOCKS: Final = 3
+COMPARISONS: Final = 40
+"""Number of other times whose rounding errors are compared."""
+MIN_STATISTIC: Final = 20.0
+"""With three lags and no feedback, one in 10,000 joints exceeds it (chi-squared distribution)."""
+MIN_RATIO: Final = 2.0
+"""Required ratio to the largest statistic of the other times."""
+ROUNDING_VARIANCE: Final = 1 / 12
+LAW_COMMANDS: Final = 24
+"""Commands of a segment in which one law is fitted."""
+MIN_SEGMENTS: Final = 2
+LAW_RESIDUAL: Final = 0.75
+"""Largest root mean square of the unexplained torque, mN·m: the registers resolve 1 mN·m."""
+LAW_TORQUE_RANGE: Final = 40.0
+"""Smallest range of the torque in a segment that is examined, mN·m."""
+
+
+def follows_positions(windows: Iterable[tuple[Rows, Rows]]) -> bool:
+    """Whether the torques of a controller contain the positions that it was served.
+
+    Args:
+        windows: states and commands of parts of a run, fields as `STATE_DTYPE` and `COMMAND_DTYPE`.
+    """
+    series = [found for states, commands in windows for found in _series(states, commands)]
+    return contains_rounding_errors(series) or is_restoring_law(series)
+
+
+def _series(states: Rows, commands: Rows) -> Iterator[Series]:
+    """The first command after each poll, with the positions of its basis, by incarnation of the simulation."""
+    commands = commands[(commands["basis_step"] > 0) & ~commands["safe"]]
+    for incarnation in np.unique(states["incarnation"]):
+        known = states[states["incarnation"] == incarnation]
+        chosen = commands[commands["basis_incarnation"] == incarnation]
+        chosen = chosen[np.diff(chosen["basis_step"].astype(np.int64), prepend=0) > 0]
+        at = np.minimum(np.searchsorted(known["step"], chosen["basis_step"]), len(known) - 1)
+        found = known["step"][at] == chosen["basis_step"]
+        chosen, at = chosen[found], at[found]
+        if len(chosen):
+            position = known["position"][at] * JOINT_SCALE * 100
+            yield chosen["write_arrived_ns"] / 1e9, position, chosen["effort"] * 1e3
+
+
+def contains_rounding_errors(series: Iterable[Series]) -> bool:
+    """Whether the torques contain the rounding errors of the positions in the registers."""
+    statistics = np.zeros((4, COMPARISONS + 1))
+    for time_s, position, torque in series:
+        error = np.rint(position) - position
+        blocks = np.arange(LAGS - 1, len(time_s) - BLOCK_COMMANDS + 1, BLOCK_COMMANDS)
+        if len(blocks) < MIN_BLOCKS:
+            continue
+        rows = blocks[:, np.newaxis] + np.arange(BLOCK_COMMANDS)
+        shifts = np.linspace(LAGS, len(time_s) - LAGS, COMPARISONS + 1).astype(int)[:-1]
+        for joint in range(4):
+            known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(2)])
+            unexplained = _without(known, torque[rows, joint])
+            variance = (unexplained**2).sum(axis=1) / (BLOCK_COMMANDS - known.shape[2])
+            # A constant torque contains nothing.
+            weight = np.where(variance > 1e-9, 1 / (variance + ROUNDING_VARIANCE), 0.0)
+            for number, shift in enumerate((0, *shifts.tolist())):
+                shifted = np.roll(error[:, joint], shift)
+                errors = _without(known, np.stack([shifted[rows - lag] for lag in range(LAGS)], axis=-1))
+                statistics[joint, number] += _explained(unexplained, errors, weight)
+    tested = np.vstack((statistics, statistics.sum(axis=0)))
+    enough = np.maximum(MIN_STATISTIC, MIN_RATIO * tested[:, 1:].max(axis=1))
+    return bool((tested[:4, 0] >= enough[:4]).any() or tested[4, 0] >= 2 * enough[4] / MIN_RATIO + MIN_STATISTIC)
+
+
+def _basis_of_known(time_s: Floats, positions: list[Floats]) -> Floats:
+    """Orthonormal basis of a cubic trend in time and of the exact positions, by block, (blocks, commands, 6)."""
+    since = time_s - time_s.mean(axis=1, keepdims=True)
+    since /= np.maximum(np.abs(since).max(axis=1, keepdims=True), 1e-9)
+    moved = [position - position.mean(axis=1, keepdims=True) for position in positions]
+    columns = np.stack([since**0, since, since**2, since**3, *moved], axis=-1)
+    columns /= np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-9)
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left * (sizes > 1e-6 * sizes[:, :1])[:, np.newaxis, :])
+
+
+def _without(known: Floats, values: Floats) -> Floats:
+    """Remainder of values, (blocks, commands) or (blocks, commands, k), after projection on `known`."""
+    columns = values if values.ndim == 3 else values[..., np.newaxis]
+    rest = columns - known @ (known.transpose(0, 2, 1) @ columns)
+    return rest if values.ndim == 3 else rest[..., 0]
+
+
+def _explained(unexplained: Floats, errors: Floats, weight: Floats) -> float:
+    """Weighted sum of squares that the errors explain, with the same gains in all blocks."""
+    normal = np.einsum("b,bli,blj->ij", weight, errors, errors)
+    right = np.einsum("b,bli,bl->i", weight, errors, unexplained)
+    gains, *_ = np.linalg.lstsq(normal, right, rcond=1e-9)
+    return float(right @ gains)
+
+
+def is_restoring_law(series: Iterable[Series]) -> bool:
+    """Whether one law of the positions in the registers, which restores a set point, explains a torque exactly.
+
+    The gains of torques that merely drive the arm have the opposite sign: they are in phase with its velocity.
+    """
+    passed, moved = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    for time_s, position, torque in series:
+        for start in range(1, len(time_s) - LAW_COMMANDS + 1, LAW_COMMANDS):
+            rows = np.arange(start, start + LAW_COMMANDS)
+            for joint in range(4):
+                newest, previous = np.rint(position[rows, joint]), np.rint(position[rows - 1, joint])
+                if np.ptp(torque[rows, joint]) < LAW_TORQUE_RANGE:
+                    continue
+                moved[joint] += 1
+                law = np.column_stack((newest, previous, np.ones(LAW_COMMANDS)))
+                gains, *_ = np.linalg.lstsq(law, torque[rows, joint], rcond=None)
+                residual = torque[rows, joint] - law @ gains
+                restores = gains[0] + gains[1] < 0 and (gains[0] < 0 or abs(gains[0]) < 0.05 * abs(gains[1]))
+                passed[joint] += int(restores and np.sqrt((residual**2).mean()) <= LAW_RESIDUAL)
+    return bool(((passed >= MIN_SEGMENTS) & (passed >= 0.5 * moved)).any())
