@@ -66,8 +66,9 @@ def age_chain(sequences: Sequence[Ints]) -> AgeChain:
         np.add.at(counts, (rows[:-1], rows[1:]), 1.0)
         start[rows[0]] += 1.0
     total = counts.sum(axis=1, keepdims=True)
-    # A state that occurs only at the end of a run becomes absorbing, so that each row sums to 1.
-    transition = np.where(total > 0, counts / np.maximum(total, 1.0), np.eye(len(states)))
+    # A state that occurs only at the end of a run is followed by any age, as often as it occurs: it is not absorbing.
+    occurs = np.where(states > 0, np.bincount(np.searchsorted(states, np.concatenate(labels))), 0)
+    transition = np.where(total > 0, counts / np.maximum(total, 1.0), occurs / occurs.sum())
     return AgeChain(np.maximum(states, 0), transition, start / start.sum())
 
 
