@@ -51,8 +51,9 @@ together: .venv/dev
 alone: .venv/dev
 	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
 
-test-long: .venv/dev ## evaluate 2,000 other forged recordings (minutes)
+test-long: .venv/dev ## tests that take minutes: 2,000 other forged recordings, the loop against a packet capture
 	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_basis_of_commands.py
 
 check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff format --check .
