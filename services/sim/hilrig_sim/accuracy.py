@@ -5,7 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_sim.arm.model import JOINT_SCALE, LARGEST_REGISTER_FORCE, ArmParameters, RigParameters, StepParameters
+from hilrig_sim.arm.joints import JOINT_SCALE
+from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, ArmParameters, RigParameters, StepParameters
 from hilrig_sim.arm.stability import ERROR_BOUND
 from hilrig_sim.plant.plant import Plant
 

@@ -11,7 +11,7 @@ from hilrig_runtime.timing.rate import Tick
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 from hilrig_schemas.v1.event_pb2 import IntegrationData, LimitData, OverrunData, PartData, WatchdogData
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_sim.arm.stability import ERROR_BOUND
 from hilrig_sim.commands import CommandLatch
 from hilrig_sim.plant.limits import PlantEvent, PlantEventKind

@@ -14,6 +14,7 @@ from typing import Any, Final, Literal, Self, Union, get_args, get_origin, get_t
 from hilrig_runtime.config.lab import ArmConfig, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.errors import InputError
+from hilrig_sim.arm.joints import JOINT_NAMES
 
 GRAVITY: Final = 9.81
 """m/s², as in the paper (20)."""
@@ -34,10 +35,6 @@ AUTO: Final = "auto"
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
-
-JOINT_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
-JOINT_SCALE: Final = (math.degrees(1.0), math.degrees(1.0), 1e3, math.degrees(1.0))
-"""Factors from rad and m to the displayed ° and mm."""
 
 
 _ARM: Final = ArmConfig()
