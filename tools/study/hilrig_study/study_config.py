@@ -19,7 +19,8 @@ from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
 from hilrig_runtime.config.validation import parse_toml, read_text, validate
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import JOINT_NAMES, RigParameters, joints_si
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import RigParameters, joints_si
 from hilrig_sim.parameters import rig_parameters
 from hilrig_study.controllers.control_laws import ComputedTorque, Controller, Pid
 from hilrig_study.controllers.lqr import PredictiveLqr

@@ -182,6 +182,16 @@ def decode_record(opcode: int, content: Buffer, offset: int) -> McapRecord | Non
         encoded, data = encoded[: -_U32.size], data[: -_U32.size]
     if encoded != data:
         raise DamagedError(f"{name} record with inconsistent lengths", offset)
+    if isinstance(record, Statistics):
+        first_ns, last_ns = record.message_start_time, record.message_end_time
+        if not first_ns <= last_ns <= MAX_TIME_NS:
+            raise DamagedError(
+                f"statistics record with times {first_ns} to {last_ns}, expected increasing times up to {MAX_TIME_NS}",
+                offset,
+            )
+        total = sum(record.channel_message_counts.values())
+        if total and total != record.message_count:
+            raise DamagedError(f"statistics record with {total} messages, expected {record.message_count}", offset)
     return record
 
 
