@@ -62,6 +62,32 @@ def test_loop_latency_is_time_from_basis_to_new_command(rig: VirtualRig) -> None
     assert (after.basis_step, after.command_arrived_ns, after.loop_latency_ns, after.command_seq) == (0, 0, 0, 1)
 
 
+def test_report_has_the_age_of_the_basis_at_each_step(rig: VirtualRig) -> None:
+    rig.tick(3)
+    rig.command((1.0, 0.0, 0.0, 0.0), basis_step=2)
+    rig.tick(3)
+    (report,) = rig.service.health.rig_reports()
+    assert (list(report.loop_us), list(report.age_us)) == ([40_000], [40_000, 60_000, 80_000])
+    # The command is held over the report, and another one without a basis replaces it.
+    rig.tick(2)
+    rig.command((2.0, 0.0, 0.0, 0.0))
+    rig.tick(2)
+    rig.command((3.0, 0.0, 0.0, 0.0), basis_step=10)
+    rig.tick(2)
+    (report,) = rig.service.health.rig_reports()
+    assert (list(report.loop_us), list(report.age_us)) == ([20_000], [100_000, 120_000, 20_000, 40_000])
+
+
+def test_timed_out_command_has_no_age(rig: VirtualRig) -> None:
+    rig.tick(2)
+    rig.command((1.0, 0.0, 0.0, 0.0), basis_step=2)
+    timeout_steps = rig.lab.sim.command_timeout_ns // rig.lab.sim.step_ns
+    rig.tick(timeout_steps + 20)
+    (report,) = rig.service.health.rig_reports()
+    assert report.safe
+    assert timeout_steps <= len(report.age_us) <= timeout_steps + 2
+
+
 def test_unknown_basis_gives_no_latency(rig: VirtualRig) -> None:
     rig.tick(2)
     for options in ({"basis_step": 99}, {"basis_step": 1, "basis_incarnation": 5}, {"basis_step": 0}):

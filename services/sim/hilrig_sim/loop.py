@@ -102,9 +102,9 @@ class Simulation:
         latencies_ns = {basis: sampled_ns - (times.get(basis) or sampled_ns) for basis in {r.basis_step for r in rigs}}
         ends = {basis: encode_loop_latency(latency_ns) for basis, latency_ns in latencies_ns.items()}
         self._states.publish([common + rig.encoded + ends[rig.basis_step] for rig in rigs])
+        for rig, latch in zip(rigs, latches, strict=True):
+            rig.on_published(step, latencies_ns[rig.basis_step], latch.changed)
         self._apply_commands()
-        for rig in rigs:
-            rig.on_published(latencies_ns[rig.basis_step])
         events = plant.step(self._effort, self._magnet)
         if events:
             self._events.report_plant_events(events, step + 1, sampled_ns, [latch.session for latch in latches])
@@ -178,7 +178,7 @@ class Simulation:
         self._update_motion()
 
     def _rig_reports(self) -> list[RigReport]:
-        return [rig.report(latch.safe) for rig, latch in zip(self._rigs, self._latches, strict=True)]
+        return [rig.report(latch.safe, self._times) for rig, latch in zip(self._rigs, self._latches, strict=True)]
 
     def _reset_diverged(self, step: int) -> None:
         """Reset the rigs whose state is not finite any more, because the motion was too fast for the step."""

@@ -81,7 +81,11 @@ class RigStateEncoder:
         """Values that `_slow_fields` was encoded from."""
         self._slow_fields = b""
         self._command_fields = JointState()
-        self._loops_us: list[int] = []
+        self._effects: list[tuple[int, int]] = []
+        """Steps since the last report at which the command changed, and its loop latency, ns; 0: it has no basis."""
+        self._basis_ns = 0
+        """Tick of the basis of the command that acted at the last report; 0: none."""
+        self._reported_step = 0
         self._parts_due_ns = 0
         self._parts_encoded_ns = 0
         """Tick whose encoded state has the parts, ns; 0: the encoded state has none."""
@@ -124,18 +128,38 @@ class RigStateEncoder:
             )
         )
 
-    def on_published(self, latency_ns: int) -> None:
-        """Record that the state was published; `latency_ns`: its loop latency, 0: none."""
+    def on_published(self, step: int, latency_ns: int, changed: bool) -> None:
+        """Record that the state of a step was published.
+
+        Args:
+            step: the step.
+            latency_ns: loop latency of the new command; 0: no new command, or it has no basis.
+            changed: whether the effort is that of another command, or is zero because the commands timed out.
+        """
         if self._parts_encoded_ns:
             # Not in `encode`: the state may have been encoded several times before the tick.
             self._parts_due_ns = self._parts_encoded_ns + ALL_PARTS_PERIOD_NS
-        if latency_ns:
-            self._loops_us.append(latency_ns // 1000)
+        if changed or latency_ns:
+            self._effects.append((step, latency_ns))
 
-    def report(self, safe: bool) -> RigReport:
+    def report(self, safe: bool, times: StepTimes) -> RigReport:
         """Return the report on the rig since the last report; `safe`: its commands have timed out."""
-        loops_us, self._loops_us = self._loops_us, []
-        return RigReport(rig=self.name, loop_us=loops_us, safe=safe)
+        effects, self._effects = self._effects, []
+        report = RigReport(rig=self.name, safe=safe, loop_us=[latency // 1000 for _, latency in effects if latency])
+        step = self._reported_step + 1
+        for following, latency_ns in effects:
+            self._add_ages(report, times, step, following)
+            self._basis_ns = (times.get(following) or 0) - latency_ns if latency_ns else 0
+            step = following
+        self._add_ages(report, times, step, times.step + 1)
+        self._reported_step = times.step
+        return report
+
+    def _add_ages(self, report: RigReport, times: StepTimes, begin: int, end: int) -> None:
+        """Add the ages of the acting command's basis at the steps from `begin` to before `end`."""
+        if self._basis_ns > 0:
+            sampled = (times.get(step) for step in range(begin, end))
+            report.age_us.extend([(at_ns - self._basis_ns) // 1000 for at_ns in sampled if at_ns is not None])
 
     def _encode_slow_fields(self, command: CommandLatch) -> bytes:
         """Encode the fields that rarely change."""
