@@ -21,9 +21,9 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Validate a lab's configuration file: report every error, and print the rigs with their addresses."""
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import Console
     from hilrig_replay.grading.task_loading import validate_task
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template

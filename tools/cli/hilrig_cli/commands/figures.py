@@ -18,9 +18,9 @@ def figures(
 
     Exit code 1: a number differs from the expected one at the paper's step of 20 ms.
     """
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import Console
     from hilrig_sim.validation.paper_figures import compute, draw
 
     found = compute(step_ms)

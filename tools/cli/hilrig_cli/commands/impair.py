@@ -105,9 +105,9 @@ def _row(status: "ImpairmentStatus") -> dict[str, object]:
 
 def _print_table(statuses: "list[ImpairmentStatus]") -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import Console
     from hilrig_runtime.config.impairment import LinkImpairments
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))

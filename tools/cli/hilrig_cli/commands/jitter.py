@@ -40,10 +40,10 @@ def jitter(
 
 
 def _measure(step_ms: float, seconds: float, loaded: bool) -> "TimingResult":
-    from rich.console import Console
     from rich.progress import Progress
 
     from hilrig_cli.bench.jitter import measure_timing
+    from hilrig_cli.terminal import Console
 
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         task = progress.add_task("with load" if loaded else "measuring", total=1.0)
@@ -52,9 +52,10 @@ def _measure(step_ms: float, seconds: float, loaded: bool) -> "TimingResult":
 
 def _print_table(result: "TimingResult") -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from hilrig_cli.terminal import Console
 
     console = Console()
     condition = "with CPU load" if result.loaded else "without load"

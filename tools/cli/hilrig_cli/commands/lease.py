@@ -52,8 +52,9 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
 
 
 def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import Console
 
     table = Table()
     for column in ("rig", "lease holder", "last request", "session", "connections", "watchdog"):

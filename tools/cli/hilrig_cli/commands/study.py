@@ -9,7 +9,7 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from hilrig_cli.terminal import Console
 
 
 def study(
@@ -41,8 +41,7 @@ def study(
     controller (PNG, SVG) and study.rrd. Exit code 1: a live measurement contradicts the prediction; with --from: no
     gain of the study is stable.
     """
-    from rich.console import Console
-
+    from hilrig_cli.terminal import Console
     from hilrig_runtime.errors import InputError
 
     console = Console(stderr=True, quiet=as_json)
@@ -122,8 +121,9 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import Console
 
     console = Console()
     title = (
@@ -182,8 +182,10 @@ def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Cons
 
 
 def _print_gains(evaluation: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+
+    from hilrig_cli.terminal import Console
 
     latency, age = evaluation["latency"], evaluation["age_ms"]
     title = (
@@ -199,7 +201,7 @@ def _print_gains(evaluation: dict[str, Any]) -> None:
         table.add_row(
             gain["controller"],
             f"{gain['gain']:.3g}",
-            "yes" if gain["stable"] else "[red]no[/red]",
+            "yes" if gain["stable"] else Text("no", style="red"),
             f"{gain['mean_square_radius']:.4f}",
             "–" if cost is None else f"{cost:.2f}",
             "–" if gain["spare_ms"] is None else f"{'≥ ' if gain['spare_at_least'] else ''}{gain['spare_ms']:.0f}",

@@ -54,9 +54,9 @@ def top(
     In a terminal the display is updated until Ctrl-C. If it does not fit, the rigs with the lowest loop latency and
     less important columns are hidden.
     """
-    from rich.console import Console
     from rich.live import Live
 
+    from hilrig_cli.terminal import Console
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_runtime.config.lab import load_lab
 
