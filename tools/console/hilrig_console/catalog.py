@@ -14,6 +14,7 @@ from typing import Any, Final
 from hilrig_console.worker import Worker
 from hilrig_recorder.mcap_format.file_names import recording_stem
 from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
+from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.errors import HilrigError, InputError
 
 LIST_PERIOD_S: Final = 2.0
@@ -70,8 +71,8 @@ class ReportWorker:
         page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
-class RecordingCatalog:
-    """Recordings below a folder; a context manager. The methods may be called from any thread."""
+class RecordingCatalog(Handle):
+    """Recordings below a folder. The methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -158,10 +159,8 @@ class RecordingCatalog:
                 self._reports.popitem(last=False)[1].unlink(missing_ok=True)
             return page
 
-    def __enter__(self) -> "RecordingCatalog":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the worker processes and delete the reports."""
         self._list_worker.close()
         self._report_worker.close()
         self._cache.cleanup()

@@ -129,14 +129,13 @@ class ConsoleServer:
 
     def __enter__(self) -> "ConsoleServer":
         self._subscriber.__enter__()
-        self._catalog.__enter__()
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._console.broadcast.close()
         self._server.should_exit = True
-        self._catalog.__exit__()
+        self._catalog.close()
         self._subscriber.__exit__()
         self._thread.join(timeout=5.0)
         self._socket.close()

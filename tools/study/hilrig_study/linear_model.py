@@ -16,7 +16,8 @@ from scipy.linalg import expm
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import GRAVITY, JOINT_NAMES, ArmParameters, Vector4
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import GRAVITY, ArmParameters, Vector4
 
 Floats = NDArray[np.float64]
 

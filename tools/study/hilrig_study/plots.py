@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.plots.output import save_figure
 from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
 from hilrig_study.theory.gain_theory import GainTheory

@@ -12,7 +12,7 @@ import pyarrow.parquet
 from pydantic_core import to_jsonable_python
 
 from hilrig_replay.io.output_file import output_file
-from hilrig_sim.arm.model import JOINT_NAMES
+from hilrig_sim.arm.joints import JOINT_NAMES
 from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import CELL_DTYPE, SweepResult

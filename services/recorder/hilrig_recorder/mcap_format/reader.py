@@ -12,7 +12,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema, Statistics
 
-from hilrig_recorder.mcap_format.metadata_numbers import check_numbers
+from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.records import (
     CHUNK_HEAD_BYTES,
     FOOTER_BYTES,

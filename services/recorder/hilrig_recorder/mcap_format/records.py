@@ -37,6 +37,8 @@ COMPRESSION: Final = "zstd"
 MAX_CHUNK_BYTES: Final = 128 << 20
 """Maximum uncompressed size of a chunk, bytes. A chunk that states a larger size is treated as damaged."""
 MAX_TIME_NS: Final = (1 << 63) - 1
+COPY_SUFFIX: Final = ".copy"
+"""End of the name of a metadata record that repeats one of the beginning of the file. The first copy has precedence."""
 
 Buffer = bytes | memoryview
 

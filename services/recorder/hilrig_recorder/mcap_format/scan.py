@@ -11,7 +11,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
-from hilrig_recorder.mcap_format.metadata_numbers import check_numbers
+from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.reader import Record, RecordReader, buffer_reader, chunk_records, decompress
 from hilrig_recorder.mcap_format.records import (
     MAGIC,

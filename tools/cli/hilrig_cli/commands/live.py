@@ -44,11 +44,9 @@ def live(
     with ExitStack() as closing:
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         check_rig(bus, lab, name)
+        viewer = None
         if save is not None:
             stream = to_file(closing.enter_context(output_file(save)), f"live-{name}", blueprint)
-
-            def is_closed() -> bool:
-                return False
         else:
             grpc_port, web_port = free_port(), free_port() if web else None
             viewer = closing.enter_context(running_viewer(grpc_port, web_port))
@@ -56,8 +54,8 @@ def live(
                 log(f"open {browser_address(grpc_port, web_port)} ; press Ctrl-C to stop")
             stream = to_viewer(grpc_port, f"live-{name}", blueprint)
 
-            def is_closed() -> bool:
-                return viewer.poll() is not None
+        def is_closed() -> bool:
+            return viewer is not None and viewer.poll() is not None
 
         closing.callback(stream.disconnect)
         period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S

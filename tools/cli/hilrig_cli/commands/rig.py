@@ -36,9 +36,7 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     if as_json:
         print(json.dumps(rows))
         return
-    table = Table()
-    for column in ("rig", "address", "simulation", "edge", "source"):
-        table.add_column(column)
+    table = Table("rig", "address", "simulation", "edge", "source")
     for row in rows:
         origin = "lab.toml" if row["in_file"] else "added"
         table.add_row(row["rig"], row["address"], row["sim"] or "none", row["edge"] or "none", origin)

@@ -61,16 +61,62 @@ class LoopAge:
     """Share of the aged steps whose age exceeds a number of steps, by this number (`OLD_STEPS`)."""
 
 
+class AgeTracker:
+    """Computes the ages of consecutive states."""
+
+    def __init__(self) -> None:
+        self._last_state: Rows | None = None
+        self._last_row = np.zeros(1, AGE_DTYPE)
+        self._basis_ns = UNKNOWN
+        """Tick of the basis of the command that acts at the last state, or `NO_AGE` or `UNKNOWN`."""
+
+    def add(self, states: Rows) -> NDArray[np.void]:
+        """Ages of the next states, fields as `STATE_DTYPE`, at least one; one row each, fields as `AGE_DTYPE`."""
+        changed, hidden = self._changes(states)
+        based = states["basis_step"] != 0
+        own_ns = np.where(hidden, UNKNOWN, NO_AGE)
+        own_ns[based] = (states["sampled_ns"] - states["loop_latency_ns"])[based]
+        # Row of the state at which the acting command took effect, from 1; 0: a state of the previous blocks.
+        effect = np.maximum.accumulate(np.where(changed, np.arange(1, len(states) + 1), 0))
+        basis_ns = np.concatenate(([self._basis_ns], own_ns))[effect]
+        rows = np.empty(len(states), AGE_DTYPE)
+        for name in ("sampled_ns", "incarnation", "step", "command_seq", "basis_step"):
+            rows[name] = states[name]
+        rows["effect_ns"] = states["sampled_ns"]
+        for name in ("basis_step", "effect_ns"):
+            rows[name] = np.concatenate((self._last_row[name], rows[name]))[effect]
+        rows["age_ns"] = np.where(basis_ns > 0, states["sampled_ns"] - basis_ns, basis_ns)
+        rows["age_ns"][states["safe"]] = NO_AGE
+        self._basis_ns = int(basis_ns[-1])
+        self._last_state, self._last_row = states[-1:].copy(), rows[-1:].copy()
+        return rows
+
+    def _changes(self, states: Rows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """States whose command is another one than that of the state before, and those where states are missing.
+
+        At a missing state, a command may have taken effect whose basis is not known.
+        """
+        first = self._last_state is None
+        followed = states if self._last_state is None else np.concatenate((self._last_state, states))
+        changed = np.zeros(len(followed), np.bool_)
+        for name in ("incarnation", "session", "command_seq"):
+            changed[1:] |= np.diff(followed[name]) != 0
+        hidden = np.zeros(len(followed), np.bool_)
+        hidden[1:] = np.diff(followed["sequence"].astype(np.int64)) > 1
+        hidden[1:] &= np.diff(followed["incarnation"]) == 0
+        if first:
+            changed[0], hidden[0] = True, followed["command_seq"][0] > 0
+            return changed, hidden
+        return changed[1:], hidden[1:]
+
+
 class AgeTable:
     """Ages of a run, collected block by block; call `finish` after the last block."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._table = DiskTable(AGE_DTYPE)
-        self._last_state: Rows | None = None
-        self._last_row = np.zeros(1, AGE_DTYPE)
-        self._basis_ns = UNKNOWN
-        """Tick of the basis of the command that acts at the last state, or `NO_AGE` or `UNKNOWN`."""
+        self._tracker = AgeTracker()
         self._first_seq: int | None = None
         """Number of the first command that the controller of the session wrote."""
         self._last_written_ns = self._lease_lost_ns = 0
@@ -91,7 +137,7 @@ class AgeTable:
                 self._first_seq = int(written["seq"].min())
             self._last_written_ns = int(written["wall_ns"][-1])
         if len(block.states):
-            self._add_states(block.states)
+            self._table.add(self._tracker.add(block.states)[self._in_use(block.states)])
 
     def _in_session(self, rows: Rows) -> NDArray[np.bool_]:
         # A manual recording can contain sessions of several controllers.
@@ -102,44 +148,6 @@ class AgeTable:
     def _in_use(self, states: Rows) -> NDArray[np.bool_]:
         # A restarted simulation does not know the session until it receives a command.
         return np.asarray(self._in_session(states) | ((states["session"] == 0) & bool(self._run.controller)))
-
-    def _add_states(self, states: Rows) -> None:
-        changed, hidden = self._changes(states)
-        based = states["basis_step"] != 0
-        own_ns = np.where(hidden, UNKNOWN, NO_AGE)
-        own_ns[based] = (states["sampled_ns"] - states["loop_latency_ns"])[based]
-        # Row of the state at which the acting command took effect, from 1; 0: a state of the previous blocks.
-        effect = np.maximum.accumulate(np.where(changed, np.arange(1, len(states) + 1), 0))
-        basis_ns = np.concatenate(([self._basis_ns], own_ns))[effect]
-        rows = np.empty(len(states), AGE_DTYPE)
-        for name in ("sampled_ns", "incarnation", "step", "command_seq", "basis_step"):
-            rows[name] = states[name]
-        rows["effect_ns"] = states["sampled_ns"]
-        for name in ("basis_step", "effect_ns"):
-            rows[name] = np.concatenate((self._last_row[name], rows[name]))[effect]
-        rows["age_ns"] = np.where(basis_ns > 0, states["sampled_ns"] - basis_ns, basis_ns)
-        rows["age_ns"][states["safe"]] = NO_AGE
-        self._table.add(rows[self._in_use(states)])
-        self._basis_ns = int(basis_ns[-1])
-        self._last_state, self._last_row = states[-1:].copy(), rows[-1:].copy()
-
-    def _changes(self, states: Rows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """States whose command is another one than that of the state before, and those where states are missing.
-
-        At a missing state, a command may have taken effect whose basis is not known.
-        """
-        first = self._last_state is None
-        followed = states if self._last_state is None else np.concatenate((self._last_state, states))
-        changed = np.zeros(len(followed), np.bool_)
-        for name in ("incarnation", "session", "command_seq"):
-            changed[1:] |= np.diff(followed[name]) != 0
-        hidden = np.zeros(len(followed), np.bool_)
-        hidden[1:] = np.diff(followed["sequence"].astype(np.int64)) > 1
-        hidden[1:] &= np.diff(followed["incarnation"]) == 0
-        if first:
-            changed[0], hidden[0] = True, followed["command_seq"][0] > 0
-            return changed, hidden
-        return changed[1:], hidden[1:]
 
     def finish(self) -> None:
         """Find the first and the last step of the controller."""

@@ -1,10 +1,10 @@
-"""Checks the numbers in the metadata records of a recording: they have no checksum, so damage can change them. Pure."""
+"""Checks of metadata records, which have no checksum: their numbers, and the copies at the end of a file. Pure."""
 
 from typing import Final
 
 from mcap.records import Metadata
 
-from hilrig_recorder.mcap_format.records import DamagedError
+from hilrig_recorder.mcap_format.records import COPY_SUFFIX, DamagedError
 
 MAX_STEP_NS: Final = 10_000_000_000
 """Largest duration of a simulation step; that of a lab is at most 1 s."""
@@ -31,8 +31,23 @@ def check_numbers(record: Metadata, offset: int) -> None:
     Raises:
         DamagedError: a value is not a decimal number, or out of its range; `offset` is the place of the record.
     """
-    for key, (low, high) in _RANGES.get(record.name, {}).items():
+    for key, (low, high) in _RANGES.get(record.name.removesuffix(COPY_SUFFIX), {}).items():
         text = record.metadata.get(key, "0" if low == 0 else str(low))
         # The length is checked first, because the conversion of a long text takes long.
         if not (text.isascii() and text.isdecimal() and len(text) <= len(str(high)) and low <= int(text) <= high):
             raise DamagedError(f"metadata {record.name}: {key} is {text[:40]!r}, expected {low} to {high}", offset)
+
+
+def add_metadata(known: dict[str, dict[str, str]], record: Metadata, offset: int) -> bool:
+    """Add a record to the metadata of a file, by its name without `COPY_SUFFIX`; False: it repeats a known one.
+
+    Raises:
+        DamagedError: a copy differs from the first one, which is kept.
+    """
+    name = record.name.removesuffix(COPY_SUFFIX)
+    if name == record.name or name not in known:
+        known[name] = dict(record.metadata)
+        return True
+    if known[name] != record.metadata:
+        raise DamagedError(f"metadata {record.name} differs from its first copy", offset)
+    return False
