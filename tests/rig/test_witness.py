@@ -76,20 +76,28 @@ class Witness:
                 [mark] = struct.unpack_from(">h", packet.data, 13 + 2 * 3)
                 self.writes.append(Write(mark, basis, served_ns, packet.wall_ns, 0))
 
-    def loops(self) -> dict[int, int]:
-        """By the step on which a command is known to act first: the step of its basis."""
+    def bases(self) -> dict[int, int]:
+        """By step that the client was served: step of the basis of the command that acts on it."""
         found: dict[int, int] = {}
         # Marks repeat after 100 commands, within which a command acts or was superseded.
-        bases: dict[int, int] = {}
+        written: dict[int, int] = {}
         writes = iter(self.writes)
         upcoming = next(writes, None)
         for step, mark in sorted(self.acting.items()):
             while upcoming is not None and upcoming.basis < step:
-                bases[upcoming.mark] = upcoming.basis
+                written[upcoming.mark] = upcoming.basis
                 upcoming = next(writes, None)
-            if self.acting.get(step - 1, mark) != mark:
-                found[step] = bases[mark]
+            # The first step may show the last command of the session before.
+            if mark in written:
+                found[step] = written[mark]
         return found
+
+    def loops(self) -> dict[int, int]:
+        """By the step on which a command is known to act first: the step of its basis."""
+        bases = self.bases()
+        return {
+            step: bases[step] for step in bases if self.acting.get(step - 1, self.acting[step]) != self.acting[step]
+        }
 
 
 @dataclass
@@ -185,11 +193,21 @@ def check_against_capture(session: Session) -> None:
     assert (edge_ns <= answered_ns + US).all()
     assert np.percentile(answered_ns - edge_ns, 95) < 2 * MS
 
+    sampled_ns = dict(zip(session.run.states["step"].tolist(), session.run.states["sampled_ns"].tolist(), strict=True))
+    # Age, at each step that the client was served.
+    assert session.report.ages is not None
+    ages_ns = {
+        int(row["step"]): int(row["age_ns"]) for block in session.report.ages.rows("step", "age_ns") for row in block
+    }
+    bases = witness.bases()
+    assert len(bases) > 25
+    for step, basis in bases.items():
+        assert ages_ns[step] == sampled_ns[step] - sampled_ns[basis]
+
     # Loop latency, of each step on which a new command was seen to act.
     loops = witness.loops()
     samples = session.report.table["step"], session.report.table["basis_step"], session.report.table["loop"]
     reported = {int(step): (int(basis), int(loop)) for step, basis, loop in zip(*samples, strict=True)}
-    sampled_ns = dict(zip(session.run.states["step"].tolist(), session.run.states["sampled_ns"].tolist(), strict=True))
     checked = 0
     for step, basis in loops.items():
         if step in reported:
@@ -235,6 +253,10 @@ def test_stalls_of_the_edge_are_time_of_the_edge(lab: RunningLab, stall_ms: floa
     assert (edge_ms > stall_ms / 2).sum() >= waiting / 3
     # The stop itself is in no time of the controller.
     assert np.percentile(controller_ms, 98) < stall_ms / 2
+    # Commands are held while the edge is stopped.
+    assert session.report.age_ms is not None
+    assert session.report.age_ms.max > stall_ms
+    assert "edge_stall" in {reason.code for reason in session.report.reasons}
     stalls = overruns(session)
     assert sum(count for count, _ in stalls) == len(session.stalls)
     assert all(stall_ms - 25 <= longest_ms < stall_ms + 40 for _, longest_ms in stalls)

@@ -33,17 +33,27 @@ def _vector_head(field: str) -> bytes:
 
 
 _VECTORS: Final = ("position", "velocity", "integration_error")
-_MOTION: Final = np.dtype([item for name in _VECTORS for item in ((f"{name} head", "V2"), (name, "<f8", _JOINTS))])
+_SUBSTEPS_HEAD: Final = JointState(substeps=1).SerializeToString()[:-1]
+_MOTION: Final = np.dtype(
+    [
+        *(item for name in _VECTORS for item in ((f"{name} head", "V2"), (name, "<f8", _JOINTS))),
+        ("substeps head", f"V{len(_SUBSTEPS_HEAD)}"),
+        # A protobuf number below 128 is one byte.
+        ("substeps", "u1"),
+    ]
+)
 _EFFORT: Final = struct.Struct(f"<2s{_JOINTS}d")
 _EFFORT_HEAD: Final = _vector_head("effort")
 
 
 def encode_motion(plant: Plant) -> list[bytes]:
-    """Encode position, velocity and integration error of each rig as fields of a `JointState`."""
+    """Encode position, velocity, integration error and sub-steps of each rig as fields of a `JointState`."""
     rows = np.empty(plant.count, _MOTION)
     for name, values in zip(_VECTORS, (plant.position, plant.velocity, plant.error), strict=True):
         rows[f"{name} head"] = np.void(_vector_head(name))
         rows[name] = values.T
+    rows["substeps head"] = np.void(_SUBSTEPS_HEAD)
+    rows["substeps"] = plant.substeps
     encoded, size = rows.tobytes(), _MOTION.itemsize
     return [encoded[start : start + size] for start in range(0, len(encoded), size)]
 
@@ -172,15 +182,12 @@ class RigStateEncoder:
         A new message each time: a reused one would keep the memory of every part that was ever added.
         """
         world, index = self._world, self.index
-        poses = zip(
-            self._part_names,
-            world.x[:, index].tolist(),
-            world.y[:, index].tolist(),
-            world.z[:, index].tolist(),
-            world.yaw[:, index].tolist(),
-            strict=False,
-        )
+        columns = (world.x, world.y, world.z, world.yaw, *world.velocity)
+        motions = zip(self._part_names, *(column[:, index].tolist() for column in columns), strict=False)
         held = int(world.held[index])
         self._held_part = self._part_names[held] if held != NO_PART else ""
-        parts = [PartState(name=name, x=x, y=y, z=z, yaw=yaw) for name, x, y, z, yaw in poses]
+        parts = [
+            PartState(name=name, x=x, y=y, z=z, yaw=yaw, vx=vx, vy=vy, vz=vz)
+            for name, x, y, z, yaw, vx, vy, vz in motions
+        ]
         return JointState(parts=parts).SerializeToString()

@@ -16,6 +16,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("ticks_total", "counter", "Ticks of the service's loop.", "ticks", 1),
     ("overruns_total", "counter", "Ticks that began more than a period late.", "overruns", 1),
     ("missed_steps_total", "counter", "Steps skipped because of overruns.", "missed_steps", 1),
+    ("inaccurate_steps_total", "counter", "Steps of a rig with a too large error estimate.", "inaccurate_steps", 1),
     ("lateness_p50_seconds", "gauge", "Tick lateness in the last second, p50.", "lateness_p50_ns", 1e-9),
     ("lateness_p99_seconds", "gauge", "Tick lateness in the last second, p99.", "lateness_p99_ns", 1e-9),
     ("lateness_max_seconds", "gauge", "Tick lateness in the last second, maximum.", "lateness_max_ns", 1e-9),

@@ -16,6 +16,7 @@ from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Losses, Run
 from hilrig_replay.io.sequence_order import Repairs
+from hilrig_sim.arm.stability import ERROR_BOUND
 
 MIN_SAMPLES: Final = 500
 """Required number of samples; with fewer, p99 depends on fewer than five samples."""
@@ -23,8 +24,6 @@ MAX_UNCONTROLLED_SHARE: Final = 0.01
 """Largest share of steps without an age."""
 MAX_HELD_PERIODS: Final = 3
 """Control periods by which the p99 of the age may exceed that of the loop latency, beside one step."""
-MAX_INTEGRATION_ERROR: Final = np.array([np.radians(0.1), np.radians(0.1), 1e-4, np.radians(0.1)])
-"""Largest error estimate of a step: 0.1° or 0.1 mm; rad, rad, m, rad."""
 MIN_MISSING_BASES: Final = 5
 """Number of bases before the first state that shows that the beginning is missing: a controller may have read once,
 long before its first write."""
@@ -189,7 +188,7 @@ class DataQuality:
 
     def _add_errors(self, states: Rows) -> None:
         error = np.abs(states["integration_error"])
-        self._inaccurate_steps += int((error > MAX_INTEGRATION_ERROR).any(axis=1).sum())
+        self._inaccurate_steps += int((error > ERROR_BOUND).any(axis=1).sum())
         self._largest_error = np.maximum(self._largest_error, error.max(axis=0))
 
     def _add_events(self, events: Rows) -> None:
@@ -312,7 +311,7 @@ class DataQuality:
         if clock_steps:
             yield Reason("clock_step", f"{_count(clock_steps, 'step')} of the wall clock during the run")
         if self._inaccurate_steps:
-            joint = int(np.argmax(self._largest_error / MAX_INTEGRATION_ERROR))
+            joint = int(np.argmax(self._largest_error / ERROR_BOUND))
             error, unit = self._largest_error[joint], "mm" if joint == 2 else "°"
             largest = error * 1e3 if joint == 2 else np.degrees(error)
             text = f"{_count(self._inaccurate_steps, 'step')} with an integration error above 0.1° or 0.1 mm"
