@@ -4,11 +4,11 @@ BIN := .venv/bin
 # Bytecode files are always written: a lab has four processes, and tests start hundreds of processes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test together alone check gen bench system clean
+.PHONY: help demo test test-long together alone check gen bench system clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1|/' | awk -F'|' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{printf "  make %-9s %s\n", $$1, $$2}'
 
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
@@ -50,6 +50,10 @@ together: .venv/dev
 	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
 alone: .venv/dev
 	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
+
+test-long: .venv/dev ## tests that take minutes: 2,000 other forged recordings, the loop against a packet capture
+	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_basis_of_commands.py
 
 check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff format --check .

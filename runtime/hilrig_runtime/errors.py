@@ -22,8 +22,6 @@ class InputError(HilrigError):
 class OperationError(HilrigError):
     """A valid request that failed: a port in use, a full disk. Exit code 3."""
 
-    exit_code = 3
-
 
 def list_names(names: Sequence[str], limit: int = 3) -> str:
     """Join names for a message; those beyond `limit` are only counted."""

@@ -146,7 +146,7 @@ ALIVE: Final = "alive"
 RESERVED_RIG_NAMES: Final = frozenset({topic.name for topic in SERVICE_TOPICS} | {ALIVE})
 """Names in place of the rig in keys of services."""
 SERVICES: Final = ("sim", "edge", "recorder")
-"""The services of a lab; their names are used in place of the rig in keys of events (`Service.emit`)."""
+"""The services of a lab in start order; keys of events have their names in place of the rig (`Service.emit`)."""
 
 
 def alive_key(lab: str, service: str, instance: str) -> str:

@@ -13,7 +13,7 @@ from hilrig_cli import main
 ROOT = Path(__file__).parents[2]
 MODULES = sorted((ROOT / "tools/cli/hilrig_cli/commands").glob("[a-z]*.py"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-PANELS = {main.LAB_PANEL, main.SERVICES_PANEL, main.ANALYSIS_PANEL}
+PANELS = set(main.PANELS)
 
 
 def registered() -> Iterator[tuple[str, str, str | None]]:

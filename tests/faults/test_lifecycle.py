@@ -79,11 +79,10 @@ def test_second_signal_forces_exit(tmp_path: Path) -> None:
 
 
 LOCKED = """
-import os, signal, threading
+import os, signal
 from hilrig_runtime.process.shutdown import stop_on_signals
 
-stopping = threading.Event()
-stop_on_signals(stopping)
+stopping = stop_on_signals()
 with stopping._cond:
     # `wait` holds this lock for a moment.
     os.kill(os.getpid(), signal.SIGTERM)

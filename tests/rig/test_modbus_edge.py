@@ -40,6 +40,7 @@ def test_write_has_timestamps_in_chronological_order() -> None:
             began_ns,
             command.state_arrived_ns,
             command.state_served_ns,
+            *([command.write_received_ns] if sys.platform == "linux" else []),
             command.write_arrived_ns,
             command.sent_ns,
             now_ns(),
@@ -62,6 +63,25 @@ def test_pipelined_requests_give_no_negative_stage() -> None:
         for command in measured:
             assert 0 < command.state_arrived_ns <= command.state_served_ns
             assert command.state_served_ns <= command.write_arrived_ns <= command.sent_ns
+            assert command.write_received_ns == 0 or command.state_served_ns <= command.write_received_ns
+
+
+def test_two_connections_give_no_negative_stage() -> None:
+    """Both are sent at once: the kernel may receive the write before the state is served that the edge serves first."""
+    with running_edge() as rig, rig.client() as reader, rig.client() as writer:
+        read = reader.frame(b"\x03\x00\x04\x00\x04")
+        write = writer.frame(bytes.fromhex("10 00 00 00 01 02 00 01"))
+        for _ in range(300):
+            rig.state()
+            reader.send(read)
+            writer.send(write)
+            for client in (reader, writer):
+                client.receive()
+        measured = [command for command in rig.commands if command.basis_step]
+        assert len(measured) > 250
+        for command in measured:
+            assert command.basis_on_other_connection
+            assert command.write_received_ns == 0 or command.state_served_ns <= command.write_received_ns
 
 
 def test_every_request_is_in_the_request_log() -> None:
@@ -80,6 +100,24 @@ def test_every_request_is_in_the_request_log() -> None:
         arrived_ns = [arrived_ns for traffic in logged for arrived_ns in traffic.arrived_ns]
         assert arrived_ns == sorted(arrived_ns)
         assert all(0 <= after_ns < 1_000_000_000 for traffic in logged for after_ns in traffic.answered_after_ns)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="TCP_INFO has these figures on Linux")
+def test_request_log_has_tcp_figures_once_a_second() -> None:
+    with running_edge() as rig, rig.client() as client:
+        begin_ns = now_ns()
+        round_trips_us = []
+        while now_ns() < begin_ns + 2_500_000_000:
+            sent_ns = now_ns()
+            client.read(4, 4)
+            round_trips_us.append((now_ns() - sent_ns) // 1000)
+            time.sleep(0.02)
+        figures = [figures for traffic in rig.traffic for figures in traffic.connections]
+        assert 2 <= len(figures) <= 4
+        for one in figures:
+            assert one.controller == client.address
+            assert one.retransmissions == 0
+            assert 0 < one.min_rtt_us <= min(round_trips_us)
 
 
 def test_busy_polling_client_sends_few_messages_a_step() -> None:

@@ -270,6 +270,7 @@ def write(
     missing: Mapping[str, Collection[int]] = MappingProxyType({}),
     arrival_lag_ns: int = 0,
     lab_toml: str = "",
+    urdf_text: str | None = None,
 ) -> Path:
     """Write messages as the recorder does.
 
@@ -287,6 +288,7 @@ def write(
         missing: sequence numbers of messages that are not written, by topic.
         arrival_lag_ns: additional arrival delay of the second half of the messages.
         lab_toml: content of the attached lab file.
+        urdf_text: content of the attached URDF; None: that of the rig.
     """
     if arrival_lag_ns:
         made = list(made)
@@ -319,7 +321,8 @@ def write(
         }
         if configured:
             writer.add_metadata("hilrig.config", configuration)
-            writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", urdf(PARAMETERS).encode())
+            model = urdf(PARAMETERS) if urdf_text is None else urdf_text
+            writer.add_attachment(0, START_WALL_NS, f"{rig}.urdf", "application/xml", model.encode())
         if lab_toml:
             writer.add_attachment(0, START_WALL_NS, "lab.toml", "application/toml", lab_toml.encode())
         sequences = dict.fromkeys(RECORDED, 0)

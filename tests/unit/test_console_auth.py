@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hilrig_cli.commands.console import console
-from hilrig_console.auth import AccessPolicy, is_loopback, normalize_host_names
+from hilrig_console.auth import AccessPolicy, normalize_host_names
 from hilrig_console.serving import ListenAddress
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 
@@ -76,9 +76,10 @@ def test_rejects_invalid_listen_address(text: str) -> None:
 
 
 def test_recognizes_loopback_addresses() -> None:
-    assert is_loopback("127.1.2.3")
-    assert not is_loopback("")
-    assert not is_loopback("10.0.0.1")
+    assert ListenAddress("127.1.2.3", 1).is_loopback
+    assert ListenAddress("localhost", 1).is_loopback
+    assert not ListenAddress("", 1).is_loopback
+    assert not ListenAddress("10.0.0.1", 1).is_loopback
 
 
 @pytest.mark.parametrize(

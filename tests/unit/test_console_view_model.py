@@ -210,7 +210,7 @@ def test_lab_message_has_state_of_each_rig() -> None:
 
 def test_lab_message_has_bus_error_without_lab() -> None:
     model = ViewModel("lab", ("rig1",), 0)
-    model.set_bus_error("no zenoh router answers")
+    model.bus_error = "no zenoh router answers"
     lab = json.loads(model.frame(0.0, {}).lab)
     assert (lab["services"], lab["bus_error"]) == ([], "no zenoh router answers")
     assert [rig["state"] for rig in lab["rigs"]] == ["no edge"]

@@ -116,12 +116,14 @@ def test_reports_a_truncated_file_after_its_recovery(tmp_path: Path) -> None:
     assert found["truncated"] == "the file was truncated: messages at its end are missing, or can be"
 
 
-def stalled(count: int, lateness_ms: float) -> list[TimedMessage]:
+def stalled(count: int, lateness_ms: float, *, stalls: int = 0) -> list[TimedMessage]:
+    """A run with overrun events of the edge; `stalls`: number of stalls in each."""
     made = make(SCRIPT)
     for number in range(count):
         event = Event(rig="rig1", session=SESSION, kind=Event.OVERRUN, severity=Event.WARNING, source="edge/1")
         event.wall_ns = made[0].publish_wall_ns + (number + 1) * 1_000 * MS
         event.overrun_data.lateness_ns = round((lateness_ms + number / 10) * MS)
+        event.overrun_data.stalls = stalls
         made.append(TimedMessage("event", event.wall_ns, event))
     return sorted(made, key=lambda one: one.publish_wall_ns)
 
@@ -132,6 +134,14 @@ def test_reports_the_stalls_of_the_edge(tmp_path: Path) -> None:
     assert reasons(report) == {"edge_stall": "edge stalled 12 times, 201 ms each"}
     (finding,) = report.findings
     assert (finding.kind, finding.evidence["stalls"]) == ("edge_stall", 12)
+
+
+def test_counts_the_stalls_of_an_event(tmp_path: Path) -> None:
+    report = measured(tmp_path, stalled(4, 60, stalls=3), {"overruns": "4"})
+    assert reasons(report) == {"edge_stall": "edge stalled 12 times, 60 ms each"}
+    (tmp_path / "run.mcap").unlink()
+    # The fifth overrun is one of the simulation.
+    assert "simulation_stall" in reasons(measured(tmp_path, stalled(4, 60, stalls=3), {"overruns": "5"}))
 
 
 def test_short_stalls_of_the_edge_are_a_finding_only(tmp_path: Path) -> None:

@@ -248,6 +248,34 @@ def test_pipelined_write_is_not_based_on_preceding_read(bench: Bench) -> None:
     assert bench.commands[-1].state_served_ns < bench.commands[-1].write_arrived_ns
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_write_received_before_a_read_is_not_based_on_it(bench: Bench, own: bool) -> None:
+    """Several requests wait in the kernel while the edge is stalled: the edge serves the read first."""
+    reader = bench.connect()
+    writer = reader if own else bench.connect(port=2)
+    bench.write(writer, 0, 1)
+    times_ns = []
+    for step in (2, 3):
+        bench.clock.advance(10)
+        bench.state(step)
+        bench.read(reader, 4, 4)
+        times_ns.append(bench.clock.monotonic_ns())
+    bench.clock.advance(10)
+
+    def basis_of_write(received_ns: int) -> tuple[int, bool]:
+        now_ns = bench.clock.monotonic_ns()
+        writer.record_request(now_ns)
+        bench.device.write_registers(writer, 0, b"\0\1", now_ns, received_ns)
+        assert bench.commands[-1].write_received_ns == received_ns
+        return bench.commands[-1].basis_step, bench.commands[-1].basis_on_other_connection
+
+    assert basis_of_write(0) == (3, not own)
+    assert basis_of_write(times_ns[1]) == (3, not own)
+    assert basis_of_write(times_ns[1] - 1) == (2, not own)
+    assert basis_of_write(times_ns[0]) == (2, not own)
+    assert basis_of_write(times_ns[0] - 1) == (0, False)
+
+
 def test_read_of_torques_serves_no_state(bench: Bench) -> None:
     client = bench.connect()
     bench.read(client, 0, 4)
@@ -693,6 +721,7 @@ def test_invalid_state_message_is_ignored(bench: Bench) -> None:
         payload = b"\xff\xff\xff" if message is None else message.SerializeToString()
         bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
+    assert bench.rejected == ["state of rig1: not a valid state"] * 3
 
 
 def test_one_read_contains_one_step(bench: Bench) -> None:

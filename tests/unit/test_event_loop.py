@@ -3,14 +3,21 @@
 import asyncio
 import logging
 import socket
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from selectors import EVENT_READ
 
 import pytest
 
-from hilrig_modbus_edge.server.event_loop import HIGH_WATER, DirectEventLoop, SocketTransport
+from hilrig_modbus_edge.server.event_loop import (
+    HIGH_WATER,
+    DirectEventLoop,
+    SocketTransport,
+    set_receive_timestamps,
+)
 
 
 def test_timer_is_not_rounded_to_milliseconds() -> None:
@@ -230,6 +237,50 @@ def test_paused_reading_leaves_bytes_in_the_socket() -> None:
             assert protocol.received == b""
             transport.resume_reading()
             await until(lambda: protocol.received == b"later")
+            transport.abort()
+            await protocol.lost
+
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
+        runner.run(body())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel stamps received data on Linux")
+def test_kernel_timestamp_precedes_a_stall_of_the_loop() -> None:
+    async def body() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, DirectEventLoop)
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            set_receive_timestamps(listening)
+            with socket.create_connection(listening.getsockname()) as peer:
+                transport, protocol = SocketTransport(loop, listening.accept()[0], "peer"), Protocol()
+                transport.set_protocol(protocol)
+                assert transport.received_ns(0, time.monotonic_ns()) == 0
+                sent_ns = time.monotonic_ns()
+                peer.sendall(b"hello")
+                received_ns = time.monotonic_ns()
+                time.sleep(0.05)
+                await until(lambda: protocol.received == b"hello")
+                now_ns = time.monotonic_ns()
+                stamp_ns = transport.received_ns(sent_ns, now_ns)
+                # Softirqs may deliver the segment to the receiver after the call of the sender has returned.
+                assert sent_ns <= stamp_ns <= received_ns + 20_000_000
+                # What lies outside the bounds was stamped on another wall clock.
+                assert transport.received_ns(stamp_ns + 1_000_000, now_ns) == 0
+                assert transport.received_ns(sent_ns, stamp_ns - 1_000_000) == 0
+                transport.abort()
+                await protocol.lost
+
+    with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
+        runner.run(body())
+
+
+def test_socket_without_timestamps_has_none() -> None:
+    async def body() -> None:
+        transport, protocol, peer = await connect()
+        with peer:
+            await asyncio.get_running_loop().sock_sendall(peer, b"hello")
+            await until(lambda: protocol.received == b"hello")
+            assert transport.received_ns(0, time.monotonic_ns()) == 0
             transport.abort()
             await protocol.lost
 

@@ -10,6 +10,7 @@ import pytest
 from hilrig_modbus_edge.server.listener import bind
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import unknown_host
+from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.shutdown import run_main
@@ -76,7 +77,7 @@ def test_unknown_router_name_is_reported() -> None:
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tls/[::1]:7447", "tcp/localhost:1?rel=1"])
 def test_known_host_is_not_reported(endpoint: str) -> None:
-    assert unknown_host(endpoint) == ""
+    assert unknown_host(BusConfig(router=endpoint).router_host) == ""
 
 
 LIMITS = """

@@ -9,15 +9,17 @@ from typing import IO, Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Metadata
+from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 
+from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
 from hilrig_recorder.mcap_format.file_names import recovered_path
 from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_recorder.mcap_format.records import Chunk, Message, encode_message
 from hilrig_recorder.mcap_format.recover import read_session_metadata, recover
 from hilrig_recorder.mcap_format.scan import is_complete, read_chunk, scan
 from hilrig_recorder.mcap_format.writer import RecordingWriter
+from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError, OperationError
 from support import recordings
 from support.labs import hilrig
@@ -391,3 +393,81 @@ def test_open_file_can_be_locked_once(tmp_path: Path) -> None:
     with (tmp_path / "file").open("w") as one, (tmp_path / "file").open("r+") as two:
         assert lock_file(one.fileno())
         assert not lock_file(two.fileno())
+
+
+def two_copies(path: Path, seconds: float = 2.0) -> bytes:
+    """A recording as the recorder writes it: session and configuration at the beginning and at the end."""
+    script = recordings.Script(seconds=seconds)
+    plain = path.with_suffix(".plain")
+    recordings.write(plain, recordings.make(script), script=script)
+    items = list(scan(plain.read_bytes()))
+    session, config = (
+        item
+        for name in ("hilrig.session", "hilrig.config")
+        for _, item in items
+        if isinstance(item, Metadata) and item.name == name
+    )
+    writer = RecordingWriter(path, metadata=(session,))
+    writer.add_metadata(config.name, config.metadata, is_repeated=True)
+    for _, item in items:
+        if isinstance(item, Attachment):
+            writer.add_attachment(item.name, item.media_type, item.data, log_time=item.log_time)
+    file = open_run(plain).file
+    for channel_id, sequence, log_ns, publish_ns, data in file.messages(frozenset(file.topics.values())):
+        channel = CHANNEL_OF_TOPIC[file.topics[channel_id]]
+        writer.add(encode_message(channel, sequence, log_ns, publish_ns, data))
+    writer.finish(lambda: {"hilrig.summary": {"ended": "ended", "lost_transport": "0", "lost_recorder": "0"}})
+    writer.publish()
+    plain.unlink()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("end", ["4 KiB", "first chunk", "all but the last chunk"])
+def test_damaged_beginning_is_recovered_from_the_end(tmp_path: Path, end: str) -> None:
+    data = two_copies(tmp_path / "good.mcap")
+    good = open_run(tmp_path / "good.mcap")
+    chunks = [item.offset for _, item in scan(data) if isinstance(item, Chunk)]
+    until = {"4 KiB": 4096, "first chunk": chunks[1], "all but the last chunk": chunks[-1]}[end]
+    kept = sum(
+        isinstance(message, Message)
+        for _, item in scan(data)
+        if isinstance(item, Chunk) and item.offset >= until
+        for message in read_chunk(item)
+    )
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data[:8] + bytes(until - 8) + data[until:])
+    recovery = recover(damaged, tmp_path / "new.mcap")
+    assert recovery.messages == kept > 0
+    new = open_run(tmp_path / "new.mcap")
+    for name in ("hilrig.session", "hilrig.config"):
+        assert new.metadata[name] == good.metadata[name]
+    assert recover(tmp_path / "new.mcap", tmp_path / "newer.mcap").path is None
+
+
+def test_records_in_a_damaged_range_are_found_by_the_index(tmp_path: Path) -> None:
+    data = two_copies(tmp_path / "good.mcap")
+    offset = next(at for at, item in scan(data) if isinstance(item, Attachment) and item.name.endswith(".urdf"))
+    # The head of the record before is damaged, so reading in order continues at the next chunk.
+    config = next(at for at, item in scan(data) if isinstance(item, Metadata) and item.name == "hilrig.config")
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data[:config] + bytes(9) + data[config + 9 :])
+    recovery = recover(damaged, tmp_path / "new.mcap")
+    assert config < offset
+    assert open_run(tmp_path / "new.mcap").urdf == open_run(tmp_path / "good.mcap").urdf
+    assert 0 < recovery.damaged_bytes < offset - config + 9
+
+
+def test_difference_of_the_two_copies_is_damage(tmp_path: Path) -> None:
+    data = bytearray(two_copies(tmp_path / "good.mcap"))
+    first = data.index(b"parameters_json")
+    second = data.index(b"parameters_json", first + 1)
+    at = data.index(b"0.", second) + 2
+    data[at] ^= 1
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    with pytest.raises(InputError, match=r"damaged \(metadata hilrig\.config\.copy differs from its first copy"):
+        open_run(damaged)
+    recovery = recover(damaged, tmp_path / "new.mcap")
+    assert any("differs from its first copy" in reason for reason in recovery.reasons)
+    good = open_run(tmp_path / "good.mcap")
+    assert open_run(tmp_path / "new.mcap").parameters_json == good.parameters_json

@@ -26,8 +26,8 @@ def parameters(text: str) -> None:
             PART.format(name="a", x=300, y=0) + PART.format(name="b", x=320, y=0),
             "parts 'a' and 'b' overlap: their centers are 20.0 mm apart and must be 40.0 mm apart",
         ),
-        (PART.format(name="a", x=300, y=0) * 2, "duplicate name 'a' of a part or tray"),
-        (PART.format(name="tray", x=300, y=0), "duplicate name 'tray' of a part or tray"),
+        (PART.format(name="a", x=300, y=0) * 2, "duplicate part or tray name 'a'"),
+        (PART.format(name="tray", x=300, y=0), "duplicate part or tray name 'tray'"),
         (PART.format(name="a", x=300, y=0) + "mass_kg = 0", "scene.parts[0].mass_kg: must be > 0, got 0"),
         (PART.format(name="a", x=300, y=0) + 'colour = "red"', "scene.parts[0].colour"),
         (

@@ -8,9 +8,13 @@ import pytest
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
-from hilrig_study.live.from_recording import evaluate_gains, recorded_ages
+from hilrig_study.live.from_recording import MAX_RECORDED_AGE_STEPS, evaluate_gains, recorded_ages
 from hilrig_study.study_config import AxisConfig, ControllerConfig, StudyConfig
+from hilrig_study.theory.expected_cost import age_chain
 from support import recordings
+
+DATA = Path(__file__).parents[1] / "data"
+ONE_GAIN = StudyConfig(x=AxisConfig(what="delay_ms", values=(0.0,)), y=AxisConfig(what="gain", values=(0.3,)))
 
 
 def recorded(folder: Path, **script: object) -> Path:
@@ -24,6 +28,39 @@ def test_ages_equal_loop_latency_and_grow_for_held_command(tmp_path: Path) -> No
     new = run.states[run.states["basis_step"] != 0]
     assert int(np.median(ages)) == round(float(np.median(new["loop_latency_ns"])) / 20e6)
     assert (np.diff(ages) <= 1).all()
+
+
+@pytest.mark.parametrize("name", ["simulation-restarted.mcap", "before-columns-of-requests.mcap"])
+def test_ages_are_those_of_the_latency_report(name: str) -> None:
+    run = open_run(DATA / name)
+    latency, gains = measure(run), evaluate_gains(run, ONE_GAIN)
+    assert gains.as_dict()["age_ms"] == latency.as_dict()["age_ms"]
+    assert latency.ages is not None
+    ages = np.concatenate(list(latency.ages.ages_ns()))
+    recorded = np.concatenate(recorded_ages(latency))
+    assert len(recorded) == len(ages)
+    assert np.array_equal(recorded, np.clip(np.rint(ages / run.step_ns), 1, MAX_RECORDED_AGE_STEPS))
+
+
+@pytest.mark.parametrize("name", ["simulation-restarted.mcap", "before-columns-of-requests.mcap"])
+def test_markov_chain_has_the_recorded_distribution_of_ages(name: str) -> None:
+    sequences = recorded_ages(measure(open_run(DATA / name)))
+    chain, recorded = age_chain(sequences), np.concatenate(sequences)
+    values, vectors = np.linalg.eig(chain.transition.T)
+    stationary = vectors[:, np.argmin(np.abs(values - 1))].real
+    stationary /= stationary.sum()
+    for age, share in zip(chain.ages, stationary, strict=True):
+        measured = float((recorded == age).mean())
+        # Successive ages are correlated: about one independent value in two steps.
+        error = np.sqrt(2 * share * (1 - share) / len(recorded))
+        assert share == pytest.approx(measured, abs=3 * error + 1 / len(recorded)), age
+
+
+def test_open_loop_has_no_ages(tmp_path: Path) -> None:
+    script = recordings.Script(seconds=4.0, controllers=False)
+    run = open_run(recordings.write(tmp_path / "run.mcap", recordings.make(script), script=script))
+    with pytest.raises(InputError, match="no loop latency: no closed loop: no controller wrote commands"):
+        evaluate_gains(run)
 
 
 def test_longer_latency_reduces_largest_stable_gain(tmp_path: Path) -> None:

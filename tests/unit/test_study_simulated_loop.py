@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from hilrig_modbus_edge.impairment.model import Impairment
 from hilrig_modbus_edge.registers import codec
@@ -14,19 +15,18 @@ from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 from hilrig_study.controllers.control_laws import ComputedTorque, LawController, Measurement, Pid
 from hilrig_study.controllers.lqr import PredictiveLqr
-from hilrig_study.linear_model import linearize
+from hilrig_study.linear_model import Floats, linearize
 from hilrig_study.simulation import quantization
 from hilrig_study.simulation.plants import ArmPlant, LinearArms
 from hilrig_study.simulation.simulated_loop import Outcome, Scenario, simulate
 from hilrig_study.simulation.timing import NO_POLL, LoopTiming, Timeline, poll_count, timeline
 from hilrig_study.theory.expected_cost import (
     age_chain,
-    ages_by_tick,
     expected_cost,
     mean_square_radius,
     transition_matrices,
 )
-from hilrig_study.theory.margins import is_stable, linearize_law
+from hilrig_study.theory.margins import STABLE_RADIUS, LinearLaw, linearize_law, loop_matrix, spectral_radius
 
 ARM = ArmParameters()
 MS = 1_000_000
@@ -200,6 +200,16 @@ def test_run_without_poll_reads_initialized_positions(monkeypatch: pytest.Monkey
     assert run(pd(0.5, 0.015), lines, ticks=200, linear=True).settled.all()
 
 
+def is_stable(phi: Floats, gamma: Floats, law: LinearLaw, timing: LoopTiming, command_delay_ns: int) -> bool:
+    return spectral_radius(loop_matrix(phi, gamma, law, timing, 0, command_delay_ns)) < STABLE_RADIUS
+
+
+def ages_by_tick(line: Timeline) -> NDArray[np.int64]:
+    """Return the age of the acting command at every tick, steps; 0: no command acts."""
+    ages = np.arange(len(line.in_force)) - line.basis[np.maximum(line.in_force, 0)]
+    return np.where(line.in_force != NO_POLL, ages, 0)
+
+
 def growth(outcome: Outcome, number: int, pose: tuple[float, float, float, float]) -> float:
     """Return the ratio of the largest distance from the pose in the last third and in the middle third."""
     distance = np.linalg.norm((outcome.positions[:, :, number] - np.array(pose)) / [1, 1, 0.1, 1], axis=1)
@@ -219,7 +229,7 @@ def test_simulation_and_theory_agree_on_stable_delays(pose: tuple[float, float, 
     timing = LoopTiming()
     delays_ms = range(0, 121)
     steps = [timing.latency_steps(0, ms * MS)[0] for ms in delays_ms]
-    theory = {n: is_stable(phi, gamma, law, timing, 0, ms * MS) for ms, n in zip(delays_ms, steps, strict=True)}
+    theory = {n: is_stable(phi, gamma, law, timing, ms * MS) for ms, n in zip(delays_ms, steps, strict=True)}
     lines = [timeline(timing, 3000, command_delay_ns=ms * MS) for ms in delays_ms]
     outcome = run(pd(gain), lines, pose=pose, ticks=3000, linear=True, quantize=False, limit=1e9)
     simulated = [
@@ -240,7 +250,7 @@ def test_nonlinear_arm_settles_if_theory_is_stable() -> None:
         law = linearize_law(pd(gain), plant_model, 0.02)
         delays_ms = [0, 10, 20, 40, 60, 80, 100, 150, 200, 300]
         outcome = run(pd(gain), [timeline(timing, 1500, 0, ms * MS) for ms in delays_ms], ticks=1500)
-        expected = [is_stable(phi, gamma, law, timing, 0, ms * MS) for ms in delays_ms]
+        expected = [is_stable(phi, gamma, law, timing, ms * MS) for ms in delays_ms]
         assert outcome.settled.tolist() == expected
 
 

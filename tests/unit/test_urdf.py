@@ -5,7 +5,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from hilrig_sim.arm.model import JOINT_NAMES, ArmParameters, RigParameters, SceneParameters
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters
 from hilrig_sim.arm.urdf import LINKS, urdf
 from support.recordings import PARAMETERS
 

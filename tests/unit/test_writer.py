@@ -247,7 +247,7 @@ def test_initial_metadata_is_in_the_first_write(tmp_path: Path) -> None:
     assert read(path) == added
     with path.open("rb") as stream:
         found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-    assert found == {"owner": {"rig": "rig1"}, "more": {}}
+    assert found == {"owner": {"rig": "rig1"}, "more": {}, "owner.copy": {"rig": "rig1"}, "more.copy": {}}
 
 
 def metadata_in(content: bytes) -> dict[str, dict[str, str]]:

@@ -60,30 +60,18 @@ class BusIdentity:
 def identities(tls: BusTlsConfig) -> list[BusIdentity]:
     """Return all accepted identities except the router."""
     edges = [BusIdentity(name, "edge", rigs, name) for name, rigs in tls.edges.items()] or [BusIdentity("edge", "edge")]
-    return [
-        BusIdentity("sim", "sim"),
-        *edges,
-        BusIdentity("recorder", "recorder"),
-        *(BusIdentity(t, t) for t in TOOL_ROLES),
-    ]
+    return [BusIdentity("sim", "sim"), *edges, *(BusIdentity(role, role) for role in ("recorder", *TOOL_ROLES))]
 
 
 def access_control(tls: BusTlsConfig, lab: str = "*") -> dict[str, Any]:
     """Return the `access_control` section of a zenoh configuration; `lab` `*`: all labs of this authority."""
-    rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
-    for identity in identities(tls):
-        granted = list(_rules_of(identity, lab))
-        rules += granted
-        subjects.append({"id": identity.name, "cert_common_names": [identity.name]})
-        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [identity.name]})
+    granted = {identity.name: list(_rules_of(identity, lab)) for identity in identities(tls)}
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+        "rules": [rule for rules in granted.values() for rule in rules],
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in granted],
+        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": [name]} for name, rules in granted.items()],
     }
 
 

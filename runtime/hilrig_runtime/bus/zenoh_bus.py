@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 import zenoh
@@ -36,12 +37,13 @@ logger = logging.getLogger(__name__)
 
 
 class _Declared(Handle):
-    def __init__(self, item: Any, *more: Any) -> None:
-        self._items = [item, *more]
+    def __init__(self, declaration: Any) -> None:
+        self._declaration = declaration
 
     def close(self) -> None:
-        while self._items:
-            self._items.pop().undeclare()
+        declaration, self._declaration = self._declaration, None
+        if declaration is not None:
+            declaration.undeclare()
 
 
 class _NewestReader(Handle):
@@ -61,19 +63,13 @@ class _NewestReader(Handle):
         self._thread.start()
 
     def _read(self) -> None:
-        with raise_priority():
-            self._read_all()
-
-    def _read_all(self) -> None:
         recv, on_sample = self._ring.recv, self._on_sample
-        while not self._closing:
-            try:
+        # A receive fails when the subscriber is undeclared or the session is closed.
+        with raise_priority(), suppress(zenoh.ZError):
+            while not self._closing:
                 sample = recv()
-            except zenoh.ZError:
-                # Undeclared, or the session is closed.
-                return
-            if not self._closing:
-                on_sample(sample)
+                if not self._closing:
+                    on_sample(sample)
 
     def close(self) -> None:
         if not self._closing:
@@ -192,7 +188,7 @@ def _deliver(on_message: OnMessage) -> Callable[[zenoh.Sample], None]:
 
 def _open_error(bus: BusConfig, service: str, error: Exception) -> str:
     if bus.topology == "router":
-        host = unknown_host(bus.router)
+        host = unknown_host(bus.router_host)
         if host:
             return f"no zenoh router answers at {bus.router} (bus.router in lab.toml): unknown host name {host!r}"
         certificate = "" if bus.tls is None else ", or the certificates do not match: run hilrig doctor"

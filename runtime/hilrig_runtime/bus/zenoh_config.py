@@ -22,6 +22,13 @@ MESH_ORDER: Final = ("sim", "edge", "recorder")
 ROUTER: Final = "router"
 FIRST_INSTANCE: Final = "1"
 """The instance that has a fixed port in the mesh."""
+_COMMON: Final[dict[str, Any]] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "scouting/delay": 0,
+    # Implicit shared memory can lose data, and a batch is larger than its threshold.
+    "transport/shared_memory/enabled": False,
+}
 _CERTS_HINT: Final = "create certificates with hilrig certs on the host that has ca.key"
 
 
@@ -51,7 +58,7 @@ def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -
         connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
         if service in MESH_ORDER:
             listen = [mesh_endpoint(bus, service) if has_port else f"{_protocol(bus)}/{bus.host}:0"]
-    settings: dict[str, Any] = _common() | {
+    settings = _COMMON | {
         "mode": mode,
         "listen/endpoints": listen,
         "connect/endpoints": connect,
@@ -75,7 +82,7 @@ def router_config(bus: BusConfig, lab: str, listen: str) -> zenoh.Config:
     Raises:
         InputError: a certificate of the router is missing.
     """
-    settings = _common() | {"mode": "router", "listen/endpoints": [listen]}
+    settings = _COMMON | {"mode": "router", "listen/endpoints": [listen]}
     if bus.tls is not None:
         settings |= _tls_settings(bus.tls, ROUTER)
         settings["access_control"] = access_control(bus.tls, lab)
@@ -103,16 +110,6 @@ def own_identity(tls: BusTlsConfig, service: str, instance: str = FIRST_INSTANCE
 
 def _protocol(bus: BusConfig) -> str:
     return "tcp" if bus.tls is None else "tls"
-
-
-def _common() -> dict[str, Any]:
-    return {
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        # Implicit shared memory can lose data, and a batch is larger than its threshold.
-        "transport/shared_memory/enabled": False,
-    }
 
 
 def _tls_settings(tls: BusTlsConfig, name: str) -> dict[str, Any]:
@@ -149,9 +146,8 @@ def _build(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-def unknown_host(endpoint: str) -> str:
-    """Return the host of an endpoint ("tcp/host:port") if it can't be resolved; empty: it can."""
-    host = endpoint.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
+def unknown_host(host: str) -> str:
+    """Return a host name if it can't be resolved; empty: it can."""
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError):

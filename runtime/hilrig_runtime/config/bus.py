@@ -46,6 +46,11 @@ class BusConfig(Section):
     tls: BusTlsConfig | None = None
     """Require certificates of this lab."""
 
+    @property
+    def router_host(self) -> str:
+        """Host name or address in the endpoint of the router."""
+        return self.router.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
+
     def may_serve(self, source: str, rig: str) -> bool:
         """Return whether a service, "<service>/<instance>", may publish for a rig according to its certificate."""
         service, _, instance = source.partition("/")

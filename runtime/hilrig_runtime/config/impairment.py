@@ -11,6 +11,8 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from hilrig_runtime.config.types import NotNegative, Section
+from hilrig_runtime.config.validation import read_text
+from hilrig_runtime.errors import InputError
 
 MAX_DELAY_MS: Final = 10_000.0
 """Longest delay, ms; a mistyped unit is detected here."""
@@ -176,10 +178,9 @@ def read_trace(path: Path) -> tuple[float, ...]:
         ValueError: the file can't be read, or a line is not a delay: a trace has no gaps.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ValueError(f"trace {path}: can't be read: {reason}") from error
+        lines = read_text(path).splitlines()
+    except InputError as error:
+        raise ValueError(f"trace {error}") from error
     delays = []
     for number, line in enumerate(lines, 1):
         if line.startswith("#"):

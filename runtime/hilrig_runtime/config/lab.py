@@ -4,7 +4,6 @@ Units are SI unless the key's name states another one (`step_ms`, `timeout_ms`).
 with the defaults below.
 """
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -27,8 +26,9 @@ from hilrig_runtime.config.types import (
     Section,
     TableForm,
     Vector4,
+    check_distinct,
 )
-from hilrig_runtime.config.validation import format_validation_error
+from hilrig_runtime.config.validation import format_validation_error, parse_toml, read_text, validate
 from hilrig_runtime.errors import InputError, list_names
 from hilrig_schemas.topics import RESERVED_RIG_NAMES, SERVICES
 
@@ -211,9 +211,7 @@ class RigsTable(Section):
 
     @model_validator(mode="after")
     def _names_are_distinct(self) -> "RigsTable":
-        for name, times in Counter(rig.name for rig in self.single).items():
-            if times > 1:
-                raise ValueError(f"duplicate rig name {name!r}")
+        check_distinct("rig name", (rig.name for rig in self.single))
         return self
 
 
@@ -247,9 +245,7 @@ class LabConfig(Section):
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
-        for name, times in Counter(rig.name for rig in self.rigs).items():
-            if times > 1:
-                raise ValueError(f"duplicate rig name {name!r}")
+        check_distinct("rig name", (rig.name for rig in self.rigs))
         all_ports = [*self.ports.items(), *self.tls_ports.items()]
         ports = Counter(port for _, port in all_ports)
         for rig, port in all_ports:
@@ -343,20 +339,7 @@ def load_lab(path: Path | None) -> LabConfig:
     Raises:
         InputError: the file can't be read, or is not a valid lab configuration; names every error.
     """
-    return LabConfig() if path is None else parse_lab(read_lab_text(path), str(path))
-
-
-def read_lab_text(path: Path) -> str:
-    """Read the text of a lab's file.
-
-    Raises:
-        InputError: the file can't be read.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise InputError(f"{path}: can't be read: {reason}") from error
+    return LabConfig() if path is None else parse_lab(read_text(path), str(path))
 
 
 def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
@@ -365,11 +348,6 @@ def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:
     Raises:
         InputError: as `load_lab`.
     """
-    try:
-        lab = LabConfig.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where}: invalid TOML: {error}") from error
-    except ValidationError as error:
-        raise InputError("\n".join(f"{where}: {text}" for text in format_validation_error(error))) from error
+    lab = validate(LabConfig, parse_toml(text, where), where)
     lab._source = text
     return lab

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hilrig_runtime.config.types import Color, Flag, Name, Number, Positive, Section, Vector2
+from hilrig_runtime.config.types import Color, Flag, Name, Number, Positive, Section, Vector2, check_distinct
 
 
 class TableConfig(Section):
@@ -124,10 +124,7 @@ class SceneConfig(Section):
     @model_validator(mode="after")
     def _objects_are_distinct_and_on_the_table(self) -> "SceneConfig":
         objects: tuple[TrayConfig | PartConfig, ...] = (*self.trays, *self.parts)
-        names = [item.name for item in objects]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"duplicate name {name!r} of a part or tray")
+        check_distinct("part or tray name", (item.name for item in objects))
         half = [length / 2 for length in self.table.size_mm]
         for item in objects:
             x, y = (at - center for at, center in zip(item.position_mm, self.table.centre_mm, strict=True))

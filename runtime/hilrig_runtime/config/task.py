@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from hilrig_runtime.config.types import Name, NotNegative, Number, Positive, Section
+from hilrig_runtime.config.types import Name, NotNegative, Number, Positive, Section, check_distinct
 
 Vector3 = tuple[Number, Number, Number]
 
@@ -72,8 +72,5 @@ class TaskConfig(Section):
     def _task_is_not_empty(self) -> "TaskConfig":
         if not self.poses and self.path is None and self.place is None:
             raise ValueError("a task needs poses, a path or parts to place: [[task.poses]], [task.path], [task.place]")
-        names = [pose.name for pose in self.poses]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"duplicate pose name {name!r}")
+        check_distinct("pose name", (pose.name for pose in self.poses))
         return self

@@ -10,7 +10,6 @@ import textwrap
 import types
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Final, get_args
 
 from pydantic.fields import FieldInfo
@@ -36,7 +35,7 @@ def _lines(section: Section, path: tuple[str, ...], *, with_comments: bool = Tru
             continue
         if with_comments:
             yield from _explanation(field, descriptions.get(name, ""))
-        yield f"# {name} =" if value is None else f"{name} = {_literal(value)}"
+        yield f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
     for name, value in tables:
         field = type(section).model_fields[name]
         yield ""
@@ -91,9 +90,10 @@ def _choices(annotation: Any) -> list[str]:
     return [json.dumps(option) for option in options] if options and all(isinstance(o, str) for o in options) else []
 
 
-def _literal(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_literal, value))}]"
-    if isinstance(value, Path):
-        return json.dumps(str(value))
-    return json.dumps(value)
+def toml_value(value: Any) -> str:
+    """Return a number, text, path, sequence or dictionary as an inline TOML value."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return json.dumps(value, default=str)

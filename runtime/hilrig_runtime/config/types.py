@@ -1,5 +1,7 @@
 """Base class and value types of the tables in `lab.toml`."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Annotated, Final
@@ -28,6 +30,17 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Network = Annotated[IPv4Network | IPv6Network, BeforeValidator(ip_network)]
 Vector2 = tuple[Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
+
+
+def check_distinct(kind: str, names: Iterable[str]) -> None:
+    """Check that no name occurs twice.
+
+    Raises:
+        ValueError: one does.
+    """
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise ValueError(f"duplicate {kind} {name!r}")
 
 
 @dataclass(frozen=True)

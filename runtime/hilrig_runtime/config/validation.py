@@ -1,13 +1,21 @@
-"""Formats pydantic's validation errors as plain sentences, each with the place of the value."""
+"""Reads and validates configuration; each error is a plain sentence with the place of the value."""
 
 import difflib
 import reprlib
+import tomllib
 from collections.abc import Iterator
-from typing import Any, Final, get_args
+from pathlib import Path
+from typing import Any, Final, TypeVar, get_args
 
 from pydantic import ValidationError
 
 from hilrig_runtime.config.types import PATTERN_DESCRIPTIONS, Section, TableForm
+from hilrig_runtime.errors import InputError
+
+SectionT = TypeVar("SectionT", bound=Section)
+
+MAX_TEXT_BYTES: Final = 8 << 20
+"""Largest text file that is read. A lab of 500 rigs has 0.1 MB, with a recorded delay trace in it 1 MB."""
 
 _BOUNDS: Final = {"greater_than_equal": "≥", "greater_than": ">", "less_than_equal": "≤", "less_than": "<"}
 _CONTEXT_KEYS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
@@ -31,6 +39,53 @@ _EXPECTED: Final = {
 """pydantic's type of error → the value that is accepted."""
 _REPR: Final = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 80
+
+
+def read_text(path: Path) -> str:
+    """Read a text file of at most `MAX_TEXT_BYTES`.
+
+    Raises:
+        InputError: the file can't be read, or is too large.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_TEXT_BYTES + 1)
+        if len(content) > MAX_TEXT_BYTES:
+            raise InputError(f"{path}: can't be read: larger than {MAX_TEXT_BYTES >> 20} MiB")
+        return content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise InputError(f"{path}: can't be read: {reason}") from error
+
+
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """Parse TOML; `where` is the name of the file in messages.
+
+    Raises:
+        InputError: the text is not TOML, too long or nested too deeply.
+    """
+    if len(text) > MAX_TEXT_BYTES:
+        raise InputError(f"{where}: invalid TOML: longer than {MAX_TEXT_BYTES >> 20} MiB")
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{where}: invalid TOML: nested too deeply; expected at most some hundred levels") from error
+    except ValueError as error:
+        # Also an integer with thousands of digits.
+        raise InputError(f"{where}: invalid TOML: {error}") from error
+
+
+def validate(model: type[SectionT], values: dict[str, Any], where: str = "") -> SectionT:
+    """Return the table with these values; `where` is the name of the file in messages.
+
+    Raises:
+        InputError: a value is invalid; names every error.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        prefix = f"{where}: " if where else ""
+        raise InputError("\n".join(f"{prefix}{text}" for text in format_validation_error(error))) from error
 
 
 def format_validation_error(error: ValidationError) -> list[str]:

@@ -12,7 +12,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals, stop_with_stdin
+from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, lower_priority, set_short_slice
 
 ROUTER_RETRY_S: Final = 0.5
@@ -37,10 +37,7 @@ def run_service(
     """
     _set_scheduling(name, lab)
     allow_open_files()
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-    if stop_with_parent:
-        stop_with_stdin(stopping)
+    stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     force_exit_after(stopping, close_timeout_s)
     bus = _open_bus(lab, name, instance, stopping)
     if bus is None:

@@ -1,6 +1,5 @@
 """Runs the zenoh router of a lab: the router embedded in the zenoh library, with the lab's access rules."""
 
-import threading
 from contextlib import closing
 
 import zenoh
@@ -8,13 +7,7 @@ import zenoh
 from hilrig_runtime.bus.zenoh_config import ROUTER, router_config, system_reason
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.process.shutdown import (
-    CLOSE_TIMEOUT_S,
-    force_exit_after,
-    stop_on_signals,
-    stop_with_stdin,
-    wait_for,
-)
+from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals, wait_for
 from hilrig_schemas.topics import alive_key
 
 
@@ -41,10 +34,7 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
         OperationError: the endpoint is not available.
     """
     endpoint = router_endpoint(lab, listen)
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-    if stop_with_parent:
-        stop_with_stdin(stopping)
+    stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     force_exit_after(stopping, CLOSE_TIMEOUT_S)
     config = router_config(lab.bus, lab.name, endpoint)
     try:

@@ -64,10 +64,7 @@ class Service(Handle):
             bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batch_cache_depth)
         )
         self.recording_stream = RecordingStream(log_publisher, self.source, self.incarnation)
-        health_publisher = self._closing.enter_context(
-            bus.publisher(HEALTH.key(lab.name, name, instance), HEALTH.traffic)
-        )
-        self.health = HealthReporter(health_publisher, name, instance, self.incarnation, clock)
+        self.health = HealthReporter(self.publisher(HEALTH), name, instance, self.incarnation, clock)
         self.counters = self.health.counters
         self._token: Handle | None = None
         self._failure = ""

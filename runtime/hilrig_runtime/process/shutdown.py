@@ -33,8 +33,12 @@ _THREAD_LIMIT_MESSAGE: Final = "can't start new thread"
 """Text of Python's RuntimeError when the system refuses a new thread."""
 
 
-def stop_on_signals(stopping: threading.Event) -> None:
-    """Set `stopping` on the first SIGINT or SIGTERM; end the process on the second."""
+def stop_on_signals(*, stop_with_parent: bool = False) -> threading.Event:
+    """Return an event that the first SIGINT or SIGTERM sets, and on request the end of the parent process.
+
+    The second signal ends the process.
+    """
+    stopping = threading.Event()
     count = itertools.count()
     received: SimpleQueue[int] = SimpleQueue()
 
@@ -54,6 +58,9 @@ def stop_on_signals(stopping: threading.Event) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", None)):
         if number is not None:
             signal.signal(number, on_signal)
+    if stop_with_parent:
+        stop_with_stdin(stopping)
+    return stopping
 
 
 def wait_for(stopping: threading.Event) -> None:

@@ -52,6 +52,10 @@ class RequestLog:
         self._add_arrived_ns(arrived_ns)
         self._add_answered_after_ns(answered_ns - arrived_ns)
 
+    def record_connection(self, controller: str, min_rtt_us: int, retransmissions: int) -> None:
+        """Record the TCP figures of an open connection; fields as in `ModbusConnection`."""
+        self._message.connections.add(controller=controller, min_rtt_us=min_rtt_us, retransmissions=retransmissions)
+
     def drain(self, closed_ns: int, wall_ns: int) -> ModbusTraffic:
         """Return the recorded requests as a message and start a new one.
 

@@ -22,6 +22,8 @@ from hilrig_schemas import Event, RigReport, topics
 
 REQUEST_LOG_PERIOD_NS: Final = 200_000_000
 """Period at which the request log of a rig is published, ns."""
+TCP_FIGURES_PERIOD_NS: Final = 1_000_000_000
+"""Period at which the TCP figures of the connections are recorded, ns."""
 
 
 class BusOutput:
@@ -87,6 +89,7 @@ class RigEndpoint:
         self._request_log = service.rig_publisher(topics.TRAFFIC, rig.name)
         self.request_log_due_ns = 0
         """Time at which the request log is published next, ns, monotonic clock."""
+        self._tcp_figures_due_ns = 0
         self._sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
 
     def bind(self, port: int, tls_port: int | None) -> None:
@@ -123,6 +126,9 @@ class RigEndpoint:
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
             late_ns = max(0, now_ns - self.request_log_due_ns)
             self.request_log_due_ns += REQUEST_LOG_PERIOD_NS * (1 + late_ns // REQUEST_LOG_PERIOD_NS)
+            if now_ns >= self._tcp_figures_due_ns:
+                self._tcp_figures_due_ns = now_ns + TCP_FIGURES_PERIOD_NS
+                server.log_tcp_figures()
             self._publish_request_log()
 
     def report(self) -> RigReport:

@@ -223,7 +223,13 @@ class EdgeService:
         monotonic_ns = service.clock.monotonic_ns
         while not service.stopping.is_set():
             await asyncio.sleep(rate.remaining_s)
-            service.counters.count_tick(rate.tick(monotonic_ns()), TICK_NS)
+            tick = rate.tick(monotonic_ns())
+            service.counters.count_tick(tick, TICK_NS)
+            # Lateness against the original deadline: `lateness_ns` is against the one after the skipped periods.
+            late_ns = tick.lateness_ns + tick.missed_steps * TICK_NS
+            if late_ns > TICK_NS:
+                for endpoint in self._endpoints.values():
+                    endpoint.device.report_stall(late_ns, monotonic_ns())
             for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)

@@ -107,10 +107,9 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
             raise lab.no_such_rig(rig, sorted(added))
         if waited_s > WAIT_MESSAGE_AFTER_S and not message_printed:
             message_printed = True
+            where = "for a service that it was added to"
             print(
-                f"hilrig: rig {rig!r} is not in lab.toml; waiting up to {QUERY_TIMEOUT_S:g} s for a service that it "
-                "was added to",
-                file=sys.stderr,
+                f"hilrig: rig {rig!r} is not in lab.toml; waiting up to {QUERY_TIMEOUT_S:g} s {where}", file=sys.stderr
             )
         time.sleep(0.05)
 

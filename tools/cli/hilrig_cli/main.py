@@ -8,36 +8,33 @@ import inspect
 
 import typer
 
-from hilrig_cli.commands import (
-    certs,
-    check,
-    compare,
-    console,
-    demo,
-    doctor,
-    export,
-    figures,
-    impair,
-    jitter,
-    latency,
-    lease,
-    live,
-    metrics,
-    play,
-    record,
-    recover,
-    registers,
-    replay,
-    report,
-    rig,
-    router,
-    runs,
-    services,
-    study,
-    top,
-    up,
-    verify,
-)
+from hilrig_cli.commands import record, rig
+from hilrig_cli.commands.certs import certs
+from hilrig_cli.commands.check import check
+from hilrig_cli.commands.compare import compare
+from hilrig_cli.commands.console import console
+from hilrig_cli.commands.demo import demo
+from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.export import export
+from hilrig_cli.commands.figures import figures
+from hilrig_cli.commands.impair import impair
+from hilrig_cli.commands.jitter import jitter
+from hilrig_cli.commands.latency import latency
+from hilrig_cli.commands.lease import lease
+from hilrig_cli.commands.live import live
+from hilrig_cli.commands.metrics import metrics
+from hilrig_cli.commands.play import play
+from hilrig_cli.commands.recover import recover
+from hilrig_cli.commands.registers import registers
+from hilrig_cli.commands.replay import replay
+from hilrig_cli.commands.report import report
+from hilrig_cli.commands.router import router
+from hilrig_cli.commands.runs import runs
+from hilrig_cli.commands.services import edge, recorder, sim
+from hilrig_cli.commands.study import study
+from hilrig_cli.commands.top import top
+from hilrig_cli.commands.up import up
+from hilrig_cli.commands.verify import verify
 
 app = typer.Typer(
     name="hilrig",
@@ -49,40 +46,18 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-LAB_PANEL = "Run a lab"
-SERVICES_PANEL = "Run a single service"
-ANALYSIS_PANEL = "Analyze recordings"
+PANELS = {
+    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, certs),
+    "Run a single service": (sim, edge, recorder, router),
+    "Analyze recordings": (runs, latency, replay, compare, study, report, verify, figures, recover, play, export),
+}
+"""Panels of the help, each with its commands."""
 
-app.command(rich_help_panel=LAB_PANEL)(up.up)
-app.command(rich_help_panel=LAB_PANEL)(demo.demo)
-app.command(rich_help_panel=LAB_PANEL)(live.live)
-app.command(rich_help_panel=LAB_PANEL)(console.console)
-app.command(rich_help_panel=LAB_PANEL)(top.top)
-app.command(rich_help_panel=LAB_PANEL)(metrics.metrics)
-app.command(rich_help_panel=LAB_PANEL)(check.check)
-app.add_typer(rig.app, name="rig", rich_help_panel=LAB_PANEL)
-app.command(rich_help_panel=LAB_PANEL)(doctor.doctor)
-app.command(rich_help_panel=LAB_PANEL)(lease.lease)
-app.command(rich_help_panel=LAB_PANEL)(impair.impair)
-app.command(rich_help_panel=LAB_PANEL)(jitter.jitter)
-app.command(rich_help_panel=LAB_PANEL)(registers.registers)
-app.command(rich_help_panel=LAB_PANEL)(certs.certs)
-app.add_typer(record.app, name="record", rich_help_panel=LAB_PANEL)
-app.command(rich_help_panel=SERVICES_PANEL)(services.sim)
-app.command(rich_help_panel=SERVICES_PANEL)(services.edge)
-app.command(rich_help_panel=SERVICES_PANEL)(services.recorder)
-app.command(rich_help_panel=SERVICES_PANEL)(router.router)
-app.command(rich_help_panel=ANALYSIS_PANEL)(runs.runs)
-app.command(rich_help_panel=ANALYSIS_PANEL)(latency.latency)
-app.command(rich_help_panel=ANALYSIS_PANEL)(replay.replay)
-app.command(rich_help_panel=ANALYSIS_PANEL)(compare.compare)
-app.command(rich_help_panel=ANALYSIS_PANEL)(study.study)
-app.command(rich_help_panel=ANALYSIS_PANEL)(report.report)
-app.command(rich_help_panel=ANALYSIS_PANEL)(verify.verify)
-app.command(rich_help_panel=ANALYSIS_PANEL)(figures.figures)
-app.command(rich_help_panel=ANALYSIS_PANEL)(recover.recover)
-app.command(rich_help_panel=ANALYSIS_PANEL)(play.play)
-app.command(rich_help_panel=ANALYSIS_PANEL)(export.export)
+for _panel, _commands in PANELS.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
+app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
+app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
 
 
 def _unwrap_help(group: typer.Typer) -> None:

@@ -1,5 +1,6 @@
 """Options and texts that several commands share."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,6 @@ Config = Annotated[
         "-c",
         metavar="LAB.TOML",
         help="Configuration file of the lab; default: one rig with default settings.",
-        show_default=False,
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
@@ -23,6 +23,11 @@ def config_for_commands(context: typer.Context, config: Config = None) -> None:
     """Callback of a command group: accepts `-c` before the command too; `-c` after the command takes precedence."""
     if config is not None and isinstance(context.command, TyperGroup):
         context.default_map = {name: {"config": str(config)} for name in context.command.commands}
+
+
+def log(line: str) -> None:
+    """Print a message of a running command on standard error."""
+    print(f"hilrig: {line}", file=sys.stderr, flush=True)
 
 
 def format_size(size: float) -> str:

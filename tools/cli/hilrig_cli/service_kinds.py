@@ -1,9 +1,7 @@
-"""The kinds of service of a lab, in their start and stop orders."""
+"""The order in which the services of a lab stop, and those that have rigs; `topics.SERVICES` is their start order."""
 
 from typing import Final
 
-SERVICE_KINDS: Final = ("sim", "edge", "recorder")
-"""Every kind of service, in start order."""
 STOP_ORDER: Final = ("edge", "sim", "recorder")
 """The edge first: it zeroes the torques and ends the sessions. The recorder last: it records both."""
 RIG_SERVICES: Final = ("sim", "edge")

@@ -16,7 +16,8 @@ from typing import Final
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from hilrig_console.auth import HEALTH_PATH, REPORT_POLICY, AccessPolicy, AuthMiddleware
@@ -30,7 +31,6 @@ FRAME_PERIOD_S: Final = 0.2
 MAX_BROWSERS: Final = 64
 """Upper limit of simultaneous event streams."""
 STATIC_FOLDER: Final = Path(__file__).with_name("static")
-PAGE_FILES: Final = ("console.css", "console.js", "icon.svg")
 
 logger = logging.getLogger(__name__)
 
@@ -76,17 +76,15 @@ class Console:
     def __init__(self, subscriber: LabSubscriber, catalog: RecordingCatalog, policy: AccessPolicy) -> None:
         self._subscriber = subscriber
         self._catalog = catalog
-        self._page = (STATIC_FOLDER / "index.html").read_text(encoding="utf-8")
-        self.broadcast: Broadcast | None = None
+        self.broadcast = Broadcast(self._frame)
         routes = [
-            Route("/", self._index),
             Route("/live", self._live),
             Route("/scenes", self._scenes),
             Route("/runs", self._runs),
             Route("/recordings/{path:path}", self._recording),
             Route("/reports/{path:path}", self._report),
             Route(HEALTH_PATH, self._health),
-            *(Route(f"/{name}", self._file) for name in PAGE_FILES),
+            Mount("/", StaticFiles(directory=STATIC_FOLDER, html=True)),
         ]
         app = Starlette(routes=routes, lifespan=self._lifespan, exception_handlers={HilrigError: _error_response})  # type: ignore[dict-item]
         self.app: ASGIApp = AuthMiddleware(app, policy)
@@ -94,7 +92,6 @@ class Console:
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
         del app
-        self.broadcast = Broadcast(self._frame)
         tasks = [asyncio.create_task(_repeat(task)) for task in (self.broadcast.publish, self._refresh_recordings)]
         yield
         for task in tasks:
@@ -107,32 +104,20 @@ class Console:
 
     async def _refresh_recordings(self) -> None:
         """Refresh the list of recordings while a browser is connected."""
-        if self._stream.browsers:
+        if self.broadcast.browsers:
             await asyncio.to_thread(self._catalog.refresh)
-
-    @property
-    def _stream(self) -> Broadcast:
-        assert self.broadcast is not None
-        return self.broadcast
-
-    async def _index(self, request: Request) -> Response:
-        del request
-        return HTMLResponse(self._page)
-
-    async def _file(self, request: Request) -> Response:
-        return FileResponse(STATIC_FOLDER / request.url.path[1:])
 
     async def _health(self, request: Request) -> Response:
         del request
         return PlainTextResponse("ok\n")
 
     async def _live(self, request: Request) -> Response:
-        if self._stream.browsers >= MAX_BROWSERS:
+        if self.broadcast.browsers >= MAX_BROWSERS:
             return PlainTextResponse(
                 f"limit of {MAX_BROWSERS} connected browsers reached\n", HTTPStatus.SERVICE_UNAVAILABLE
             )
         last = request.headers.get("last-event-id", "")
-        stream = self._stream.stream(int(last) if last.isascii() and last.isdigit() else 0)
+        stream = self.broadcast.stream(int(last) if last.isascii() and last.isdigit() else 0)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
     async def _scenes(self, request: Request) -> Response:

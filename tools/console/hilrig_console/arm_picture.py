@@ -65,11 +65,7 @@ def pose_of(arm: ArmParameters, state: JointState) -> Pose | None:
         return None
     elbow_x, elbow_y = arm.l2 * math.cos(theta1), arm.l2 * math.sin(theta1)
     x, y = elbow_x + arm.l3 * math.cos(theta1 + theta2), elbow_y + arm.l3 * math.sin(theta1 + theta2)
-    flags = (
-        (MAGNET_ON if state.magnet else 0)
-        | (HOLDS_PART if state.held_part else 0)
-        | (AT_STOP if state.limit_flags else 0)
-    )
+    flags = MAGNET_ON * state.magnet + HOLDS_PART * bool(state.held_part) + AT_STOP * bool(state.limit_flags)
     return [_mm(elbow_x), _mm(elbow_y), _mm(x), _mm(y), _mm(arm.l1 - d3), flags]
 
 

@@ -122,13 +122,6 @@ class AuthMiddleware:
         return PlainTextResponse("password required\n", HTTPStatus.UNAUTHORIZED, challenge)
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether a host name or address is reachable from this host only."""
-    if host == "localhost":
-        return True
-    return _is_ip_address(host) and ipaddress.ip_address(host.partition("%")[0]).is_loopback
-
-
 def normalize_host_names(names: Iterable[str]) -> frozenset[str]:
     """Return host names in lower case without trailing dots; empty names are left out."""
     return frozenset(name.lower().rstrip(".") for name in names if name)

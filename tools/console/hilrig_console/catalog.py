@@ -14,6 +14,7 @@ from typing import Any, Final
 from hilrig_console.worker import Worker
 from hilrig_recorder.mcap_format.file_names import recording_stem
 from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
+from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.errors import HilrigError, InputError
 
 LIST_PERIOD_S: Final = 2.0
@@ -70,8 +71,8 @@ class ReportWorker:
         page.write_text(build_report([recording]).html, encoding="utf-8")
 
 
-class RecordingCatalog:
-    """Recordings below a folder; a context manager. The methods may be called from any thread."""
+class RecordingCatalog(Handle):
+    """Recordings below a folder. The methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -80,7 +81,6 @@ class RecordingCatalog:
         self.error = "the recordings are being listed"
         """Reason why the list is missing or outdated; empty: none."""
         self._entries: list[RunEntry] = []
-        self._by_path: dict[str, RunEntry] = {}
         self._due_s = 0.0
         self._list_worker = Worker(ListWorker, folder)
         self._report_worker = Worker(ReportWorker)
@@ -102,7 +102,6 @@ class RecordingCatalog:
         self._due_s = time.monotonic() + max(LIST_PERIOD_S, LIST_REST_FACTOR * spent_s)
         if (entries, message) != (self._entries, self.error):
             self._entries, self.error = entries, message
-            self._by_path = {entry.path: entry for entry in entries}
             self.version += 1
 
     def search(self, query: str) -> dict[str, Any]:
@@ -126,9 +125,9 @@ class RecordingCatalog:
         Raises:
             InputError: the recording is not listed or does not exist anymore.
         """
-        entry = self._by_path.get(path)
-        found = None if entry is None else (self.folder / entry.path).resolve()
-        if found is None or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
+        found = (self.folder / path).resolve()
+        is_listed = any(entry.path == path for entry in self._entries)
+        if not is_listed or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
             raise InputError(f"unknown recording {path!r}")
         return found
 
@@ -160,10 +159,8 @@ class RecordingCatalog:
                 self._reports.popitem(last=False)[1].unlink(missing_ok=True)
             return page
 
-    def __enter__(self) -> "RecordingCatalog":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the worker processes and delete the reports."""
         self._list_worker.close()
         self._report_worker.close()
         self._cache.cleanup()

@@ -6,13 +6,14 @@ import ssl
 import threading
 import urllib.request
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
 import uvicorn
 
 from hilrig_console.app import Console
-from hilrig_console.auth import HEALTH_PATH, AccessPolicy, is_loopback
+from hilrig_console.auth import HEALTH_PATH, AccessPolicy
 from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_runtime.config.lab import LabConfig
@@ -46,7 +47,10 @@ class ListenAddress:
     @property
     def is_loopback(self) -> bool:
         """Whether the address is reachable from this host only."""
-        return is_loopback(self.host)
+        try:
+            return ip_address(self.host.partition("%")[0]).is_loopback
+        except ValueError:
+            return self.host == "localhost"
 
     def open_socket(self) -> socket.socket:
         """Open a listening socket.
@@ -119,22 +123,19 @@ class ConsoleServer:
         # Lower levels only log aborted connections.
         logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._serve, name="console", daemon=True)
-
-    def _serve(self) -> None:
-        self._server.run(sockets=[self._socket])
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="console", daemon=True
+        )
 
     def __enter__(self) -> "ConsoleServer":
         self._subscriber.__enter__()
-        self._catalog.__enter__()
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._console.broadcast is not None:
-            self._console.broadcast.close()
+        self._console.broadcast.close()
         self._server.should_exit = True
-        self._catalog.__exit__()
+        self._catalog.close()
         self._subscriber.__exit__()
         self._thread.join(timeout=5.0)
         self._socket.close()

@@ -88,7 +88,7 @@ class LabSubscriber:
 
     def _set_bus_error(self, error: str) -> None:
         with self._model.lock:
-            self._model.set_bus_error(error)
+            self._model.bus_error = error
 
     def _receive(self, bus: Bus) -> None:
         bus.subscribe(HEALTH.key(self._lab.name, "*", "*"), self._on_health)
@@ -99,9 +99,8 @@ class LabSubscriber:
             now_s = time.monotonic()
             is_viewed = now_s - self._viewed_s < VIEWER_TIMEOUT_S
             if is_viewed and states is None:
-                states = bus.subscribe_newest(
-                    STATES.key(self._lab.name, "*", "*"), self._on_states, _MAX_QUEUED_BATCHES
-                )
+                key = STATES.key(self._lab.name, "*", "*")
+                states = bus.subscribe_newest(key, lambda _, batch: self._states.append(batch), _MAX_QUEUED_BATCHES)
             elif not is_viewed and states is not None:
                 states.close()
                 states = None
@@ -137,10 +136,6 @@ class LabSubscriber:
     def _on_event(self, key: str, payload: bytes) -> None:
         with self._model.lock:
             self._model.events.add(key, payload)
-
-    def _on_states(self, key: str, payload: bytes) -> None:
-        del key
-        self._states.append(payload)
 
 
 def _config(bus: Bus, lab: str, rig: str) -> RigConfig | None:

@@ -56,14 +56,11 @@ class ViewModel:
         self.poses = PoseCache()
         self.events = EventBuffer(start)
         self._lab = lab
-        self._bus_error = ""
+        self.bus_error = ""
+        """Reason why the bus is unavailable; empty: connected."""
         self._addresses: dict[str, str] = {}
         self._lab_text = ""
         self._lab_due_s = 0.0
-
-    def set_bus_error(self, error: str) -> None:
-        """Set the reason why the bus is unavailable; empty: connected."""
-        self._bus_error = error
 
     def set_addresses(self, infos: list[ServiceInfo]) -> None:
         """Set the addresses of the rigs from the announcements of the edges."""
@@ -93,7 +90,7 @@ class ViewModel:
         return {
             "lab": self._lab,
             "at_s": now_s,
-            "bus_error": self._bus_error,
+            "bus_error": self.bus_error,
             "scenes": len(self.poses.scenes),
         } | values
 

@@ -2,12 +2,12 @@
 
 import threading
 import time
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from google.protobuf.message import DecodeError
 
 from hilrig_monitoring.lab_view import LabView
+from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
@@ -18,8 +18,8 @@ FIRST_REPORTS_TIMEOUT_S: Final = 3.0
 """Timeout for the first reports: the time to set up the links, and one report period of 1 s."""
 
 
-class LabWatch:
-    """Context manager that keeps a `LabView` up to date; `lock` is held while the view changes."""
+class LabWatch(Handle):
+    """Keeps a `LabView` up to date until it is closed; `lock` is held while the view changes."""
 
     def __init__(self, lab: LabConfig) -> None:
         self.lab = lab
@@ -58,10 +58,6 @@ class LabWatch:
             name = f"{health.service}/{health.instance}"
             self._report_counts[name] = self._report_counts.get(name, 0) + 1
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Leave the bus."""
         self._bus.close()

@@ -1,6 +1,5 @@
 """Prometheus exporter of a lab: text exposition format, version 0.0.4, and its HTTP server."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -115,8 +114,3 @@ def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> Threadi
     server = ThreadingHTTPServer(address, Handler)
     server.daemon_threads = True
     return server
-
-
-def text_of(view: LabView, lab: str) -> str:
-    """Format all metrics of a view at the current time."""
-    return exposition(view, lab, time.monotonic())

@@ -16,7 +16,8 @@ from scipy.linalg import expm
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import GRAVITY, JOINT_NAMES, ArmParameters, Vector4
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import GRAVITY, ArmParameters, Vector4
 
 Floats = NDArray[np.float64]
 
@@ -72,20 +73,14 @@ class LinearPlant:
         return total_phi, total_gamma
 
 
-def holding_effort(arm: ArmParameters, payload: float = 0.0) -> Vector4:
+def holding_effort(arm: ArmParameters) -> Vector4:
     """Return the effort that balances gravity and the external wrench at rest; N·m, N·m, N, N·m."""
-    lift = arm.external_force_z - (arm.masses[2] + payload) * GRAVITY
+    lift = arm.external_force_z - arm.masses[2] * GRAVITY
     return (-arm.external_torque_z, -arm.external_torque_z, lift, -arm.external_torque_z)
 
 
-def linearize(arm: ArmParameters, pose: Sequence[float], *, payload: float = 0.0, coupled: bool = True) -> LinearPlant:
-    """Linearize the arm at rest at `pose` (rad, rad, m, rad).
-
-    Args:
-        arm: parameters of the arm.
-        pose: q0, (4,), between the stops.
-        payload: m4, mass held by the magnet, kg.
-        coupled: False uses only the diagonal of M(q0), which decouples the joints.
+def linearize(arm: ArmParameters, pose: Sequence[float]) -> LinearPlant:
+    """Linearize the arm without a part at rest at q0 = `pose`, (4,), between the stops; rad, rad, m, rad.
 
     Raises:
         InputError: the pose is at or beyond a stop, where the arm is not linear.
@@ -95,16 +90,13 @@ def linearize(arm: ArmParameters, pose: Sequence[float], *, payload: float = 0.0
     for name, low, value, high in zip(JOINT_NAMES, arm.lower, pose, arm.upper, strict=True):
         if not low < value < high:
             raise InputError(f"pose: {name} must be between its stops {low:g} and {high:g} (rad or m), got {value:g}")
-    mass = mass_matrix(arm, pose[1], payload)
-    if not coupled:
-        mass = np.diag(np.diag(mass))
-    inverse = np.linalg.inv(mass)
+    inverse = np.linalg.inv(mass_matrix(arm, pose[1]))
     a, b = np.zeros((8, 8)), np.zeros((8, 4))
     a[:4, 4:] = np.eye(4)
     a[4:, 4:] = -inverse @ np.diag(arm.friction)
     b[4:] = inverse
     first, second, third, fourth = map(float, pose)
-    return LinearPlant(a, b, (first, second, third, fourth), holding_effort(arm, payload))
+    return LinearPlant(a, b, (first, second, third, fourth), holding_effort(arm))
 
 
 def fixed_order_product(matrix: Floats, columns: Floats) -> Floats:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.plots.output import save_figure
 from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
 from hilrig_study.theory.gain_theory import GainTheory
@@ -110,9 +110,7 @@ def plane_figure(
     bar = figure.colorbar(mesh, ax=axes, pad=0.01, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
     bar.set_label("mean of Σ (error / 1° or 1 mm)² + 0.01 Σ effort²", fontsize=8)
-    for axis, config in ((axes.xaxis, study.x), (axes.yaxis, study.y)):
-        if config.spacing == "log":
-            (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
+    axes.set(xscale=study.x.spacing, yscale=study.y.spacing)
     theory = [entry for entry in swept.theory if entry.controller == number]
     predicts = study.controllers[number].kind == "lqr" and study.controllers[number].compensate
     _draw_theory(axes, study, theory, predicts)
@@ -142,8 +140,7 @@ def plane_figure(
                 zorder=5,
                 label=label,
             )
-    axes.set_xlim(*_ends(study.x))
-    axes.set_ylim(*_ends(study.y))
+    axes.set(xlim=_ends(study.x), ylim=_ends(study.y))
     axes.set_xlabel(study.x.label, color=TEXT_COLOR)
     axes.set_ylabel(study.y.label, color=TEXT_COLOR)
     axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=TEXT_COLOR)
@@ -155,12 +152,11 @@ def plane_figure(
 
 def _ends(axis: AxisConfig) -> tuple[float, float]:
     points = axis.points
-    if axis.spacing == "log" or len(points) < 2:
-        return float(points.min()) * (1 if len(points) > 1 else 0.9), float(points.max()) * (
-            1 if len(points) > 1 else 1.1
-        )
-    half = float(points.max() - points.min()) / (len(points) - 1) / 2
-    return float(points.min()) - half, float(points.max()) + half
+    low, high = float(points.min()), float(points.max())
+    if len(points) < 2:
+        return 0.9 * low, 1.1 * high
+    half = 0.0 if axis.spacing == "log" else (high - low) / (len(points) - 1) / 2
+    return low - half, high + half
 
 
 def _draw_theory(axes: Axes, study: StudyConfig, theory: Sequence[GainTheory], predicts: bool) -> None:

@@ -1,7 +1,6 @@
 """Result files of a study: a Parquet table with one row per run, and a JSON summary."""
 
 import json
-import math
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -10,9 +9,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+from pydantic_core import to_jsonable_python
 
 from hilrig_replay.io.output_file import output_file
-from hilrig_sim.arm.model import JOINT_NAMES
+from hilrig_sim.arm.joints import JOINT_NAMES
 from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import CELL_DTYPE, SweepResult
@@ -37,10 +37,9 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
     controllers = []
     for number, controller in enumerate(study.controllers):
         settled = swept.plane(study, number, swept.results["settled"])
-        theory = []
-        for entry in swept.theory:
-            if entry.controller == number:
-                theory.append({key: value for key, value in asdict(entry).items() if key != "controller"})
+        theory = [asdict(entry) for entry in swept.theory if entry.controller == number]
+        for entry in theory:
+            del entry["controller"]
         controllers.append(
             {
                 "name": controller.name,
@@ -61,19 +60,13 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
         "times_real_time": simulated_s / swept.seconds,
         "controllers": controllers,
     }
-    plain: dict[str, Any] = _plain(values)
+    return _plain(values)
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Return JSON values, with infinity and NaN replaced by null, since JSON has neither."""
+    plain: dict[str, Any] = to_jsonable_python(values, inf_nan_mode="null")
     return plain
-
-
-def _plain(value: Any) -> Any:
-    """Return the value with infinity and NaN replaced by null, since JSON has neither."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
@@ -82,7 +75,7 @@ def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dic
     Raises:
         OperationError: a file can't be written.
     """
-    written: dict[str, Any] = summary(study, swept) | _plain(more)
+    written = summary(study, swept) | _plain(more)
     with output_file(folder / "runs.parquet") as table_file, output_file(folder / "study.json") as summary_file:
         pyarrow.parquet.write_table(run_table(study, swept), table_file)
         summary_file.write_text(json.dumps(written, indent=1), encoding="utf-8")

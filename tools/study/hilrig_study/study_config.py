@@ -5,22 +5,22 @@ degrees, as in `lab.toml`; gains are in SI units.
 """
 
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from hilrig_runtime.config.impairment import ImpairmentSetting, LinkImpairments
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.types import NotNegative, Number, Positive, Section, Vector4
-from hilrig_runtime.config.validation import format_validation_error
+from hilrig_runtime.config.validation import parse_toml, read_text, validate
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import JOINT_NAMES, RigParameters, joints_si
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import RigParameters, joints_si
 from hilrig_sim.parameters import rig_parameters
 from hilrig_study.controllers.control_laws import ComputedTorque, Controller, Pid
 from hilrig_study.controllers.lqr import PredictiveLqr
@@ -86,13 +86,8 @@ class MotionTaskConfig(Section):
 
     def scenario(self) -> Scenario:
         """Return the task in SI units."""
-        return Scenario(
-            joints_si(self.pose),
-            joints_si(self.offset),
-            joints_si(self.amplitude),
-            self.frequency_hz,
-            joints_si(self.limit),
-        )
+        pose, offset, amplitude, limit = map(joints_si, (self.pose, self.offset, self.amplitude, self.limit))
+        return Scenario(pose, offset, amplitude, self.frequency_hz, limit)
 
 
 class ControllerConfig(Section):
@@ -236,14 +231,8 @@ class StudyConfig(Section):
 
     @model_validator(mode="after")
     def _check_start_position(self) -> "StudyConfig":
-        joints = zip(
-            JOINT_NAMES,
-            self.task.pose,
-            self.task.offset,
-            self.arm.lower_limits,
-            self.arm.upper_limits,
-            strict=True,
-        )
+        task, arm = self.task, self.arm
+        joints = zip(JOINT_NAMES, task.pose, task.offset, arm.lower_limits, arm.upper_limits, strict=True)
         for joint, pose, offset, lower, upper in joints:
             if not lower <= pose + offset <= upper:
                 raise ValueError(
@@ -278,15 +267,9 @@ class StudyConfig(Section):
         step = step_ms or self.loop.step_ms
         substeps = max(1, math.ceil(step / 20.0))
         start = tuple(p + o for p, o in zip(self.task.pose, self.task.offset, strict=True))
-        try:
-            arm = ArmConfig.model_validate({**self.arm.model_dump(), "start_position": start})
-            return LabConfig(
-                name="study",
-                sim=SimConfig(step_ms=step, substeps=substeps),
-                rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),),
-            )
-        except ValidationError as error:
-            raise InputError("; ".join(format_validation_error(error))) from error
+        arm = validate(ArmConfig, {**self.arm.model_dump(), "start_position": start})
+        sim = validate(SimConfig, {"step_ms": step, "substeps": substeps})
+        return LabConfig(name="study", sim=sim, rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),))
 
     def link_impairments(self, controller: int) -> LinkImpairments:
         """Return the link impairments of a controller, without the swept values."""
@@ -317,17 +300,7 @@ def load_study(path: Path) -> StudyConfig:
     Raises:
         InputError: the file can't be read, is not valid TOML, or is not a valid study; the message has every error.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: can't be read: {reason}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: invalid TOML: {error}") from error
-    try:
-        study = StudyConfig.model_validate(values)
-    except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {message}" for message in format_validation_error(error))) from error
+    study = validate(StudyConfig, parse_toml(read_text(path), str(path)), str(path))
     study.linear_plant()
     study.loop.timing()
     return study

@@ -26,10 +26,12 @@ class ConnectedController:
     """Its open connections."""
     served: ServedState | None = None
     """The state that any of its connections was last served in this session; None: none was."""
+    served_before: ServedState | None = None
+    """The one served before."""
 
     def clear_served(self) -> None:
         """Clear the state that any of its connections was served; each connection keeps its own."""
-        self.served = None
+        self.served = self.served_before = None
         for client in self.clients:
             client.other_basis = None
 
@@ -52,6 +54,8 @@ class Client:
     """It cannot acquire the lease before this time, because its lease was revoked; ns, monotonic clock."""
     served: ServedState | None = None
     """The state that it was last served since the previous session ended; None: none was."""
+    served_before: ServedState | None = None
+    """The one served before."""
     basis: ServedState | None = None
     """`served` when its newest bytes arrived: they cannot be based on a newer one."""
     other_basis: ServedState | None = None
@@ -65,12 +69,24 @@ class Client:
 
     def record_served(self, served: ServedState) -> None:
         """Record the state that it was served."""
-        self.served = served
-        self.controller.served = served
+        controller = self.controller
+        self.served_before, controller.served_before = self.served, controller.served
+        self.served = controller.served = served
+
+    def basis_before(self, received_ns: int) -> ServedState:
+        """Return the basis of a write that the kernel received at `received_ns`, before the newest state was served."""
+        for served in (self.served_before, self.other_basis, self.controller.served_before):
+            if served is not None and served[1] <= received_ns:
+                return served
+        return NO_STATE
+
+    def was_served(self, basis: ServedState) -> bool:
+        """Return whether the basis of its newest write is not one that another connection was served."""
+        return basis is self.basis or basis is self.served_before or basis is NO_STATE
 
     def clear_served(self) -> None:
         """Clear the state that it was served: no later write is based on it."""
-        self.served = self.basis = None
+        self.served = self.served_before = self.basis = None
 
 
 def controller_of(connection: Client, lease: Literal["controller", "connection"]) -> str:

@@ -27,6 +27,7 @@ _FIELDS_OF_A_WRITE: Final = (
     "state_served_ns",
     "state_injected_ns",
     "write_arrived_ns",
+    "write_received_ns",
 )
 
 
@@ -79,10 +80,13 @@ class CommandPublisher:
         self.zero()
         self._message.resets += 1
 
-    def publish_write(self, client: Client, arrived_ns: int) -> bool:
-        """Publish the registers as the command of a client whose write arrived at `arrived_ns`, monotonic clock.
+    def publish_write(self, client: Client, arrived_ns: int, received_ns: int) -> bool:
+        """Publish the registers as the command of a client; return False if the impaired link drops it.
 
-        Returns False if the impaired link drops it.
+        Args:
+            client: connection that wrote.
+            arrived_ns: arrival of the write at this process, ns, monotonic clock.
+            received_ns: kernel's receive timestamp of the write, ns, monotonic clock; 0: unavailable.
         """
         command = self._message
         if client is not self._writer:
@@ -93,8 +97,9 @@ class CommandPublisher:
         # Setting a protobuf field costs as much as a dozen bytecodes: unchanged fields are not set again.
         if self.echo != self._echo_published:
             command.echo = self._echo_published = self.echo
-        # A state that the client itself was served proves the loop; one of another connection may not be used by it.
         basis = client.basis or client.other_basis or NO_STATE
+        if 0 < received_ns < basis[1]:
+            basis = client.basis_before(received_ns)
         before = self._basis
         if basis is not before:
             self._basis = basis
@@ -106,8 +111,9 @@ class CommandPublisher:
                     command.state_arrived_ns,
                     command.state_injected_ns,
                 ) = state
-            command.basis_on_other_connection = client.basis is None and basis is not NO_STATE
+            command.basis_on_other_connection = not client.was_served(basis)
         command.write_arrived_ns = arrived_ns
+        command.write_received_ns = received_ns
         self._set_effort_and_session()
         if self.delayed is not None:
             return self.delayed.put(command, bytes(self.torque))

@@ -127,6 +127,11 @@ class Device:
         text = f"{address}: connection to {self.rig} refused: {reason}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
 
+    def report_stall(self, late_ns: int, now_ns: int) -> None:
+        """Report a tick of the edge that is late by more than its period, if a session is open; ns, monotonic clock."""
+        if self.session is not None:
+            self._write_access.stalls.record(late_ns, now_ns)
+
     def connections_of(self, host: str) -> int:
         """Return the number of connections of a host."""
         return sum(client.host == host for client in self.clients)
@@ -197,8 +202,17 @@ class Device:
         if end > POSITION_ADDRESS and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
-    def write_registers(self, client: Client, address: int, words: bytes, arrived_ns: int) -> None:
+    def write_registers(
+        self, client: Client, address: int, words: bytes, arrived_ns: int, received_ns: int = 0
+    ) -> None:
         """Write holding registers, all or none; torques are published at once.
+
+        Args:
+            client: connection that writes.
+            address: first register.
+            words: values, big-endian.
+            arrived_ns: arrival of the write at this process, ns, monotonic clock.
+            received_ns: kernel's receive timestamp of the write, ns, monotonic clock; 0: unavailable.
 
         Raises:
             ModbusError: 02 a register does not exist or is read-only, 04 the watchdog timeout is outside the bounds
@@ -208,7 +222,7 @@ class Device:
         if end <= POSITION_ADDRESS:
             self._write_access.authorize_write(client, arrived_ns)
             self._commands.torque[2 * address : 2 * end] = words
-            self._publish_write(client, arrived_ns)
+            self._publish_write(client, arrived_ns, received_ns)
             return
         self.check_writable(address, len(words) // 2)
         sets_timeout = address <= WATCHDOG_ADDRESS < end
@@ -225,8 +239,8 @@ class Device:
         self._commands.publish_session()
         self._write_access.feed_watchdog(client, arrived_ns)
 
-    def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int) -> None:
-        """Switch the magnet, or reset the rig.
+    def write_coil(self, client: Client, address: int, on: bool, arrived_ns: int, received_ns: int = 0) -> None:
+        """Switch the magnet, or reset the rig; arguments as `write_registers`.
 
         Raises:
             ModbusError: as `write_registers`.
@@ -242,11 +256,11 @@ class Device:
             self._commands.magnet = on
         else:
             self._commands.reset()
-        self._publish_write(client, arrived_ns)
+        self._publish_write(client, arrived_ns, received_ns)
 
-    def _publish_write(self, client: Client, arrived_ns: int) -> None:
+    def _publish_write(self, client: Client, arrived_ns: int, received_ns: int) -> None:
         """Publish the written registers; a command that the emulated network drops does not feed the watchdog."""
-        if self._commands.publish_write(client, arrived_ns):
+        if self._commands.publish_write(client, arrived_ns, received_ns):
             self._write_access.feed_watchdog(client, arrived_ns)
 
     # -- time

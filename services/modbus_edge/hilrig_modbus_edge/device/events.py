@@ -1,4 +1,4 @@
-"""Events of a rig: each carries the session and the simulation step; lease events are rate-limited per host."""
+"""Events of a rig: each has the session and the simulation step; those that may occur in bursts are rate-limited."""
 
 from typing import Final
 
@@ -12,6 +12,8 @@ from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two lease events of one kind and host, ns."""
+STALL_EVENT_PERIOD_NS: Final = 1_000 * MS
+"""Shortest time between two events about stalls of the edge, ns."""
 
 
 class EventEmitter:
@@ -102,3 +104,42 @@ class LeaseEventReporter:
     def _emit_acquired(self, address: str, count: int = 1) -> None:
         text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
+
+
+class StallReporter:
+    """Reports stalls of the edge within a session as events, rate-limited, with their number and the longest.
+
+    A stall is a tick of the edge that is late by more than its period. Time is passed in.
+    """
+
+    def __init__(self, events: EventEmitter) -> None:
+        self._events = events
+        self._rate_limiter: RateLimiter[None] = RateLimiter(STALL_EVENT_PERIOD_NS)
+        self._count = self._longest_ns = 0
+        """Of the stalls that were not reported yet."""
+
+    def record(self, late_ns: int, now_ns: int) -> None:
+        """Record a stall, and report it if that is due; ns, monotonic clock."""
+        self._count += 1
+        self._longest_ns = max(self._longest_ns, late_ns)
+        if self._rate_limiter.record(None, now_ns):
+            self.flush()
+
+    def check(self, now_ns: int) -> None:
+        """Report the stalls whose period has ended; ns, monotonic clock."""
+        if self._count and list(self._rate_limiter.pop_remainders(now_ns)):
+            self.flush()
+
+    def flush(self) -> None:
+        """Report the stalls that were not reported, because the session ends or their period has ended."""
+        if not self._count:
+            return
+        times = "once" if self._count == 1 else f"{self._count} times, at most"
+        text = (
+            f"the edge stalled {times} for {self._longest_ns / MS:.0f} ms: its host was overloaded, or it was stopped"
+        )
+        event = self._events.event(Event.OVERRUN, Event.WARNING, text)
+        event.overrun_data.lateness_ns = self._longest_ns
+        event.overrun_data.stalls = self._count
+        self._events.emit(event)
+        self._count = self._longest_ns = 0

@@ -14,7 +14,7 @@ from pymodbus.constants import ExcCodes
 from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter
+from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, StallReporter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
@@ -101,6 +101,7 @@ class WriteAccess:
         self._events = events
         self._rng = random.SystemRandom() if rng is None else rng
         self._lease_events = LeaseEventReporter(rig, events)
+        self.stalls = StallReporter(events)
         self._session_count = 0
         self._last_writer = ""
         self._controller_change_ns = 0
@@ -190,6 +191,7 @@ class WriteAccess:
         if silent_ns:
             self._trip(silent_ns, now_ns)
         self._lease_events.check(now_ns)
+        self.stalls.check(now_ns)
         if self.lease.expired(now_ns):
             self._release_lease(f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)")
         session = self._session.current
@@ -286,6 +288,7 @@ class WriteAccess:
         # No command of the next session is based on a state that was read in this one.
         for client in self._clients:
             client.clear_served()
+        self.stalls.flush()
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.address
         event.session_data.reason = reason

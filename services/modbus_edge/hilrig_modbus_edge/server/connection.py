@@ -6,6 +6,7 @@ read its responses, no further requests are read from it.
 """
 
 import asyncio
+import socket
 from collections.abc import Callable
 from typing import Final, Protocol
 
@@ -13,9 +14,11 @@ from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Request, decode_frames
 from hilrig_modbus_edge.registers.map import UNIT_IDS
 from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_modbus_edge.server.event_loop import SocketTransport
 from hilrig_modbus_edge.server.pdu import exception_response, execute
 from hilrig_runtime.counters import Counters
 
@@ -25,9 +28,14 @@ MAX_REQUESTS_PER_TURN: Final = 16
 """Requests of one connection per turn of the event loop; also the TCP guide's limit of transactions."""
 _PDU: Final = HEADER.size
 """Offset of the PDU in a frame, bytes."""
+_WRITES: Final = frozenset(int(function) for function in FunctionCode if function.is_write)
 _TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
 
 _pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
+
+
+def _not_stamped(earliest_ns: int, latest_ns: int) -> int:  # noqa: ARG001
+    return 0
 
 
 class ConnectionOwner(Protocol):
@@ -48,8 +56,11 @@ class Connection(asyncio.BufferedProtocol):
 
     def __init__(self, server: ConnectionOwner, transport: asyncio.Transport, client: Client) -> None:
         self.client = client
+        self.socket: socket.socket = transport.get_extra_info("socket")
         self._server = server
         self._transport = transport
+        self._kernel_received_ns = transport.received_ns if isinstance(transport, SocketTransport) else _not_stamped
+        """Returns when the kernel received the newest bytes, within two bounds; 0: unavailable, as with TLS."""
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._log_request = server.request_log.record
@@ -58,7 +69,8 @@ class Connection(asyncio.BufferedProtocol):
         self._view = memoryview(self._buffer)
         self._filled = 0
         self._backlog: list[Request] = []
-        self._arrived_ns = 0
+        self._arrived_ns = self._received_ns = 0
+        """Of the backlog: arrival at this process and the kernel's receive timestamp, as in `buffer_updated`."""
         self._malformed = ""
         self._blocked = False
         self._reason = ""
@@ -85,9 +97,11 @@ class Connection(asyncio.BufferedProtocol):
             # Fast path for the most common case, exactly one request; same result as the general path below.
             transaction, protocol, length, unit = _unpack_header(self._buffer)
             if nbytes == 6 + length and not protocol:
-                self.client.record_request(now_ns)
                 pdu = self._view[_PDU:nbytes].tobytes()
-                self._transport.write(self._reply(transaction, unit, pdu, now_ns))
+                client = self.client
+                received_ns = self._kernel_received_ns(client.last_request_ns, now_ns) if pdu[0] in _WRITES else 0
+                client.record_request(now_ns)
+                self._transport.write(self._reply(transaction, unit, pdu, now_ns, received_ns))
                 return
         if self._transport.is_closing():
             # asyncio's TLS transport still delivers data that was already received.
@@ -97,16 +111,19 @@ class Connection(asyncio.BufferedProtocol):
         self._filled = filled - used
         if self._filled:
             self._buffer[: self._filled] = self._buffer[used:filled]
+        received_ns = 0
         if requests:
+            if any(request.pdu[0] in _WRITES for request in requests):
+                received_ns = self._kernel_received_ns(self.client.last_request_ns, now_ns)
             self.client.record_request(now_ns)
         if len(requests) <= MAX_REQUESTS_PER_TURN and not self._backlog:
-            self._answer(requests, now_ns)
+            self._answer(requests, now_ns, received_ns)
             if malformed:
                 self._close_malformed(malformed)
             return
         is_draining = bool(self._backlog)
         self._backlog += requests
-        self._arrived_ns = now_ns
+        self._arrived_ns, self._received_ns = now_ns, received_ns
         self._malformed = malformed
         self._transport.pause_reading()
         if not is_draining:
@@ -148,20 +165,21 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.resume_reading()
             return
         turn, self._backlog = self._backlog[:MAX_REQUESTS_PER_TURN], self._backlog[MAX_REQUESTS_PER_TURN:]
-        self._answer(turn, self._arrived_ns)
+        self._answer(turn, self._arrived_ns, self._received_ns)
         if not self._backlog and self._malformed:
             self._close_malformed(self._malformed)
         else:
             asyncio.get_running_loop().call_soon(self._drain_backlog)
 
-    def _answer(self, requests: list[Request], arrived_ns: int) -> None:
+    def _answer(self, requests: list[Request], arrived_ns: int, received_ns: int) -> None:
         if requests:
-            self._transport.write(b"".join([self._reply(*request, arrived_ns) for request in requests]))
+            replies = [self._reply(*request, arrived_ns, received_ns) for request in requests]
+            self._transport.write(b"".join(replies))
 
-    def _reply(self, transaction: int, unit: int, pdu: bytes, arrived_ns: int) -> bytes:
+    def _reply(self, transaction: int, unit: int, pdu: bytes, arrived_ns: int, received_ns: int) -> bytes:
         client = self.client
         if unit in UNIT_IDS:
-            reply = execute(self._device, client, pdu, arrived_ns)
+            reply = execute(self._device, client, pdu, arrived_ns, received_ns)
         else:
             reply = exception_response(pdu[0], _TARGET_SILENT)
         code = reply[1] if reply[0] & 0x80 else 0

@@ -2,7 +2,7 @@
 
 asyncio queues a handle for each ready socket, runs it in a context, and calls the transport, then the protocol. This
 takes as much time as a Modbus request. Here a ready socket is read and answered inside `select()` (ADR 0027). The
-transport has its own receive call, which kernel timestamps need.
+transport has its own receive call, which returns the kernel's receive timestamps.
 """
 
 import asyncio
@@ -11,10 +11,13 @@ import os
 import select
 import selectors
 import socket
+import struct
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from contextvars import Context
 from selectors import EVENT_READ, EVENT_WRITE
-from time import monotonic
+from time import monotonic, monotonic_ns, time_ns
 from typing import Any, Final, TypeVarTuple
 
 HIGH_WATER: Final = 65_536
@@ -24,6 +27,13 @@ ACCEPT_RETRY_S: Final = 1.0
 """Pause after a connection could not be accepted, s."""
 
 _MS: Final = 0.001
+_SO_TIMESTAMPING: Final = 37
+"""Number of the socket option on Linux, which the module `socket` has no name for."""
+_RECEIVE_SOFTWARE: Final = 1 << 3 | 1 << 4
+"""Flags of the option: stamp received data in the kernel, and report the stamp."""
+_TIMESPEC: Final = struct.Struct("=qq")
+_ANCILLARY_BYTES: Final = 64
+"""Space for three `struct timespec` with their header; the first one is the software timestamp."""
 _Args = TypeVarTuple("_Args")
 _Ready = list[tuple[int, int]]
 """File descriptors and their events as the system reports them."""
@@ -151,7 +161,11 @@ class SocketTransport(asyncio.Transport):
         self._loop = loop
         self._selector = loop.direct
         self._socket = connected
-        self._receive_into = connected.recv_into
+        self._receive: Callable[[Any], int] = connected.recv_into
+        self._ancillary: list[tuple[int, int, bytes]] = []
+        if _has_receive_timestamps(connected):
+            self._receive_message = connected.recvmsg_into
+            self._receive = self._receive_with_timestamp
         self._send = connected.send
         self._protocol: asyncio.BufferedProtocol | None = None
         self._send_buffer = bytearray()
@@ -217,6 +231,29 @@ class SocketTransport(asyncio.Transport):
         """Close at once."""
         self._abort(None)
 
+    # -- timestamps
+
+    def received_ns(self, earliest_ns: int, latest_ns: int) -> int:
+        """Return when the kernel received the bytes that were read last, ns, monotonic clock; 0: unavailable.
+
+        The kernel stamps with the wall clock. A result outside the two bounds proves that the wall clock was stepped
+        in between, and is unavailable.
+        """
+        if not self._ancillary:
+            return 0
+        seconds, nanoseconds = _TIMESPEC.unpack_from(self._ancillary[0][2])
+        wall_ns = seconds * 1_000_000_000 + nanoseconds
+        for _ in range(2):
+            received_ns: int = wall_ns - time_ns() + monotonic_ns()
+            if earliest_ns <= received_ns <= latest_ns:
+                return received_ns
+            # The process was preempted between the two clocks, which happens rarely, or the wall clock was stepped.
+        return 0
+
+    def _receive_with_timestamp(self, buffer: Any) -> int:
+        count, self._ancillary, _, _ = self._receive_message((buffer,), _ANCILLARY_BYTES)
+        return count
+
     # -- events of the socket
 
     def _update_events(self) -> None:
@@ -251,7 +288,7 @@ class SocketTransport(asyncio.Transport):
 
     def _read(self) -> None:
         try:
-            count = self._receive_into(self._get_buffer(-1))
+            count = self._receive(self._get_buffer(-1))
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -293,6 +330,20 @@ class SocketTransport(asyncio.Transport):
                 self._protocol.connection_lost(error)
         finally:
             self._socket.close()
+
+
+def set_receive_timestamps(listening: socket.socket) -> None:
+    """Let the kernel stamp received data on the connections of a listening socket, on systems that can."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            listening.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, _RECEIVE_SOFTWARE)
+
+
+def _has_receive_timestamps(connected: socket.socket) -> bool:
+    # The fields of `struct timespec` have 64 bits where `long` has.
+    if sys.platform != "linux" or struct.calcsize("l") != 8:
+        return False
+    return connected.getsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING) == _RECEIVE_SOFTWARE
 
 
 async def accept_connections(

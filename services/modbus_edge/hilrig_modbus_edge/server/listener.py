@@ -12,7 +12,13 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
 from hilrig_modbus_edge.server.connection import Connection
-from hilrig_modbus_edge.server.event_loop import DirectEventLoop, SocketTransport, accept_connections
+from hilrig_modbus_edge.server.event_loop import (
+    DirectEventLoop,
+    SocketTransport,
+    accept_connections,
+    set_receive_timestamps,
+)
+from hilrig_modbus_edge.server.tcp_figures import tcp_figures
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError, listen_failure
@@ -94,6 +100,13 @@ class RigServer:
                 repeat_suffix(count),
             )
 
+    def log_tcp_figures(self) -> None:
+        """Add the TCP figures of each connection to the request log."""
+        for connection in self.connections:
+            figures = tcp_figures(connection.socket)
+            if figures is not None:
+                self.request_log.record_connection(connection.client.address, *figures)
+
     def close_idle(self, now_ns: int) -> None:
         """Close the connections without a request for the idle timeout; ns, monotonic clock."""
         if not self._idle_ns:
@@ -122,7 +135,7 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
     """
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        listening = socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
         reason = listen_failure(error)
         if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
@@ -135,3 +148,5 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
                 "rig)"
             )
         raise OperationError(f"rig {rig!r} can't listen on {host}:{port}: {reason}; {hint}") from error
+    set_receive_timestamps(listening)
+    return listening

@@ -18,8 +18,9 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import FunctionCode, RegisterTable
 
-Handler = Callable[[Device, Client, bytes, int], bytes]
-"""Executes a request: device, client, request and its arrival time (ns, monotonic clock) to the response."""
+Handler = Callable[[Device, Client, bytes, int, int], bytes]
+"""Executes a request: device, client, request, its arrival at the process and at the kernel (ns, monotonic clock; 0:
+unknown) to the response."""
 
 MAX_READ_BITS: Final = 2000
 MAX_WRITE_BITS: Final = 1968
@@ -52,13 +53,21 @@ IDENTITY: Final = {
 """Objects of function 43/14: vendor, product code, revision, product name, model."""
 
 
-def execute(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
-    """Execute the PDU of a request (at least the function code) and return the PDU of the response."""
+def execute(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int = 0) -> bytes:
+    """Execute the PDU of a request (at least the function code) and return the PDU of the response.
+
+    Args:
+        device: rig that the request is for.
+        client: sender of the request.
+        request: its PDU.
+        arrived_ns: arrival of the request at this process, ns, monotonic clock.
+        received_ns: kernel's receive timestamp of a write, ns, monotonic clock; 0: unavailable.
+    """
     handler = _HANDLERS.get(request[0])
     if handler is None:
         return exception_response(request[0], ExcCodes.ILLEGAL_FUNCTION)
     try:
-        return handler(device, client, request, arrived_ns)
+        return handler(device, client, request, arrived_ns, received_ns)
     except ModbusError as error:
         return exception_response(request[0], error.code)
 
@@ -68,58 +77,58 @@ def exception_response(function: int, code: int) -> bytes:
     return bytes((function | 0x80, code))
 
 
-def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_registers(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_REGISTERS)
     table = _HOLDING_REGISTER if function == 0x03 else _INPUT_REGISTER
     return _FUNCTION_SIZE.pack(function, 2 * count) + device.read_registers(client, table, address, count)
 
 
-def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _read_bits(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:  # noqa: ARG001
     function, address, count = _address_and_count(request, MAX_READ_BITS)
     table = RegisterTable.COIL if function == 0x01 else RegisterTable.DISCRETE_INPUT
     size = (count + 7) // 8
     return bytes((function, size)) + device.read_bits(client, table, address, count).to_bytes(size, "little")
 
 
-def _write_coil(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_coil(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     _, address, value = _unpack(_ADDRESS_VALUE, request)
     if value not in (_ON, _OFF):
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
-    device.write_coil(client, address, value == _ON, arrived_ns)
+    device.write_coil(client, address, value == _ON, arrived_ns, received_ns)
     return request
 
 
-def _write_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_register(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     _, address, _ = _unpack(_ADDRESS_VALUE, request)
-    device.write_registers(client, address, request[3:], arrived_ns)
+    device.write_registers(client, address, request[3:], arrived_ns, received_ns)
     return request
 
 
-def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_coils(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     address, count = _block(request, MAX_WRITE_BITS, bits=True)
     if count > 1:
         # No two coils have adjacent addresses.
         raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-    device.write_coil(client, address, bool(request[6] & 1), arrived_ns)
+    device.write_coil(client, address, bool(request[6] & 1), arrived_ns, received_ns)
     return request[:5]
 
 
-def _write_registers(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _write_registers(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     address, _ = _block(request, MAX_WRITE_REGISTERS)
-    device.write_registers(client, address, request[6:], arrived_ns)
+    device.write_registers(client, address, request[6:], arrived_ns, received_ns)
     return request[:5]
 
 
-def _mask_register(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _mask_register(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     _, address, and_mask, or_mask = _unpack(_MASK, request)
     device.check_writable(address, 1)
     now = int.from_bytes(device.read_registers(client, RegisterTable.HOLDING_REGISTER, address, 1), "big")
     value = (now & and_mask) | (or_mask & ~and_mask)
-    device.write_registers(client, address, value.to_bytes(2, "big"), arrived_ns)
+    device.write_registers(client, address, value.to_bytes(2, "big"), arrived_ns, received_ns)
     return request
 
 
-def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:
+def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:
     if len(request) < _READ_WRITE.size:
         raise ModbusError(ExcCodes.ILLEGAL_VALUE)
     _, read, read_count, write, write_count, size = _READ_WRITE.unpack_from(request)
@@ -132,12 +141,12 @@ def _read_write(device: Device, client: Client, request: bytes, arrived_ns: int)
     # Both address ranges are checked first: a wrong address is exception 02 even if no state was received yet.
     device.check_writable(write, write_count)
     device.check_readable(read, read_count)
-    device.write_registers(client, write, request[_READ_WRITE.size :], arrived_ns)
+    device.write_registers(client, write, request[_READ_WRITE.size :], arrived_ns, received_ns)
     words = device.read_registers(client, RegisterTable.HOLDING_REGISTER, read, read_count)
     return bytes((0x17, 2 * read_count)) + words
 
 
-def _identify(device: Device, client: Client, request: bytes, arrived_ns: int) -> bytes:  # noqa: ARG001
+def _identify(device: Device, client: Client, request: bytes, arrived_ns: int, received_ns: int) -> bytes:  # noqa: ARG001
     if len(request) < 2 or request[1] != _DEVICE_IDENTIFICATION:
         raise ModbusError(ExcCodes.ILLEGAL_FUNCTION)
     if len(request) != 4 or request[2] not in _READ_CODES:

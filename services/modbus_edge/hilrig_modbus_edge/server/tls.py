@@ -29,8 +29,6 @@ it has already sent."""
 HANDSHAKE_TIMEOUT_S: Final = 5.0
 """Timeout of the TLS handshake and of the TLS shutdown, s."""
 
-_CLOSED_EARLY: Final = "the client closed the connection during the handshake"
-
 logger = logging.getLogger(__name__)
 
 
@@ -52,9 +50,8 @@ class TlsPolicy:
         context.verify_mode = ssl.CERT_REQUIRED
         # A renegotiation costs the edge more than the client that requests it.
         context.options |= ssl.OP_NO_RENEGOTIATION
-        _check_readable("certificate", tls.certificate)
-        _check_readable("key", tls.key)
-        _check_readable("authority", tls.authority)
+        for name in ("certificate", "key", "authority"):
+            _check_readable(name, getattr(tls, name))
         try:
             # Without a password callback, OpenSSL prompts at the terminal, and a service would wait forever.
             context.load_cert_chain(tls.certificate, tls.key, password=partial(_reject_encrypted, tls.key))
@@ -110,19 +107,24 @@ class TlsHandshake(asyncio.Protocol):
 
     async def _complete(self, host: str, port: int) -> None:
         try:
-            secured = await self._do_handshake()
+            secured = await asyncio.get_running_loop().start_tls(
+                self._transport,
+                self,
+                self._policy.context,
+                server_side=True,
+                ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
+                ssl_shutdown_timeout=HANDSHAKE_TIMEOUT_S,
+            )
+            secret: ssl.SSLObject | None = None if secured is None else secured.get_extra_info("ssl_object")
+            if secured is None or secret is None or secret.version() is None:
+                # asyncio raises no exception if the peer disconnects during the handshake.
+                raise ConnectionResetError
         except (OSError, TimeoutError) as error:
             self._admission.refuse(host, port, f"TLS handshake failed: {_reason(error)}")
             self._transport.abort()
             return
         finally:
             self._admission.pending_handshakes.discard(self)
-        secret: ssl.SSLObject | None = None if secured is None else secured.get_extra_info("ssl_object")
-        if secured is None or secret is None or secret.version() is None:
-            # asyncio raises no exception if the peer disconnects during the handshake.
-            self._admission.refuse(host, port, f"TLS handshake failed: {_CLOSED_EARLY}")
-            self._transport.abort()
-            return
         if secured.is_closing():
             return
         certificate = secret.getpeercert(binary_form=True) or b""
@@ -137,17 +139,6 @@ class TlsHandshake(asyncio.Protocol):
             return
         self._serve(secured, host, port, role == "operator", self._policy.name_of(certificate), bytes(self._early))
 
-    async def _do_handshake(self) -> asyncio.Transport | None:
-        loop, context = asyncio.get_running_loop(), self._policy.context
-        return await loop.start_tls(
-            self._transport,
-            self,
-            context,
-            server_side=True,
-            ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
-            ssl_shutdown_timeout=HANDSHAKE_TIMEOUT_S,
-        )
-
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
@@ -156,7 +147,7 @@ def _reason(error: Exception) -> str:
         # Without a reason, the text of the library starts with a code and ends with a line of its source.
         return re.sub(r"^\[.*?] |\(_ssl.*$", "", error.reason or str(error)).strip().lower().replace("_", " ")
     if isinstance(error, ConnectionResetError | BrokenPipeError):
-        return _CLOSED_EARLY
+        return "the client closed the connection during the handshake"
     return str(error) or f"no completed handshake within {HANDSHAKE_TIMEOUT_S:g} s"
 
 

@@ -101,7 +101,7 @@ class PublisherTracker:
             if len(self._publishers) >= MAX_PUBLISHERS:
                 # Evicted at the next tick.
                 oldest = min(self._publishers.values(), key=lambda each: each.last_ns)
-                oldest.last_ns = now_ns - 2 * PUBLISHER_TIMEOUT_NS
+                oldest.last_ns = -PUBLISHER_TIMEOUT_NS
             publisher = self._publishers[identity] = PublisherState(*identity, first_ns=now_ns, restarted=restarted)
         return publisher
 

@@ -10,8 +10,9 @@ from typing import IO, NamedTuple, overload
 import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, McapRecord, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema, Statistics
 
+from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.records import (
     CHUNK_HEAD_BYTES,
     FOOTER_BYTES,
@@ -132,6 +133,8 @@ class RecordReader:
         opcode = Opcode.METADATA if isinstance(index, MetadataIndex) else Opcode.ATTACHMENT
         found = decode_record(opcode, self.indexed(opcode, index.offset, index.length), index.offset)
         assert found is not None
+        if isinstance(found, Metadata):
+            check_numbers(found, index.offset)
         return found
 
     def indexed_chunk(self, offset: int, length: int) -> bytes:

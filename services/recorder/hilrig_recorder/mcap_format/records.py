@@ -37,6 +37,8 @@ COMPRESSION: Final = "zstd"
 MAX_CHUNK_BYTES: Final = 128 << 20
 """Maximum uncompressed size of a chunk, bytes. A chunk that states a larger size is treated as damaged."""
 MAX_TIME_NS: Final = (1 << 63) - 1
+COPY_SUFFIX: Final = ".copy"
+"""End of the name of a metadata record that repeats one of the beginning of the file. The first copy has precedence."""
 
 Buffer = bytes | memoryview
 
@@ -182,6 +184,16 @@ def decode_record(opcode: int, content: Buffer, offset: int) -> McapRecord | Non
         encoded, data = encoded[: -_U32.size], data[: -_U32.size]
     if encoded != data:
         raise DamagedError(f"{name} record with inconsistent lengths", offset)
+    if isinstance(record, Statistics):
+        first_ns, last_ns = record.message_start_time, record.message_end_time
+        if not first_ns <= last_ns <= MAX_TIME_NS:
+            raise DamagedError(
+                f"statistics record with times {first_ns} to {last_ns}, expected increasing times up to {MAX_TIME_NS}",
+                offset,
+            )
+        total = sum(record.channel_message_counts.values())
+        if total and total != record.message_count:
+            raise DamagedError(f"statistics record with {total} messages, expected {record.message_count}", offset)
     return record
 
 

@@ -11,12 +11,23 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
 
 from hilrig_recorder.mcap_format.file_names import recovering_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, map_file
+from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.reader import buffer_reader
-from hilrig_recorder.mcap_format.records import MAGIC, Chunk, DamagedError, Message, encode_message
+from hilrig_recorder.mcap_format.records import (
+    COPY_SUFFIX,
+    MAGIC,
+    Chunk,
+    DamagedError,
+    Message,
+    check_attachment,
+    encode_message,
+    encode_records,
+)
 from hilrig_recorder.mcap_format.scan import (
     MAX_BEGIN_BYTES,
     Damage,
@@ -28,6 +39,8 @@ from hilrig_recorder.mcap_format.scan import (
 from hilrig_recorder.mcap_format.writer import LIBRARY, RecordingWriter
 from hilrig_runtime.errors import InputError, OperationError
 
+_REPEATED: Final = ("hilrig.session", "hilrig.config")
+"""Names of the metadata records that are in a file twice."""
 _REASON_UNFINISHED: Final = (
     "the file was not finished: the recorder was killed, or the file was truncated; the last messages may be missing"
 )
@@ -145,7 +158,10 @@ def _is_intact(view: memoryview, source: Path, should_continue: Callable[[], boo
     """Whether a finished file has no damage: a defective disk may damage chunks and leave the end valid."""
     try:
         buffer_reader(view).check_indexes()
-        for _, item in scan(view):
+        metadata: dict[str, dict[str, str]] = {}
+        for offset, item in scan(view):
+            if isinstance(item, Metadata):
+                add_metadata(metadata, item, offset)
             if isinstance(item, Damage):
                 return False
             if isinstance(item, Chunk):
@@ -192,8 +208,11 @@ class _Copier:
         self._finished = finished
         self._schemas: dict[int, Schema] = {}
         self._declared: set[int] = set()
+        self._declarations: list[Schema | Channel] = []
         self._losses = {"lost_transport": 0, "lost_recorder": 0}
-        self._has_summary = False
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._copied: set[int] = set()
+        """Offsets of the metadata records and attachments that were found by reading the file in order."""
         self._last_ns = 0
 
     def write(self, path: Path, temporary_path: Path, should_continue: Callable[[], bool]) -> None:
@@ -202,7 +221,9 @@ class _Copier:
             if self._view[: len(MAGIC)] != MAGIC:
                 raise InputError(f"{self._recovery.source}: not an MCAP file (bad magic)")
             raise InputError(f"{self._recovery.source}: MCAP file without a complete record: nothing to recover")
-        is_hilrig = header is not None and header.library == LIBRARY
+        index = self._read_summary()
+        # Without a header, the metadata tells who wrote the file.
+        is_hilrig = header.library == LIBRARY if header else any(item.name.startswith("hilrig.") for item in index)
         writer = RecordingWriter(
             path,
             temporary_path=temporary_path,
@@ -212,7 +233,10 @@ class _Copier:
             library=header.library if header else LIBRARY,
         )
         try:
+            for item in self._declarations:
+                self._declare(writer, item)
             self._copy(writer, is_hilrig, should_continue)
+            self._copy_indexed(writer, index)
             writer.finish(lambda: self._final_metadata(is_hilrig))
             if writer.dropped_count:
                 raise OperationError(f"{path}: can't be written: no space left on the disk")
@@ -221,9 +245,34 @@ class _Copier:
             writer.discard()
             raise
 
+    def _read_summary(self) -> list[MetadataIndex | AttachmentIndex]:
+        """The index of metadata and attachments; stores the schemas and channels. Empty without an intact summary."""
+        reader = buffer_reader(self._view)
+        try:
+            items = list(reader.summary_items(reader.summary()))
+        except DamagedError:
+            return []
+        self._declarations = [item for item in items if isinstance(item, Schema | Channel)]
+        return [item for item in items if isinstance(item, MetadataIndex | AttachmentIndex)]
+
+    def _copy_indexed(self, writer: RecordingWriter, index: list[MetadataIndex | AttachmentIndex]) -> None:
+        """Copy the intact records in damaged ranges to which the index points."""
+        reader = buffer_reader(self._view)
+        for item in index:
+            if item.offset in self._copied:
+                continue
+            with contextlib.suppress(DamagedError):
+                record = reader.indexed_record(item)
+                if isinstance(record, Attachment):
+                    check_attachment(reader.indexed(Opcode.ATTACHMENT, item.offset, item.length), item.offset)
+                    self._copy_attachment(writer, record)
+                elif isinstance(record, Metadata):
+                    self._copy_metadata(writer, record, item.offset)
+                self._recovery.damaged_bytes -= item.length
+
     def _copy(self, writer: RecordingWriter, is_hilrig: bool, should_continue: Callable[[], bool]) -> None:
         recovery = self._recovery
-        for _, item in scan(self._view):
+        for offset, item in scan(self._view):
             if isinstance(item, Chunk):
                 _check_interrupt(should_continue, recovery.source)
                 self._copy_chunk(writer, item)
@@ -241,12 +290,11 @@ class _Copier:
             elif isinstance(item, Schema | Channel):
                 self._declare(writer, item)
             elif isinstance(item, Metadata):
-                self._copy_metadata(writer, item)
+                self._copied.add(offset)
+                self._copy_metadata(writer, item, offset)
             elif isinstance(item, Attachment):
-                recovery.attachments += 1
-                writer.add_attachment(
-                    item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
-                )
+                self._copied.add(offset)
+                self._copy_attachment(writer, item)
 
     def _copy_chunk(self, writer: RecordingWriter, chunk: Chunk) -> None:
         try:
@@ -281,15 +329,28 @@ class _Copier:
         self._declared.add(item.id)
         writer.add_channel(item)
 
-    def _copy_metadata(self, writer: RecordingWriter, item: Metadata) -> None:
+    def _copy_attachment(self, writer: RecordingWriter, item: Attachment) -> None:
+        self._recovery.attachments += 1
+        writer.add_attachment(
+            item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
+        )
+
+    def _copy_metadata(self, writer: RecordingWriter, item: Metadata, offset: int) -> None:
+        try:
+            if not add_metadata(self._metadata, item, offset):
+                return
+        except DamagedError as damage:
+            self._recovery.damaged_bytes += len(encode_records(item))
+            self._recovery.reasons.append(str(damage))
+            return
+        name = item.name.removesuffix(COPY_SUFFIX)
         self._recovery.metadata += 1
-        self._has_summary |= item.name == "hilrig.summary"
         if item.name.startswith("hilrig.loss"):
             for name in self._losses:
                 # Metadata has no checksum: a damaged count may not be a number.
                 count = item.metadata.get(name.removeprefix("lost_"), "")
                 self._losses[name] += int(count) if count.isdecimal() else 0
-        writer.add_metadata(item.name, item.metadata)
+        writer.add_metadata(name, item.metadata, is_repeated=name.startswith(_REPEATED))
 
     def _final_metadata(self, is_hilrig: bool) -> dict[str, dict[str, str]]:
         recovery = self._recovery
@@ -305,7 +366,7 @@ class _Copier:
                 "software_version": version("hilrig"),
             }
         }
-        if is_hilrig and not self._has_summary:
+        if is_hilrig and "hilrig.summary" not in self._metadata:
             records["hilrig.summary"] = {
                 "ended": "recovered",
                 "reason": _REASON_DAMAGED if self._finished else _REASON_UNFINISHED,

@@ -11,6 +11,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
+from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.reader import Record, RecordReader, buffer_reader, chunk_records, decompress
 from hilrig_recorder.mcap_format.records import (
     MAGIC,
@@ -117,6 +118,8 @@ def _item(found: Record) -> Item | None:
     record = decode_record(opcode, content, offset)
     if opcode == Opcode.ATTACHMENT:
         check_attachment(content, offset)
+    if isinstance(record, Metadata):
+        check_numbers(record, offset)
     return record
 
 

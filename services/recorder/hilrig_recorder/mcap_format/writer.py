@@ -26,7 +26,7 @@ from hilrig_recorder.mcap_format.chunk import (
 from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
 from hilrig_recorder.mcap_format.reader import RecordReader
-from hilrig_recorder.mcap_format.records import MAGIC, ChunkInfo, DamagedError, encode_records
+from hilrig_recorder.mcap_format.records import COPY_SUFFIX, MAGIC, ChunkInfo, DamagedError, encode_records
 from hilrig_recorder.mcap_format.summary_section import SummarySection
 
 LIBRARY: Final = "hilrig"
@@ -74,6 +74,8 @@ class RecordingWriter:
         self._pending: list[bytes] = []
         self._pending_bytes = 0
         self._summary = SummarySection()
+        self._repeated = {item.name: item.metadata for item in metadata}
+        """Metadata records that are written a second time at the end of the file."""
         try:
             # One write: many files may be opened at once, and each file that exists states its session.
             begin = MAGIC + encode_records(Header(profile, library), *schemas, *channels)
@@ -130,8 +132,10 @@ class RecordingWriter:
             del self._pending[:written]
             self._pending_bytes = 0
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a metadata record."""
+    def add_metadata(self, name: str, values: Mapping[str, str], *, is_repeated: bool = False) -> None:
+        """Add a metadata record; with `is_repeated` a second time at the end, for a file whose beginning is damaged."""
+        if is_repeated:
+            self._repeated[name] = dict(values)
         record = encode_records(Metadata(name, dict(values)))
         self._append(record)
         self._summary.metadata.append(MetadataIndex(self.size - len(record), len(record), name))
@@ -189,6 +193,8 @@ class RecordingWriter:
         try:
             for name, values in final_metadata.items():
                 self.add_metadata(name, values)
+            for name, values in self._repeated.items():
+                self.add_metadata(f"{name}{COPY_SUFFIX}", values)
             self._append(self._summary.encode(self.size, chunks))
         except OSError:
             del self._summary.metadata[known:]

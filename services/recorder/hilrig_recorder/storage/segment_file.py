@@ -96,7 +96,7 @@ class SegmentFile:
             "software_version": config.software_version,
             "machine": config.machine,
         }
-        self._add_metadata(numbered("hilrig.config", len(self.configurations)), values)
+        self._add_metadata(numbered("hilrig.config", len(self.configurations)), values, is_repeated=True)
         lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were used.\n"
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
@@ -129,9 +129,9 @@ class SegmentFile:
 
         return lambda: writer.finish(final_metadata)
 
-    def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+    def _add_metadata(self, name: str, values: Mapping[str, str], *, is_repeated: bool = False) -> None:
         try:
-            self.writer.add_metadata(name, values)
+            self.writer.add_metadata(name, values, is_repeated=is_repeated)
         except OSError as error:
             self.fail(error)
 

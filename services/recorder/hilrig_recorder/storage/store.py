@@ -269,31 +269,25 @@ class FileStore:
         self._on_failed(recording)
 
     def _report(self, recording: Recording, text: str) -> None:
-        if self._alerts.get(recording.rig) != text:
-            self._alerts[recording.rig] = text
-            self._emit(
-                Event(
-                    kind=Event.RECORDING,
-                    rig=recording.rig,
-                    session=recording.session,
-                    severity=Event.ERROR,
-                    text=text,
-                )
-            )
+        self._raise_alert(recording.rig, text, Event.ERROR, rig=recording.rig, session=recording.session)
+
+    def _raise_alert(self, key: str, text: str, severity: Event.Severity, *, rig: str = "", session: str = "") -> None:
+        """Set the alert `key`, and emit an event if it changed."""
+        if self._alerts.get(key) != text:
+            self._alerts[key] = text
+            self._emit(Event(kind=Event.RECORDING, severity=severity, text=text, rig=rig, session=session))
 
     def _check_speed(self) -> None:
         if self._sync_worker.sync_delay_s < SLOW_SYNC_S:
             self._alerts.pop(_SPEED_ALERT, None)
-        elif _SPEED_ALERT not in self._alerts:
+        else:
             text = f"{self.folder}: slow disk: a power failure may lose the last {SLOW_SYNC_S:g} s or more"
-            self._alerts[_SPEED_ALERT] = text
-            self._emit(Event(kind=Event.RECORDING, severity=Event.WARNING, text=text))
+            self._raise_alert(_SPEED_ALERT, text, Event.WARNING)
 
     def _check_space(self) -> None:
         text = self._reserve.refresh()
         if text:
-            self._alerts[_SPACE_ALERT] = text
-            self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
+            self._raise_alert(_SPACE_ALERT, text, Event.ERROR)
         elif not self._reserve.is_exhausted:
             self._alerts.pop(_SPACE_ALERT, None)
 

@@ -6,7 +6,6 @@ The recorder's thread only appends, so neither a slow disk nor the index of a lo
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Final
 
@@ -19,21 +18,6 @@ FINISH_WITHOUT_SYNC_S: Final = 0.9
 """Maximum time at shutdown for finishing and renaming files without syncing them."""
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class _OpenFile:
-    writer: RecordingWriter
-    synced: int = 0
-    """Synced bytes."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """A file to sync from now on, or a file to finish."""
-
-    writer: RecordingWriter
-    finish: Callable[[], None] | None = None
 
 
 class SyncWorker:
@@ -54,8 +38,10 @@ class SyncWorker:
         self._clock = clock
         self._on_sync_error = on_sync_error
         self._on_finished = on_finished
-        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
-        self._open: dict[int, _OpenFile] = {}
+        self._jobs: SimpleQueue[tuple[RecordingWriter, Callable[[], None] | None] | None] = SimpleQueue()
+        """A file and the function that finishes it; without a function: a file to sync from now on; None: stop."""
+        self._synced: dict[RecordingWriter, int] = {}
+        """Synced bytes of each open file."""
         self._closing = threading.Event()
         self._skip_sync = threading.Event()
         self._stopped = False
@@ -68,14 +54,14 @@ class SyncWorker:
 
     def follow(self, writer: RecordingWriter) -> None:
         """Sync this file periodically from now on."""
-        self._jobs.put(_Job(writer))
+        self._jobs.put((writer, None))
 
     def finish(self, writer: RecordingWriter, finish: Callable[[], None]) -> None:
         """Call `finish`, which writes the end of the file, then sync, close and rename the file.
 
         The caller must not use the writer any more.
         """
-        self._jobs.put(_Job(writer, finish))
+        self._jobs.put((writer, finish))
 
     @property
     def sync_delay_s(self) -> float:
@@ -105,8 +91,8 @@ class SyncWorker:
                 self._run_job(wait_ns * 1e-9)
                 continue
             self._round_start_ns = self._clock.monotonic_ns()
-            for item in list(self._open.values()):
-                if self._sync(item):
+            for writer in list(self._synced):
+                if self._sync(writer):
                     # Jobs run between syncs, so that a file to finish does not wait for the sync of all open files.
                     self._run_job(0)
             now_ns = self._clock.monotonic_ns()
@@ -120,23 +106,25 @@ class SyncWorker:
             return
         if job is None:
             self._stopped = True
-        elif job.finish is None:
-            self._open[id(job.writer)] = _OpenFile(job.writer)
+            return
+        writer, finish = job
+        if finish is None:
+            self._synced[writer] = 0
         else:
-            self._open.pop(id(job.writer), None)
-            self._finish(job.writer, job.finish)
+            self._synced.pop(writer, None)
+            self._finish(writer, finish)
 
-    def _sync(self, item: _OpenFile) -> bool:
+    def _sync(self, writer: RecordingWriter) -> bool:
         """Sync a file with new data; False: nothing to sync."""
+        size = writer.size
         # A job may have closed the file meanwhile. At shutdown every file is finished soon.
-        if self._closing.is_set() or id(item.writer) not in self._open or item.writer.size == item.synced:
+        if self._closing.is_set() or self._synced.get(writer, size) == size:
             return False
-        size = item.writer.size
         try:
-            item.writer.sync()
+            writer.sync()
         except OSError as error:
-            self._on_sync_error(item.writer, error)
-        item.synced = size
+            self._on_sync_error(writer, error)
+        self._synced[writer] = size
         return True
 
     def _finish(self, writer: RecordingWriter, finish: Callable[[], None]) -> None:

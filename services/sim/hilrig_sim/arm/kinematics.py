@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import JOINT_NAMES, JOINT_SCALE, ArmParameters
+from hilrig_sim.arm.joints import JOINT_NAMES, JOINT_SCALE
+from hilrig_sim.arm.model import ArmParameters
 
 Floats = NDArray[np.float64]
 

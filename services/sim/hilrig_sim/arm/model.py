@@ -7,12 +7,14 @@ They are computed from the lab's configuration, which has their defaults, publis
 import dataclasses
 import json
 import math
+import reprlib
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Final, Self, get_args, get_origin, get_type_hints
 
 from hilrig_runtime.config.lab import ArmConfig, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.errors import InputError
+from hilrig_sim.arm.joints import JOINT_NAMES
 
 GRAVITY: Final = 9.81
 """m/s², as in the paper (20)."""
@@ -20,14 +22,14 @@ LARGEST_REGISTER_FORCE: Final = 32.767
 """Largest force in the paper's force register, N."""
 LARGEST_EFFORT: Final = 32.768
 """Largest effort of the drives, N·m or N: the absolute limit of a torque register."""
+LARGEST_NUMBER: Final = 1e10
+"""Largest magnitude of a number in recorded parameters; a step of 10 s has 10¹⁰ ns."""
+MAX_JSON_CHARACTERS: Final = 1 << 20
+"""Longest recorded parameters; those of 64 parts have 20,000 characters."""
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
-
-JOINT_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
-JOINT_SCALE: Final = (math.degrees(1.0), math.degrees(1.0), 1e3, math.degrees(1.0))
-"""Factors from rad and m to the displayed ° and mm."""
 
 
 _ARM: Final = ArmConfig()
@@ -157,6 +159,11 @@ class StepParameters:
     substeps: int = _SIM.substeps
     integrator: str = _SIM.integrator
 
+    def __post_init__(self) -> None:
+        known = get_args(SimConfig.model_fields["integrator"].annotation)
+        if self.integrator not in known:
+            raise InputError(f"the integrator must be one of {', '.join(known)}, got {reprlib.repr(self.integrator)}")
+
     @property
     def step(self) -> float:
         """Length of a step of the loop, s."""
@@ -193,25 +200,42 @@ class RigParameters:
             InputError: the text is not such JSON, or a value is invalid.
         """
         try:
+            if len(text) > MAX_JSON_CHARACTERS:
+                raise ValueError(f"{len(text)} characters, expected at most {MAX_JSON_CHARACTERS}")
             fields = json.loads(text)
-            scene = _tuples(fields["scene"])
-            scene["trays"] = tuple(TrayParameters(**tray) for tray in scene["trays"])
-            scene["parts"] = tuple(PartParameters(**part) for part in scene["parts"])
-            return cls(
-                arm=ArmParameters(**_tuples(fields["arm"])),
-                sim=StepParameters(**fields["sim"]),
-                scene=SceneParameters(**scene),
-            )
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            if not isinstance(fields, dict) or fields.keys() != {"arm", "sim", "scene"}:
+                raise ValueError("expected an object with the keys arm, sim, scene")
+            found: Self = _decode(cls, fields, "parameters")
+            return found
+        except (ValueError, TypeError, RecursionError) as error:
             raise InputError(
-                f"invalid rig parameters (parameters_json): {error!r}; use the hilrig version that made the recording"
+                f"invalid rig parameters (parameters_json): {error}; use the hilrig version that made the recording"
             ) from error
 
 
-def _tuples(value: Any) -> Any:
-    """Convert the lists of JSON to the tuples of frozen parameters."""
-    if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
+def _decode(kind: Any, value: Any, place: str) -> Any:
+    """Convert a JSON value to a type of the parameters; `place` is its name in messages."""
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        if not isinstance(value, dict) or not value.keys() <= hints.keys():
+            raise ValueError(f"{place} must be an object with the keys {', '.join(hints)}")
+        return kind(**{key: _decode(hints[key], item, f"{place}.{key}") for key, item in value.items()})
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        if kinds[-1] is Ellipsis and isinstance(value, list):
+            kinds = (kinds[0],) * len(value)
+        if not isinstance(value, list) or len(value) != len(kinds):
+            raise ValueError(f"{place} must be a list of {len(kinds)} items, got {_shown(value)}")
+        return tuple(_decode(one, item, place) for one, item in zip(kinds, value, strict=True))
+    numeric = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is float and not (numeric and abs(value) <= LARGEST_NUMBER):
+        raise ValueError(f"{place} must be a number up to {LARGEST_NUMBER:g}, got {_shown(value)}")
+    if kind is int and not (numeric and isinstance(value, int) and 1 <= value <= LARGEST_NUMBER):
+        raise ValueError(f"{place} must be an integer from 1 to {LARGEST_NUMBER:g}, got {_shown(value)}")
+    if kind in (str, bool) and not isinstance(value, kind):
+        raise ValueError(f"{place} must be a {kind.__name__}, got {_shown(value)}")
     return value
+
+
+def _shown(value: Any) -> str:
+    return reprlib.repr(value)

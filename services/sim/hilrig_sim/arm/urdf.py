@@ -11,7 +11,8 @@ from typing import Final
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from hilrig_sim.arm.model import JOINT_NAMES, ArmParameters, RigParameters, SceneParameters, TrayParameters
+from hilrig_sim.arm.joints import JOINT_NAMES
+from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, TrayParameters
 
 POINT_INERTIA: Final = 1e-12
 """Replaces the zero inertia of a point mass, kg·m²."""

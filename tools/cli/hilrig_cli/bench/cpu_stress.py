@@ -18,18 +18,12 @@ def cpu_stress(count: int) -> Iterator[None]:
     with ExitStack() as processes:
         for _ in range(count):
             # In a session of its own, like an independent program: Linux groups processes by session for scheduling.
-            process = subprocess.Popen(
-                [sys.executable, "-m", "hilrig_cli.bench.cpu_stress"], stdin=subprocess.PIPE, **own_process_group()
-            )
-            processes.callback(_kill, process)
+            command = [sys.executable, "-m", "hilrig_cli.bench.cpu_stress"]
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, **own_process_group())
+            # Killed first, then closed and waited for.
+            processes.enter_context(process)
+            processes.callback(process.kill)
         yield
-
-
-def _kill(process: "subprocess.Popen[bytes]") -> None:
-    process.kill()
-    process.wait()
-    if process.stdin is not None:
-        process.stdin.close()
 
 
 def stress_until_parent_ends() -> None:

@@ -2,14 +2,11 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from hilrig_cli.options import AsJson, Config
-
-if TYPE_CHECKING:
-    from hilrig_runtime.config.lab import LabConfig
 
 
 def certs(
@@ -56,7 +53,7 @@ def certs(
     controllers = CertificateStore(folder, now, days, renew=renew)
     bus = CertificateStore(folder / "bus", now, days, renew=renew)
     authority = controllers.authority(f"hilrig {lab.name}: controllers")
-    edge_names = _distinct([*(host or []), *_reachable(lab.edge.host), *loopback])
+    edge_names = list(dict.fromkeys([*(host or []), *_reachable(lab.edge.host), *loopback]))
     if controllers.is_due("edge", edge_names):
         controllers.write("edge", issue_server(authority, controllers.host_names("edge", edge_names), now, days))
     for name, role in clients.items():
@@ -64,8 +61,8 @@ def certs(
             controllers.write(name, issue_client(authority, name, role, now, days))
 
     authority = bus.authority(f"hilrig {lab.name}: bus")
-    router_names = _distinct([*_router_host(lab), *(host or []), *loopback])
-    service_names = _distinct([*_reachable(lab.bus.host), *loopback])
+    router_names = list(dict.fromkeys([*_reachable(lab.bus.router_host), *(host or []), *loopback]))
+    service_names = list(dict.fromkeys([*_reachable(lab.bus.host), *loopback]))
     required = {identity.name: service_names for identity in identities(lab.bus.tls or BusTlsConfig())}
     for name, names in ({"router": router_names} | required).items():
         if bus.is_due(name, names):
@@ -94,18 +91,9 @@ def certs(
             print(f'{key} = "{value}"')
 
 
-def _router_host(lab: "LabConfig") -> list[str]:
-    address = lab.bus.router.partition("/")[2].partition("?")[0]
-    return _reachable(address.rpartition(":")[0].strip("[]"))
-
-
 def _reachable(host: str) -> list[str]:
     """The host in a list; empty for a wildcard address, which no peer can connect to."""
     return [] if host in ("", "0.0.0.0", "::") else [host]
-
-
-def _distinct(names: list[str]) -> list[str]:
-    return list(dict.fromkeys(names))
 
 
 def _parse_client(text: str) -> tuple[str, str]:

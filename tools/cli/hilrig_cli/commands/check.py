@@ -43,12 +43,11 @@ def check(
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return
-    table = Table(title=f"{file or 'defaults'}: lab {lab.name!r} is valid", title_justify="left")
     addresses = lab.addresses()
-    kinds = list(addresses[lab.rigs[0].name])
     is_restricted = any(rig.allow for rig in lab.rigs)
-    for column in ("rig", *kinds, *(["allowed networks"] if is_restricted else []), "step", "integrator"):
-        table.add_column(column)
+    columns = ("rig", *addresses[lab.rigs[0].name], *(["allowed networks"] if is_restricted else []))
+    title = f"{file or 'defaults'}: lab {lab.name!r} is valid"
+    table = Table(*columns, "step", "integrator", title=title, title_justify="left")
     for rig in lab.rigs:
         substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
         allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []

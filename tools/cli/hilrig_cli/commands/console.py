@@ -1,12 +1,11 @@
 """`hilrig console`: web console of the lab."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def console(
@@ -20,15 +19,10 @@ def console(
             metavar="FILE",
             help="File whose first line is the password. Default: no password on loopback, otherwise a generated one, "
             "which is printed.",
-            show_default=False,
         ),
     ] = None,
-    certificate: Annotated[
-        Path | None, typer.Option(metavar="PEM", help="Serve HTTPS with this certificate.", show_default=False)
-    ] = None,
-    key: Annotated[
-        Path | None, typer.Option(metavar="PEM", help="Private key of the certificate.", show_default=False)
-    ] = None,
+    certificate: Annotated[Path | None, typer.Option(metavar="PEM", help="Serve HTTPS with this certificate.")] = None,
+    key: Annotated[Path | None, typer.Option(metavar="PEM", help="Private key of the certificate.")] = None,
     name: Annotated[
         list[str] | None,
         typer.Option(help="Additional host name that browsers use for this host; may be repeated."),
@@ -43,7 +37,6 @@ def console(
     """
     import platform
     import secrets
-    import threading
 
     from hilrig_console.auth import AccessPolicy, normalize_host_names
     from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
@@ -67,31 +60,26 @@ def console(
     names = normalize_host_names([platform.node(), address.host, *(name or [])])
     server = ConsoleServer(lab, address, AccessPolicy(password, names), tls)
     lower_priority()
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     force_exit_after(stopping, 8.0)
     with server:
         print(f"console of lab {lab.name}: {server.url}", flush=True)
         if generated:
             print(f"password: {password} (any user name)", flush=True)
         if tls is None and not address.is_loopback:
-            print(
-                "hilrig: warning: without --certificate and --key the password is sent unencrypted",
-                file=sys.stderr,
-                flush=True,
-            )
+            log("warning: without --certificate and --key the password is sent unencrypted")
         wait_for(stopping)
 
 
 def _password(file: Path) -> str:
     from hilrig_console.auth import MIN_PASSWORD_CHARS
+    from hilrig_runtime.config.validation import read_text
     from hilrig_runtime.errors import InputError
 
     try:
-        password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"--password-file: {file}: can't be read: {reason}") from error
+        password = read_text(file).partition("\n")[0].strip()
+    except InputError as error:
+        raise InputError(f"--password-file: {error}") from error
     if len(password) < MIN_PASSWORD_CHARS:
         raise InputError(
             f"--password-file: {file}: the password in the first line must have at least {MIN_PASSWORD_CHARS} "

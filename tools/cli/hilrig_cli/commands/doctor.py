@@ -1,6 +1,7 @@
 """`hilrig doctor`: diagnosis of a deployment."""
 
 import json
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -8,8 +9,6 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from hilrig_cli.doctor import CheckResult
     from hilrig_runtime.config.lab import LabConfig
 
@@ -21,12 +20,11 @@ def doctor(
         typer.Option(
             metavar="NAME",
             help="Check this service only (sim, edge, recorder or router); for container health checks.",
-            show_default=False,
         ),
     ] = "",
     instance: Annotated[
         str,
-        typer.Option(metavar="NAME", help="With --service: check this instance; default: any.", show_default=False),
+        typer.Option(metavar="NAME", help="With --service: check this instance; default: any."),
     ] = "",
     as_json: AsJson = False,
 ) -> None:
@@ -41,11 +39,7 @@ def doctor(
     results = _check_service(lab, service, instance) if service else _check_all(lab)
     errors = [result for result in results if result.level is Level.ERROR]
     if as_json:
-        rows = [
-            {"check": result.check, "level": result.level.value, "text": result.text, "fix": result.fix}
-            for result in results
-        ]
-        print(json.dumps({"lab": lab.name, "well": not errors, "findings": rows}))
+        print(json.dumps({"lab": lab.name, "well": not errors, "findings": [asdict(result) for result in results]}))
     else:
         _print_table(results)
     if errors:
@@ -53,7 +47,6 @@ def doctor(
 
 
 def _check_all(lab: "LabConfig") -> "list[CheckResult]":
-    from datetime import UTC, datetime
     from importlib.metadata import version
 
     from hilrig_cli.doctor import CheckResult, host, services
@@ -71,7 +64,7 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     results += services.check_versions((health for health, _ in snapshot.healths.values()), version("hilrig"))
     results += services.check_clocks(list(snapshot.healths.values()))
     if lab.bus.tls is not None or lab.edge.tls is not None:
-        results += _check_certificates(lab, datetime.now(UTC))
+        results += _check_certificates(lab)
     results += host.check_ports(lab, snapshot.services)
     results += host.check_open_files(lab)
     results += host.check_timer_accuracy(lab)
@@ -79,7 +72,9 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     return results
 
 
-def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]":
+def _check_certificates(lab: "LabConfig") -> "list[CheckResult]":
+    from datetime import UTC, datetime
+
     from hilrig_cli.doctor import CheckResult
 
     try:
@@ -89,16 +84,16 @@ def _check_certificates(lab: "LabConfig", now: "datetime") -> "list[CheckResult]
         text = f"not checked: {error.name!r} is not installed on this host"
         fix = "pip install 'hilrig[edge]', or check copies of the certificates on another host"
         return [CheckResult.warning("certificates", text, fix)]
-    return list(check_certificates(lab, now))
+    return list(check_certificates(lab, datetime.now(UTC)))
 
 
 def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[CheckResult]":
     from hilrig_cli.doctor import CheckResult
     from hilrig_cli.doctor.services import collect, matches
-    from hilrig_cli.service_kinds import SERVICE_KINDS
     from hilrig_runtime.errors import HilrigError, InputError
+    from hilrig_schemas.topics import SERVICES
 
-    if service not in (*SERVICE_KINDS, "router"):
+    if service not in (*SERVICES, "router"):
         raise InputError(f"--service {service}: expected sim, edge, recorder or router")
     if service == "router" and lab.bus.topology != "router":
         raise InputError('--service router: this lab has no router (bus.topology in lab.toml is not "router")')

@@ -8,18 +8,14 @@ import typer
 
 
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
+    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.")],
     foxglove: Annotated[
         Path | None,
-        typer.Option(
-            metavar="OUT.MCAP", help="Write an MCAP file in which Foxglove and rerun show the arm.", show_default=False
-        ),
+        typer.Option(metavar="OUT.MCAP", help="Write an MCAP file in which Foxglove and rerun show the arm."),
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write tables as CSV into a folder.", show_default=False)
-    ] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Write tables as CSV into a folder.")] = None,
     parquet: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write tables as Parquet into a folder.", show_default=False)
+        Path | None, typer.Option(metavar="FOLDER", help="Write tables as Parquet into a folder.")
     ] = None,
 ) -> None:
     """Convert a recording for other tools; print the path of each file that was written."""

@@ -29,9 +29,9 @@ def figures(
         print(json.dumps(found.as_dict() | {"files": [str(path) for path in files]}))
     else:
         console = Console()
-        table = Table(title="Experiment (44) of the paper", title_justify="left", title_style="bold")
-        for column in ("quantity", "expected", "computed", "agrees"):
-            table.add_column(column)
+        title = "Experiment (44) of the paper"
+        columns = ("quantity", "expected", "computed", "agrees")
+        table = Table(*columns, title=title, title_justify="left", title_style="bold")
         for name, expected, computed, holds in found.checks():
             table.add_row(name, expected, computed, "yes" if holds else "no", style=None if holds else "red")
         console.print(table)

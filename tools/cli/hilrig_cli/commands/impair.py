@@ -22,25 +22,17 @@ def impair(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: show all rigs of the lab.")] = "",
     preset: Annotated[
         str,
-        typer.Option(
-            metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms.", show_default=False
-        ),
+        typer.Option(metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms."),
     ] = "",
-    state: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state link, ms: {DELAY_SYNTAX}.", show_default=False)
-    ] = "",
+    state: Annotated[str, typer.Option(metavar="KIND:ARGS", help=f"Delay of the state link, ms: {DELAY_SYNTAX}.")] = "",
     command: Annotated[
         str,
-        typer.Option(metavar="KIND:ARGS", help="Delay of the command link; kinds as for --state.", show_default=False),
+        typer.Option(metavar="KIND:ARGS", help="Delay of the command link; kinds as for --state."),
     ] = "",
-    loss: Annotated[
-        str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.", show_default=False)
-    ] = "",
+    loss: Annotated[str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.")] = "",
     trace: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording.", show_default=False
-        ),
+        typer.Option(metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the delays and losses.")] = 1,
     off: Annotated[bool, typer.Option("--off", help="Remove the impairment.")] = False,
@@ -82,30 +74,21 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     Raises:
         InputError: the requested impairment is invalid.
     """
-    from pydantic import ValidationError
-
     from hilrig_runtime.config.impairment import ImpairmentConfig
-    from hilrig_runtime.config.validation import format_validation_error
-    from hilrig_runtime.errors import InputError
+    from hilrig_runtime.config.validation import validate
 
-    try:
-        base = ImpairmentConfig(preset=preset or "none").links
-        delays = {
-            "state": state or base.state.delay,
-            "command": command or base.command.delay,
-        }
-        if trace is not None:
-            from hilrig_replay.export.delay_trace import delay_trace
-            from hilrig_replay.io.isolation import isolated
-            from hilrig_replay.io.run import open_run
+    base = validate(ImpairmentConfig, {"preset": preset or "none"}).links
+    delays = {"state": state or base.state.delay, "command": command or base.command.delay}
+    if trace is not None:
+        from hilrig_replay.export.delay_trace import delay_trace
+        from hilrig_replay.io.isolation import isolated
+        from hilrig_replay.io.run import open_run
 
-            with isolated(trace):
-                delays["command"] = delay_trace(open_run(trace))
-        losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
-        links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
-        return ImpairmentConfig.model_validate({"preset": preset or "none", "seed": seed, **links})
-    except ValidationError as error:
-        raise InputError("\n".join(format_validation_error(error))) from error
+        with isolated(trace):
+            delays["command"] = delay_trace(open_run(trace))
+    losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
+    links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
+    return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})
 
 
 def _row(status: "ImpairmentStatus") -> dict[str, object]:

@@ -2,13 +2,11 @@
 
 import json
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson
+from hilrig_cli.options import AsJson, log
 
 if TYPE_CHECKING:
     from hilrig_cli.bench.timing_benchmark import TimingResult
@@ -27,14 +25,9 @@ def jitter(
     The lab runs on free ports. The result is a verdict: suitable or not suitable for a study at the given step.
     Exit code 1: not suitable; the reasons are printed.
     """
-    from hilrig_cli.bench.jitter import measure_timing
     from hilrig_sim.platform_fingerprint import machine_name
 
-    measured = []
-    for loaded in (False, True) if load else (False,):
-        with ExitStack() as display:
-            on_progress = _progress(display, "with load" if loaded else "measuring")
-            measured.append(measure_timing(step_ms, seconds, loaded, _log, on_progress))
+    measured = [_measure(step_ms, seconds, loaded) for loaded in ((False, True) if load else (False,))]
     is_suitable = not any(result.reasons for result in measured)
     if as_json:
         conditions = [result.as_dict() for result in measured]
@@ -46,17 +39,15 @@ def jitter(
         raise typer.Exit(1)
 
 
-def _log(line: str) -> None:
-    print(f"hilrig: {line}", file=sys.stderr)
-
-
-def _progress(display: ExitStack, description: str) -> Callable[[float], None]:
+def _measure(step_ms: float, seconds: float, loaded: bool) -> "TimingResult":
     from rich.console import Console
     from rich.progress import Progress
 
-    bar = display.enter_context(Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True))
-    task = bar.add_task(description, total=1.0)
-    return lambda share: bar.update(task, completed=share)
+    from hilrig_cli.bench.jitter import measure_timing
+
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+        task = progress.add_task("with load" if loaded else "measuring", total=1.0)
+        return measure_timing(step_ms, seconds, loaded, log, lambda share: progress.update(task, completed=share))
 
 
 def _print_table(result: "TimingResult") -> None:

@@ -1,25 +1,23 @@
 """`hilrig live`: shows a running rig in the rerun viewer."""
 
-import sys
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def live(
     rig: Annotated[
         str | None,
-        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig.", show_default=False),
+        typer.Argument(metavar="RIG", help="Name of the rig; default: the lab's first rig."),
     ] = None,
     config: Config = None,
     save: Annotated[
         Path | None,
-        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
+        typer.Option(metavar="LIVE.RRD", help="Write a rerun file instead of opening a viewer."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
@@ -40,21 +38,15 @@ def live(
         raise InputError("--save and --web can't be combined: use one of them")
     lab = load_lab(config)
     name = rig or lab.rigs[0].name
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-
-    def log(line: str) -> None:
-        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+    stopping = stop_on_signals()
 
     blueprint = layout(live=True)
     with ExitStack() as closing:
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         check_rig(bus, lab, name)
+        viewer = None
         if save is not None:
             stream = to_file(closing.enter_context(output_file(save)), f"live-{name}", blueprint)
-
-            def is_closed() -> bool:
-                return False
         else:
             grpc_port, web_port = free_port(), free_port() if web else None
             viewer = closing.enter_context(running_viewer(grpc_port, web_port))
@@ -62,8 +54,8 @@ def live(
                 log(f"open {browser_address(grpc_port, web_port)} ; press Ctrl-C to stop")
             stream = to_viewer(grpc_port, f"live-{name}", blueprint)
 
-            def is_closed() -> bool:
-                return viewer.poll() is not None
+        def is_closed() -> bool:
+            return viewer is not None and viewer.poll() is not None
 
         closing.callback(stream.disconnect)
         period_s = VIEWER_PERIOD_S if save is None else FILE_PERIOD_S

@@ -1,6 +1,7 @@
 """`hilrig metrics`: Prometheus exporter of the lab."""
 
 import threading
+import time
 from typing import Annotated
 
 import typer
@@ -19,7 +20,7 @@ def metrics(
     One process serves the whole lab. It uses the health reports that the services publish anyway.
     """
     from hilrig_monitoring.lab_watch import LabWatch
-    from hilrig_monitoring.prometheus import metrics_server, text_of
+    from hilrig_monitoring.prometheus import exposition, metrics_server
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError, OperationError
     from hilrig_runtime.process.shutdown import stop_on_signals, wait_for
@@ -28,13 +29,12 @@ def metrics(
     host, colon, port = listen.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise InputError(f"--listen: expected HOST:PORT, for example 127.0.0.1:9464, got {listen!r}")
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     with LabWatch(lab) as watch:
 
         def text() -> str:
             with watch.lock:
-                return text_of(watch.view, lab.name)
+                return exposition(watch.view, lab.name, time.monotonic())
 
         try:
             server = metrics_server((host.strip("[]"), int(port)), text)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def play(
-    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.", show_default=False)],
+    run: Annotated[Path, typer.Argument(metavar="RUN.MCAP", help="The recording.")],
     config: Config = None,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed factor.")] = 1.0,
     start: Annotated[float, typer.Option(min=0.0, help="Start position in the recording, s.")] = 0.0,
@@ -22,8 +22,6 @@ def play(
     rig: Annotated[str, typer.Option(help="Name of the rig to publish as; default: the recorded rig.")] = "",
 ) -> None:
     """Publish a recording on the bus with its original timing, for tools that subscribe to a running rig."""
-    import threading
-
     from hilrig_replay.export.player import Player, publish_recording, rig_config
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
@@ -40,8 +38,7 @@ def play(
     if not is_name(name) or name in RESERVED_RIG_NAMES:
         raise InputError(f"--rig: {name!r} is not a valid rig name")
     player = Player(opened.file, speed=speed, start_s=start, loop=loop)
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     with _bus(lab, name) as bus:
         bus.declare_queryable(CONFIG.key(lab.name, name), lambda _: rig_config(opened, name).SerializeToString())
         played = publish_recording(

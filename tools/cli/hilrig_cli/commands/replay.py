@@ -1,7 +1,6 @@
 """`hilrig replay`: shows recordings in the rerun viewer."""
 
 import sys
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +10,11 @@ import typer
 def replay(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP…", help="Recordings; several are shown in one view."),
     ],
     save: Annotated[
         Path | None,
-        typer.Option(metavar="RUN.RRD", help="Write a rerun file instead of opening a viewer.", show_default=False),
+        typer.Option(metavar="RUN.RRD", help="Write a rerun file instead of opening a viewer."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this host.")] = False,
 ) -> None:
@@ -37,8 +36,7 @@ def replay(
         with isolated(save if len(runs) > 1 else runs[0]):
             save_rrd(opened, save)
         return
-    stopping = threading.Event()
-    stop_on_signals(stopping)
+    stopping = stop_on_signals()
     grpc_port, web_port = free_port(), free_port() if web else None
     with running_viewer(grpc_port, web_port) as viewer:
         if web_port is not None:

@@ -1,6 +1,7 @@
 """`hilrig rig`: lists, adds, removes and resets rigs of a running lab."""
 
 import json
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,6 +10,8 @@ import typer
 from hilrig_cli.options import AsJson, Config, config_for_commands
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from hilrig_runtime.bus.api import Bus
     from hilrig_runtime.config.lab import LabConfig, RigSettings
     from hilrig_schemas import ServiceInfo
@@ -28,18 +31,12 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hilrig_runtime.bus.zenoh_bus import ZenohBus
-    from hilrig_runtime.config.lab import load_lab
-
-    lab = load_lab(config)
-    with ZenohBus(lab.bus, "rig") as bus:
-        rows = _rows(lab, _discover(bus, lab))
+    with _join(config) as (lab, _, found):
+        rows = _rows(lab, found)
     if as_json:
         print(json.dumps(rows))
         return
-    table = Table()
-    for column in ("rig", "address", "simulation", "edge", "source"):
-        table.add_column(column)
+    table = Table("rig", "address", "simulation", "edge", "source")
     for row in rows:
         origin = "lab.toml" if row["in_file"] else "added"
         table.add_row(row["rig"], row["address"], row["sim"] or "none", row["edge"] or "none", origin)
@@ -51,14 +48,13 @@ def add(
     rig: Name,
     port: Annotated[
         int | None,
-        typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports.", show_default=False),
+        typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports."),
     ] = None,
     settings: Annotated[
         Path | None,
         typer.Option(
             metavar="RIG.TOML",
             help="File with settings that differ from the lab's; keys as in \\[\\[rigs]].",
-            show_default=False,
         ),
     ] = None,
     config: Config = None,
@@ -68,17 +64,13 @@ def add(
     The rig exists until the lab stops, or its simulation or edge restarts. To keep it, add it to lab.toml too.
     """
     from hilrig_cli.client import send_control_request
-    from hilrig_runtime.bus.zenoh_bus import ZenohBus
-    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import HilrigError, OperationError
     from hilrig_schemas import AddRig, ControlRequest, RemoveRig
 
-    lab = load_lab(config)
-    with ZenohBus(lab.bus, "rig") as bus:
-        services = _discover(bus, lab)
-        new = _settings(services, rig, port, settings)
-        simulation = _least_loaded(services, "sim", lab)
-        edge = _least_loaded(services, "edge", lab)
+    with _join(config) as (lab, bus, found):
+        new = _settings(found, rig, port, settings)
+        simulation = _least_loaded(found, "sim", lab)
+        edge = _least_loaded(found, "edge", lab)
         request = ControlRequest(add_rig=AddRig(settings_json=new.model_dump_json()))
         send_control_request(bus, lab, simulation, request)
         try:
@@ -95,14 +87,11 @@ def remove(rig: Name, config: Config = None) -> None:
     """Remove a rig from a running lab: its torque is zeroed, its session ends, its port is closed."""
     from hilrig_cli.client import check_rig, send_control_request
     from hilrig_cli.service_kinds import RIG_SERVICES, STOP_ORDER
-    from hilrig_runtime.bus.zenoh_bus import ZenohBus
-    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import ControlRequest, RemoveRig
 
-    lab = load_lab(config)
-    with ZenohBus(lab.bus, "rig") as bus:
-        owners = [info for info in _discover(bus, lab) if rig in info.rigs and info.service in RIG_SERVICES]
+    with _join(config) as (lab, bus, found):
+        owners = [info for info in found if rig in info.rigs and info.service in RIG_SERVICES]
         if not owners:
             check_rig(bus, lab, rig)
             raise OperationError(f"no running service has rig {rig!r}; hilrig rig list shows the existing rigs")
@@ -115,14 +104,11 @@ def remove(rig: Name, config: Config = None) -> None:
 def reset(rig: Name, config: Config = None) -> None:
     """Reset a rig's arm and parts to their start; the controller that holds the lease stays connected."""
     from hilrig_cli.client import check_rig, send_control_request
-    from hilrig_runtime.bus.zenoh_bus import ZenohBus
-    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import ControlRequest, ResetRig
 
-    lab = load_lab(config)
-    with ZenohBus(lab.bus, "rig") as bus:
-        for info in _discover(bus, lab):
+    with _join(config) as (lab, bus, found):
+        for info in found:
             if info.service == "edge" and rig in info.rigs:
                 print(send_control_request(bus, lab, info, ControlRequest(reset_rig=ResetRig(rig=rig))).text)
                 return
@@ -130,15 +116,23 @@ def reset(rig: Name, config: Config = None) -> None:
     raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
 
 
-def _discover(bus: "Bus", lab: "LabConfig") -> "list[ServiceInfo]":
+@contextmanager
+def _join(config: Path | None) -> "Iterator[tuple[LabConfig, Bus, list[ServiceInfo]]]":
+    """Join the bus of a running lab; yield the lab, its bus and its services."""
     from hilrig_cli.client import discover_services
     from hilrig_cli.service_kinds import RIG_SERVICES
+    from hilrig_runtime.bus.zenoh_bus import ZenohBus
+    from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
 
-    found = discover_services(bus, lab, set(RIG_SERVICES))
-    if not found:
-        raise OperationError(f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?")
-    return found
+    lab = load_lab(config)
+    with ZenohBus(lab.bus, "rig") as bus:
+        found = discover_services(bus, lab, set(RIG_SERVICES))
+        if not found:
+            raise OperationError(
+                f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?"
+            )
+        yield lab, bus, found
 
 
 def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
@@ -156,17 +150,13 @@ def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
 
 
 def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
-    import tomllib
-
-    from hilrig_runtime.config.lab import read_lab_text, read_rig
+    from hilrig_runtime.config.lab import read_rig
+    from hilrig_runtime.config.validation import parse_toml, read_text
     from hilrig_runtime.errors import InputError
 
     if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
         raise InputError(f"rig {rig!r} already exists in the lab: choose another name")
-    try:
-        values = {} if settings is None else tomllib.loads(read_lab_text(settings))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{settings}: invalid TOML: {error}") from error
+    values = {} if settings is None else parse_toml(read_text(settings), str(settings))
     if port is not None:
         values["port"] = port
     return read_rig(json.dumps(values | {"name": rig}))

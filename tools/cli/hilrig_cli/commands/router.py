@@ -15,7 +15,6 @@ def router(
         typer.Option(
             metavar="ENDPOINT",
             help="Endpoint to listen on, such as tls/0.0.0.0:7447; default: bus.router of lab.toml.",
-            show_default=False,
         ),
     ] = "",
     print_only: Annotated[

@@ -2,14 +2,12 @@
 
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from importlib import import_module
+from typing import Annotated
 
 import typer
 
 from hilrig_cli.options import Config
-
-if TYPE_CHECKING:
-    from hilrig_runtime.process.service import Service
 
 StopWithParent = Annotated[
     bool, typer.Option("--stop-with-parent", help="Stop when standard input is closed, that is, the parent has ended.")
@@ -20,7 +18,6 @@ Rigs = Annotated[
     typer.Option(
         metavar="RIG,RIG…",
         help="Rigs that this process serves; default: all rigs of the lab.",
-        show_default=False,
     ),
 ]
 Instance = Annotated[
@@ -32,69 +29,44 @@ LogFormat = Annotated[
 ]
 
 
-def sim(
-    config: Config = None,
-    rigs: Rigs = "",
-    instance: Instance = "1",
-    log_format: LogFormat = "text",
-    stop_with_parent: StopWithParent = False,
-) -> None:
-    """Run the simulation: steps the plant in real time, receives commands, publishes states."""
-    from hilrig_sim.service import run
+def _command(name: str, package: str, summary: str) -> Callable[..., None]:
+    """Return the command that runs a service; all services have the same options."""
 
-    _run("sim", run, config, rigs, instance, log_format, stop_with_parent)
+    def run(
+        config: Config = None,
+        rigs: Rigs = "",
+        instance: Instance = "1",
+        log_format: LogFormat = "text",
+        stop_with_parent: StopWithParent = False,
+    ) -> None:
+        from hilrig_runtime.config.lab import load_lab
+        from hilrig_runtime.errors import InputError
+        from hilrig_runtime.process.lifecycle import run_service
+        from hilrig_runtime.process.logging_setup import start_logging
+        from hilrig_schemas.topics import is_name
 
+        service = import_module(f"{package}.service")
+        if not is_name(instance):
+            raise InputError(
+                f"--instance: expected letters, digits, - and _, starting with a letter or digit, got {instance!r}"
+            )
+        lab = load_lab(config)
+        names = [rig.strip() for rig in rigs.split(",")] if rigs else None
+        for rig, count in Counter(names).items():
+            if count > 1:
+                raise InputError(f"--rigs: duplicate rig {rig!r}")
+            lab.rig(rig)
+        start_logging(name, instance, log_format)
+        run_service(name, service.run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)
 
-def edge(
-    config: Config = None,
-    rigs: Rigs = "",
-    instance: Instance = "1",
-    log_format: LogFormat = "text",
-    stop_with_parent: StopWithParent = False,
-) -> None:
-    """Run the Modbus edge: one Modbus TCP port per rig, torques in, positions out."""
-    from hilrig_modbus_edge.service import run
-
-    _run("edge", run, config, rigs, instance, log_format, stop_with_parent)
-
-
-def recorder(
-    config: Config = None,
-    rigs: Rigs = "",
-    instance: Instance = "1",
-    log_format: LogFormat = "text",
-    stop_with_parent: StopWithParent = False,
-) -> None:
-    """Run the recorder: writes each session of each rig to an MCAP file."""
-    from hilrig_recorder.service import run
-
-    _run("recorder", run, config, rigs, instance, log_format, stop_with_parent)
+    run.__name__, run.__doc__ = name, summary
+    return run
 
 
-def _run(
-    name: str,
-    run: "Callable[[Service], None]",
-    config: Config,
-    rigs: str,
-    instance: str,
-    log_format: str,
-    stop_with_parent: bool,
-) -> None:
-    from hilrig_runtime.config.lab import load_lab
-    from hilrig_runtime.errors import InputError
-    from hilrig_runtime.process.lifecycle import run_service
-    from hilrig_runtime.process.logging_setup import start_logging
-    from hilrig_schemas.topics import is_name
-
-    if not is_name(instance):
-        raise InputError(
-            f"--instance: expected letters, digits, - and _, starting with a letter or digit, got {instance!r}"
-        )
-    lab = load_lab(config)
-    names = [rig.strip() for rig in rigs.split(",")] if rigs else None
-    for rig, count in Counter(names).items():
-        if count > 1:
-            raise InputError(f"--rigs: duplicate rig {rig!r}")
-        lab.rig(rig)
-    start_logging(name, instance, log_format)
-    run_service(name, run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)
+sim = _command(
+    "sim", "hilrig_sim", "Run the simulation: steps the plant in real time, receives commands, publishes states."
+)
+edge = _command(
+    "edge", "hilrig_modbus_edge", "Run the Modbus edge: one Modbus TCP port per rig, torques in, positions out."
+)
+recorder = _command("recorder", "hilrig_recorder", "Run the recorder: writes each session of each rig to an MCAP file.")

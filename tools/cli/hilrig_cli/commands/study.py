@@ -15,14 +15,12 @@ if TYPE_CHECKING:
 def study(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="STUDY.TOML", help="Definition of the study (docs/studies.md).", show_default=False),
+        typer.Argument(metavar="STUDY.TOML", help="Definition of the study (docs/studies.md)."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("study-out"),
     controller: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE.PY", help="Add a controller: a file that defines class Controller.", show_default=False
-        ),
+        typer.Option(metavar="FILE.PY", help="Add a controller: a file that defines class Controller."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Also run the study's live points over Modbus TCP, on a separate lab.")
@@ -33,7 +31,6 @@ def study(
             "--from",
             metavar="RUN.MCAP",
             help="Use the latency of this recording: evaluate which gains are stable, and their margins.",
-            show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,

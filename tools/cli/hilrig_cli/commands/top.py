@@ -3,8 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -94,24 +93,22 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
     from rich.text import Text
 
     services = [
-        Row(
-            {
-                "service": service.name,
-                "host": health.host,
-                "rigs": str(health.rigs),
-                "cpu %": f"{100 * service.cpu_share:.0f}",
-                "MiB": f"{health.resident_bytes / 2**20:.0f}",
-                "late ms": f"{health.lateness_p99_ns / 1e6:.2f}",
-                "overruns": str(health.overruns),
-                "lost": str(health.lost_transport + health.lost_recorder),
-                "queue": str(health.queue_depth),
-                "clock ms": f"{health.clock_offset_ns / 1e6:+.1f}" if health.clock_peer else "–",
-            },
-            is_highlighted=view.is_silent(service, now_s),
-        )
+        {
+            "service": service.name,
+            "host": health.host,
+            "rigs": str(health.rigs),
+            "cpu %": f"{100 * service.cpu_share:.0f}",
+            "MiB": f"{health.resident_bytes / 2**20:.0f}",
+            "late ms": f"{health.lateness_p99_ns / 1e6:.2f}",
+            "overruns": str(health.overruns),
+            "lost": str(health.lost_transport + health.lost_recorder),
+            "queue": str(health.queue_depth),
+            "clock ms": f"{health.clock_offset_ns / 1e6:+.1f}" if health.clock_peer else "–",
+        }
         for service in view.services()
         for health in (service.health,)
     ]
+    silent = {service.name for service in view.services() if view.is_silent(service, now_s)}
     alerts = [Text(f"! {alert}", style="yellow") for alert in view.alerts(now_s)]
     rig_views = view.rigs(now_s)
     max_rigs = len(rig_views) if height is None else max(1, height - len(services) - len(alerts) - 9)
@@ -119,36 +116,31 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
         rig_views.sort(key=lambda rig: -(rig.loop_ms(0.99) or 0.0))
         alerts.append(Text(f"… and {len(rig_views) - max_rigs} more rigs", style="dim"))
     rigs = [
-        Row(
-            {
-                "rig": rig.rig,
-                "controller": rig.controller or "none",
-                "loop p50": _or_dash(rig.loop_ms(0.5)),
-                "p99 ms": _or_dash(rig.loop_ms(0.99)),
-                "samples": str(len(rig.loops_us)),
-                "recorded": "yes" if rig.recording else "",
-                "state": rig.state,
-            }
-        )
+        {
+            "rig": rig.rig,
+            "controller": rig.controller or "none",
+            "loop p50": _or_dash(rig.loop_ms(0.5)),
+            "p99 ms": _or_dash(rig.loop_ms(0.99)),
+            "samples": str(len(rig.loops_us)),
+            "recorded": "yes" if rig.recording else "",
+            "state": rig.state,
+        }
         for rig in rig_views[:max_rigs]
     ]
-    return Group(_table(services, SERVICE_COLUMNS, width), _table(rigs, RIG_COLUMNS, width), *alerts)
+    return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, RIG_COLUMNS, width), *alerts)
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One row of a table: text by column."""
+def _table(
+    rows: Sequence[Mapping[str, str]], columns: Mapping[str, int], width: int | None, red: Set[str] = frozenset()
+) -> "Table":
+    """Build a table of the columns that fit `width`; columns of the highest rank are dropped first.
 
-    cells: dict[str, str]
-    is_highlighted: bool = False
-
-
-def _table(rows: Sequence[Row], columns: Mapping[str, int], width: int | None) -> "Table":
-    """Build a table of the columns that fit `width`; columns of the highest rank are dropped first."""
+    Rows whose first cell is in `red` are highlighted.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    needed = {name: max([len(name), *(len(row.cells[name]) for row in rows)]) + 2 for name in columns}
+    needed = {name: max([len(name), *(len(row[name]) for row in rows)]) + 2 for name in columns}
     shown = list(columns)
     while width is not None and sum(needed[name] for name in shown) > width - 2:
         dropped = max(shown, key=lambda name: columns[name])
@@ -159,7 +151,7 @@ def _table(rows: Sequence[Row], columns: Mapping[str, int], width: int | None) -
     for name in shown:
         table.add_column(name, justify="left" if name in LEFT_ALIGNED_COLUMNS else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(row.cells[name] for name in shown), style="red" if row.is_highlighted else None)
+        table.add_row(*(row[name] for name in shown), style="red" if row[shown[0]] in red else None)
     return table
 
 

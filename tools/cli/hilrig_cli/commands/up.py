@@ -2,13 +2,12 @@
 
 import subprocess
 import sys
-import threading
 from typing import Annotated
 
 import typer
 
 from hilrig_cli.commands.services import LogFormat, StopWithParent
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, log
 
 
 def up(
@@ -27,16 +26,10 @@ def up(
     from hilrig_cli.local.local_lab import POLL_S, running_lab
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
-    from hilrig_runtime.process.shutdown import stop_on_signals, stop_with_stdin
+    from hilrig_runtime.process.shutdown import stop_on_signals
 
     lab = load_lab(config)
-    stopping = threading.Event()
-    stop_on_signals(stopping)
-    if stop_with_parent:
-        stop_with_stdin(stopping)
-
-    def log(line: str) -> None:
-        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+    stopping = stop_on_signals(stop_with_parent=stop_with_parent)
 
     processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
     with running_lab(lab, config, log, stopping, processes, ["--log-format", log_format]) as supervisor:

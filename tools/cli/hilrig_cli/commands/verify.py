@@ -14,7 +14,7 @@ from hilrig_cli.options import AsJson
 def verify(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings.", show_default=False),
+        typer.Argument(metavar="RUN.MCAP…", help="Recordings, or folders of recordings."),
     ],
     tolerance: Annotated[
         float | None,
@@ -22,7 +22,6 @@ def verify(
             min=0.0,
             help="Allowed deviation of positions (rad, m) and velocities; default: 0 if it was recorded on an equal "
             "platform, otherwise 1e-9.",
-            show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,

@@ -1,11 +1,11 @@
 """Checks of `hilrig doctor`: each returns results with a level, a text and a fix."""
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 from typing import Self
 
 
-class Level(Enum):
+class Level(StrEnum):
     """Severity of a check result."""
 
     OK = "ok"

@@ -140,4 +140,4 @@ def _address_of(lab: LabConfig, name: str) -> str:
     """Host name or address by which peers connect to the owner of a certificate; empty: no peer connects to it."""
     if lab.bus.topology == "mesh":
         return lab.bus.host if name in MESH_ORDER and lab.bus.host not in ("0.0.0.0", "::") else ""
-    return lab.bus.router.partition("/")[2].rpartition(":")[0].strip("[]") if name == "router" else ""
+    return lab.bus.router_host if name == "router" else ""

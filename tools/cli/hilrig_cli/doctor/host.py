@@ -58,7 +58,8 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResul
             )
     if served + free == len(ports):
         yield CheckResult.ok("ports", f"{served} of {len(ports)} Modbus ports served by hilrig, {free} free")
-    if lab.edge.host not in ("127.0.0.1", "::1", "localhost") and lab.edge.plain and not _all_restricted(lab):
+    is_open = lab.edge.plain and not all(rig.allow for rig in lab.rigs)
+    if is_open and lab.edge.host not in ("127.0.0.1", "::1", "localhost"):
         yield CheckResult.warning(
             "ports",
             f"edge.host is {lab.edge.host}: any host that reaches the edge can control a rig without a certificate",
@@ -125,10 +126,6 @@ def check_disk(lab: LabConfig) -> Iterator[CheckResult]:
         yield CheckResult.warning("disk", f"{text}, enough for about {hours:.1f} h of this lab", fix)
     else:
         yield CheckResult.ok("disk", text)
-
-
-def _all_restricted(lab: LabConfig) -> bool:
-    return all(rig.allow for rig in lab.rigs)
 
 
 def _is_hilrig_edge(host: str, port: int) -> bool:

@@ -9,7 +9,6 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_cli.doctor import CheckResult, Level
-from hilrig_cli.service_kinds import SERVICE_KINDS
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import HilrigError, InputError
@@ -17,7 +16,7 @@ from hilrig_runtime.process.control import release_series
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Health
-from hilrig_schemas.topics import HEALTH, alive_key, source_of_key
+from hilrig_schemas.topics import HEALTH, SERVICES, alive_key, source_of_key
 
 COLLECT_TIMEOUT_S: Final = 2.5
 """Time to collect health reports; each service publishes one a second."""
@@ -114,15 +113,15 @@ def _bus_fix(lab: LabConfig, error: HilrigError) -> str:
 
 def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResult]:
     """Check that every kind of service runs, reports its health and has no alert."""
-    if not snapshot.services & set(SERVICE_KINDS):
+    if not snapshot.services & set(SERVICES):
         text = f"no service of lab {lab.name!r} is running"
         yield CheckResult.warning("services", text, "start the lab: hilrig up, or each service")
         return
-    missing = [service for service in SERVICE_KINDS if service not in snapshot.services]
+    missing = [service for service in SERVICES if service not in snapshot.services]
     if missing:
         yield CheckResult.error("services", f"not running: {', '.join(missing)}", f"start it: hilrig {missing[0]}")
     silent = sorted(
-        name for name in snapshot.alive if name.partition("/")[0] in SERVICE_KINDS and name not in snapshot.healths
+        name for name in snapshot.alive if name.partition("/")[0] in SERVICES and name not in snapshot.healths
     )
     if silent:
         text = f"{', '.join(silent)}: alive, but sends no health reports"

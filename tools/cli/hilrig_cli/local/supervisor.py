@@ -12,11 +12,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
-from hilrig_cli.service_kinds import SERVICE_KINDS, STOP_ORDER
+from hilrig_cli.service_kinds import STOP_ORDER
+from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
+from hilrig_schemas.topics import SERVICES
 
 STOP_TIMEOUT_S: Final = 2.4
 """Time for all children to stop before they are killed; below the 3 s in which `hilrig up` must end."""
@@ -47,7 +48,7 @@ class ProcessSpec:
         return [self.service, "--instance", self.instance, *rigs]
 
 
-DEFAULT_PROCESSES: Final = tuple(ProcessSpec(service) for service in SERVICE_KINDS)
+DEFAULT_PROCESSES: Final = tuple(ProcessSpec(service) for service in SERVICES)
 """One process for each kind of service."""
 
 
@@ -74,14 +75,10 @@ class _Child:
     started_s: float = 0.0
     backoff_s: float = MIN_BACKOFF_S
     restart_at_s: float | None = None
-    restarts: int = 0
 
 
-class Supervisor:
-    """Runs the services of a lab; `log` receives a line for each change.
-
-    Use it as a context manager: leaving it stops every child.
-    """
+class Supervisor(Handle):
+    """Runs the services of a lab; `log` receives a line for each change. Closing it stops every child."""
 
     def __init__(
         self,
@@ -122,35 +119,25 @@ class Supervisor:
                 self._on_death(child, code, now_s)
             elif child.process is None and child.restart_at_s is not None and now_s >= child.restart_at_s:
                 self._spawn(child)
-                child.restarts += 1
                 self._log(f"{child.spec.name} restarted")
 
     def close(self) -> None:
         """Stop the children in order; kill those that do not stop in time."""
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
         for service in STOP_ORDER:
-            stopping = [child for child in self._children.values() if child.spec.service == service and child.process]
+            stopping = [child for child in self._children.values() if child.spec.service == service]
             # Children of one kind stop in parallel.
             for child in stopping:
-                assert child.process is not None
                 _close_stdin(child.process)
             for child in stopping:
-                assert child.process is not None
-                try:
-                    child.process.wait(timeout=max(0.1, deadline_s - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    self._log(f"{child.spec.name} did not stop in time; killing it")
-                    child.process.kill()
-                    child.process.wait()
-                child.process = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+                process, child.process = child.process, None
+                if process is not None:
+                    try:
+                        process.wait(timeout=max(0.1, deadline_s - time.monotonic()))
+                    except subprocess.TimeoutExpired:
+                        self._log(f"{child.spec.name} did not stop in time; killing it")
+                        process.kill()
+                        process.wait()
 
     def _spawn(self, child: _Child) -> None:
         command = [sys.executable, "-m", "hilrig_cli", *child.spec.options, *self._options, "--stop-with-parent"]
@@ -161,8 +148,7 @@ class Supervisor:
         child.restart_at_s = None
 
     def _on_death(self, child: _Child, code: int, now_s: float) -> None:
-        if child.process is not None:
-            _close_stdin(child.process)
+        _close_stdin(child.process)
         child.process = None
         if not self._ready:
             failure: type[HilrigError] = InputError if code == InputError.exit_code else OperationError
@@ -181,8 +167,8 @@ def own_process_group() -> dict[str, Any]:
     return {"start_new_session": True}
 
 
-def _close_stdin(process: subprocess.Popen[bytes]) -> None:
-    if process.stdin is not None:
+def _close_stdin(process: subprocess.Popen[bytes] | None) -> None:
+    if process is not None and process.stdin is not None:
         with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
 

@@ -114,6 +114,7 @@ class DataQuality:
         self.stalls = Stalls()
         self.edge_stalls = Stalls()
         """Stalls that the edge itself reported; older versions do not report them."""
+        self._edge_overruns = 0
         self.repairs = Repairs()
         self._samples = self._negative = self._written = 0
         self._gaps = 0
@@ -202,7 +203,10 @@ class DataQuality:
                 if stalled_ns > longest_ns:
                     longest_ns, at_ns = stalled_ns, int(event["wall_ns"]) - self._run.start_wall_ns - stalled_ns
                 shortest_ns = min(stalls.shortest_ns or stalled_ns, stalled_ns)
-                self.edge_stalls = Stalls(stalls.count + 1, longest_ns, at_ns, shortest_ns)
+                # Stalls within a second are one event.
+                count = stalls.count + max(1, message.overrun_data.stalls)
+                self.edge_stalls = Stalls(count, longest_ns, at_ns, shortest_ns)
+                self._edge_overruns += 1
 
     def _add_stalls(self, states: Rows, lateness: NDArray[np.int64]) -> None:
         stalls, worst = self.stalls, int(np.argmax(lateness))
@@ -295,7 +299,7 @@ class DataQuality:
             text = f"{service} was restarted during the session"
             yield Reason("restart", text if count == 1 else f"{text} ({count} times)")
         # The recorder counts the events of all services.
-        overruns = max(self.stalls.count, (run.number("summary", "overruns") or 0) - self.edge_stalls.count)
+        overruns = max(self.stalls.count, (run.number("summary", "overruns") or 0) - self._edge_overruns)
         if overruns:
             steps = f"{_count(self._missed, 'step')} missed, at most {self.stalls.longest_ns / 1e6:.0f} ms late"
             yield Reason("simulation_stall", f"{_count(overruns, 'overrun')} of the simulation, {steps}")

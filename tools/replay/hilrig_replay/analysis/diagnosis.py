@@ -18,7 +18,7 @@ from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 
 MS: Final = 1e6
 EDGE_STALL_THRESHOLD_NS: Final = 5_000_000

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.io.columns import Rows
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 
 Floats = NDArray[np.float64]
 Series = tuple[Floats, Floats, Floats]

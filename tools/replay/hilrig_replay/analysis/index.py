@@ -153,7 +153,7 @@ class RunIndex:
                 row[reasons] = tuple(Reason(**reason) for reason in row[reasons])
                 known[row[0]] = RunEntry(*row)
             return known
-        except (OSError, ValueError, KeyError, TypeError, IndexError):
+        except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
             # Damaged, or of another version: the index is rebuilt.
             return {}
 
@@ -218,7 +218,7 @@ def read_verdict(path: Path) -> bool | None:
     try:
         verdict = json.loads(path.with_name(path.name + VERDICT_SUFFIX).read_text())
         return bool(verdict["verified"]) if verdict["size"] == path.stat().st_size else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -19,7 +19,8 @@ from hilrig_replay.io.columns import JointValues, Rows, StringTable, joint_value
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
-from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
+from hilrig_sim.arm.joints import JOINT_SCALE
+from hilrig_sim.arm.model import RigParameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.plant.world import NO_PART
 from hilrig_sim.platform_fingerprint import machine_name

@@ -12,8 +12,9 @@ import numpy as np
 from hilrig_replay.geometry.quaternion import Floats, multiply, rotate
 from hilrig_replay.geometry.urdf_geometry import read_origin
 from hilrig_runtime.errors import InputError
+from hilrig_sim.arm.joints import JOINT_NAMES
 from hilrig_sim.arm.kinematics import forward
-from hilrig_sim.arm.model import JOINT_NAMES, ArmParameters, RigParameters
+from hilrig_sim.arm.model import ArmParameters, RigParameters
 
 _ARC_STEP_RAD: Final = np.radians(2.0)
 
@@ -60,7 +61,7 @@ class ArmGeometry:
 
 
 def parse_arm(urdf: str) -> ArmGeometry:
-    """Parse a URDF whose movable joints are named as in `hilrig_sim.arm.model.JOINT_NAMES`.
+    """Parse a URDF whose movable joints are named as in `hilrig_sim.arm.joints.JOINT_NAMES`.
 
     Raises:
         InputError: it is not a URDF, or a joint is missing.

@@ -1,7 +1,6 @@
 """Loads and validates the task that a run is graded by: from its recording, or from a lab file."""
 
 import math
-import tomllib
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -9,7 +8,7 @@ from pydantic import ValidationError
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_runtime.config.validation import format_validation_error
+from hilrig_runtime.config.validation import format_validation_error, parse_toml
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import RigParameters
@@ -25,10 +24,8 @@ def recorded_task(run: Run) -> TaskConfig | None:
     """
     text = run.file.attachments.get("lab.toml", b"").decode("utf-8", errors="replace")
     try:
-        task = tomllib.loads(text).get("task")
+        task = parse_toml(text, f"{run.path}: recorded lab.toml").get("task")
         return None if task is None else TaskConfig.model_validate(task)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{run.path}: recorded lab.toml: invalid TOML: {error}") from error
     except ValidationError as error:
         errors = "; ".join(format_validation_error(error))
         raise InputError(f"{run.path}: recorded lab.toml: invalid task: {errors}") from error

@@ -14,6 +14,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metad
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
 from hilrig_recorder.mcap_format.fsutil import map_file
+from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.reader import (
     NoMcapError,
     RecordReader,
@@ -123,14 +124,14 @@ class _FileContents:
     end_ns: int = 0
     chunks: RowBuffer = field(default_factory=lambda: RowBuffer(CHUNK_DTYPE))
 
-    def add(self, record: McapRecord | Message) -> None:
+    def add(self, record: McapRecord | Message, offset: int = 0) -> None:
         """Add a record of the data section, or a schema or channel of the summary section."""
         if isinstance(record, Schema):
             self.schemas[record.id] = record
         elif isinstance(record, Channel):
             self.channels[record.id] = record
         elif isinstance(record, Metadata):
-            self.metadata[record.name] = dict(record.metadata)
+            add_metadata(self.metadata, record, offset)
         elif isinstance(record, Attachment):
             self.attachments[record.name] = record.data
         elif isinstance(record, Message):
@@ -199,7 +200,7 @@ def _read_summary(reader: RecordReader) -> _FileContents | None:
         elif isinstance(item, MetadataIndex | AttachmentIndex):
             index.append(item)
     for entry in index:
-        contents.add(reader.indexed_record(entry))
+        contents.add(reader.indexed_record(entry), entry.offset)
     return contents
 
 

@@ -4,6 +4,7 @@ Opening a run reads the metadata of the file; the arrays are read on first acces
 blocks, so one pass needs the same memory for a minute and for a day; `between` reads a time range.
 """
 
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -246,7 +247,7 @@ class Run:
                 if count >= rows:
                     count = 0
                     yield decoder.drain()
-        except DecodeError as error:
+        except (DecodeError, struct.error, OverflowError) as error:
             raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
             yield decoder.drain()

@@ -11,7 +11,7 @@ from hilrig_replay.analysis.summary import RunSummary
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
 from hilrig_replay.plots.palette import JOINT_SYMBOLS, RUN_COLORS
-from hilrig_sim.arm.model import JOINT_SCALE
+from hilrig_sim.arm.joints import JOINT_SCALE
 
 
 def save_comparison_plot(comparison: Comparison, path: Path) -> None:

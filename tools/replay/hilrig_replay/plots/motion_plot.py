@@ -12,7 +12,8 @@ from hilrig_replay.geometry.scene import workspace_outline
 from hilrig_replay.plots.axes_style import label_axes
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_sim.arm.model import JOINT_SCALE, RigParameters
+from hilrig_sim.arm.joints import JOINT_SCALE
+from hilrig_sim.arm.model import RigParameters
 
 TASK_COLOR: Final = "#2e9e57"
 

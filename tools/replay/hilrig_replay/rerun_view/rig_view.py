@@ -41,7 +41,8 @@ from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
 from hilrig_replay.rerun_view.layout import SIM_TIME, STEP, WALL
 from hilrig_replay.rerun_view.request_rates import BIN_NS, KINDS, MAX_CLIENTS, OTHER_CLIENTS, Rate, RequestRates
 from hilrig_runtime.config.task import TaskConfig
-from hilrig_sim.arm.model import JOINT_SCALE, PartParameters, RigParameters
+from hilrig_sim.arm.joints import JOINT_SCALE
+from hilrig_sim.arm.model import PartParameters, RigParameters
 from hilrig_sim.arm.urdf import urdf
 
 _SAFE: Final = "safe zero"

@@ -18,7 +18,6 @@ from hilrig_study.controllers.control_laws import LawController, Measurement
 from hilrig_study.linear_model import LinearPlant, fixed_order_product
 
 Floats = NDArray[np.float64]
-Vector4 = tuple[float, float, float, float]
 
 POSITION_SCALE: Final = np.array([np.radians(1.0), np.radians(1.0), 1e-3, np.radians(1.0)])
 """Position error of weight 1: 1° or 1 mm."""
@@ -39,7 +38,6 @@ class PredictiveLqr(LawController):
         period_s: float,
         effort_weight: Floats | Sequence[float] | float = 1.0,
         *,
-        assumed_latency_s: float | None = None,
         compensate: bool = True,
     ) -> None:
         """Design the feedback and the observer at a pose.
@@ -48,7 +46,6 @@ class PredictiveLqr(LawController):
             plant: linear model of the arm near the pose.
             period_s: poll period, s.
             effort_weight: weight of (1 N·m)² relative to (1°)²: one number, or one per run, (N,).
-            assumed_latency_s: fixed loop latency that replaces the measured one, s.
             compensate: False applies the feedback to the estimate without prediction, for comparison.
 
         Raises:
@@ -65,7 +62,6 @@ class PredictiveLqr(LawController):
         self._pose, self._holding = np.array(plant.pose)[:, np.newaxis], np.array(plant.holding)[:, np.newaxis]
         self._period_s = period_s
         self._max_delay = max(1, round(MAX_COMPENSATED_LATENCY_S / period_s))
-        self._assumed = None if assumed_latency_s is None else round(assumed_latency_s / period_s)
         self._compensate = compensate
 
     def start(self, runs: int) -> Floats:
@@ -76,7 +72,9 @@ class PredictiveLqr(LawController):
         """Implement `LawController.law`."""
         runs = memory.shape[1]
         commands = memory[8:].reshape(self._max_delay + 1, 4, runs)
-        delay = self._delay(measured, runs)
+        # A command acts at the tick after its state or later, so the loop latency is at least one poll.
+        polls = np.rint(measured.latency_s / self._period_s).astype(np.int64)
+        delay = np.clip(polls, 1, self._max_delay)
         position = measured.position - self._pose
         new = np.isnan(memory[0])
         estimate = np.where(new, np.concatenate([position, np.zeros((4, runs))]), memory[:8])
@@ -93,13 +91,6 @@ class PredictiveLqr(LawController):
         command = np.add.reduce(self._feedback * (goal - predicted)[np.newaxis], axis=1)
         kept = np.concatenate([command[np.newaxis], commands[:-1]]).reshape(-1, runs)
         return command + self._holding, np.concatenate([estimate, kept])
-
-    def _delay(self, measured: Measurement, runs: int) -> NDArray[np.int64]:
-        """Return the loop latency in polls, (N,), at least one: a command acts at the tick after its state or later."""
-        if self._assumed is not None:
-            return np.full(runs, min(max(self._assumed, 1), self._max_delay), dtype=np.int64)
-        polls = np.rint(measured.latency_s / self._period_s).astype(np.int64)
-        return np.asarray(np.clip(polls, 1, self._max_delay), dtype=np.int64)
 
 
 def _feedback(phi: Floats, gamma: Floats, effort_weight: float) -> Floats:

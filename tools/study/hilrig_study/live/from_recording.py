@@ -5,6 +5,7 @@ Under it, the loop of a controller that polls once per step is a Markov jump lin
 and expected cost are exact.
 """
 
+from bisect import bisect_left
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -144,7 +145,9 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
             growth = radius(0)
             stable = growth < 1.0
             cost = expected_cost(plant_model, phi, gamma, controller, law, chain, offset, ticks) if stable else None
-            spare = _largest(lambda added, growth_of=radius: growth_of(added) < 1.0) if stable else None
+            # The number of added steps, from 1 on, with which the loop is stable.
+            tried = range(1, MAX_SPARE_STEPS + 1)
+            spare = bisect_left(tried, 1.0, key=radius) if stable else None
             spare_ms = None if spare is None else spare * run.step_ns / 1e6
             verdicts.append(GainVerdict(config.name, gain, stable, growth, cost, spare_ms, spare == MAX_SPARE_STEPS))
     return GainReport(
@@ -175,12 +178,3 @@ def _law(
     built = config.build(rig, linearize(rig.arm, pose), near_period, np.array([gain]))
     assert isinstance(built, LawController)
     return built
-
-
-def _largest(holds: Any) -> int:
-    """Return the largest number up to `MAX_SPARE_STEPS` for which `holds` is true, given that it is true for 0."""
-    low, high = 0, MAX_SPARE_STEPS + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low

@@ -3,11 +3,11 @@
 The functions that start a lab are arguments, because starting processes belongs to the command line.
 """
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,10 +24,11 @@ from hilrig_runtime.config.impairment import (
     UniformDelay,
 )
 from hilrig_runtime.config.lab import LabConfig, load_lab
+from hilrig_runtime.config.template import toml_value
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_study.live.live_loop import RigClient, drive, measure_tick_phase
 from hilrig_study.live.twin import compare_with_twins
-from hilrig_study.study_config import PointConfig, StudyConfig
+from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import cell_at
 
 CLOCK_RIG: Final = "clock"
@@ -84,13 +85,9 @@ def run_live_points(
                 point, number = points[index]
                 report(f"live: {names[number]} at {study.x.label} {point.x:g}, {study.y.label} {point.y:g}")
                 run = _run_point(study, folder, lab, f"point{index + 1}", cells[index], check_processes)
-                comparison = compare_with_twins(study, cells[index], run, folder)
-                compared.append(_point_values(point, names[number], run) | comparison.as_dict())
+                place = {"x": point.x, "y": point.y, "controller": names[number], "recording": str(run.path)}
+                compared.append(place | asdict(compare_with_twins(study, cells[index], run, folder)))
     return compared
-
-
-def _point_values(point: PointConfig, controller: str, run: Run) -> dict[str, Any]:
-    return {"x": point.x, "y": point.y, "controller": controller, "recording": str(run.path)}
 
 
 def _point_impairments(study: StudyConfig, cell: np.ndarray[Any, np.dtype[np.void]]) -> LinkImpairments:
@@ -127,29 +124,20 @@ def _write_lab(
     lines = [
         "# Lab of the live points of a study: one rig per point, and one rig without impairment.",
         'name = "study"',
-        f"sim = {_toml(single_rig_lab.sim.model_dump())}",
-        f"edge = {_toml({'first_port': ports, 'session_grace_ms': 0.0})}",
-        f"bus = {_toml({'first_port': find_ports(single_rig_lab.bus.first_port, 3)})}",
-        f"recorder = {_toml({'folder': str(recordings.resolve())})}",
-        f"scene = {_toml({'trays': [], 'parts': []})}",
+        f"sim = {toml_value(single_rig_lab.sim.model_dump())}",
+        f"edge = {toml_value({'first_port': ports, 'session_grace_ms': 0.0})}",
+        f"bus = {toml_value({'first_port': find_ports(single_rig_lab.bus.first_port, 3)})}",
+        f"recorder = {toml_value({'folder': str(recordings.resolve())})}",
+        f"scene = {toml_value({'trays': [], 'parts': []})}",
     ]
-    arm = _toml(single_rig_lab.rigs[0].arm.model_dump())
+    arm = toml_value(single_rig_lab.rigs[0].arm.model_dump())
     for name, links in {CLOCK_RIG: LinkImpairments(), **rigs}.items():
         impairment = {"seed": study.seed, **links.model_dump()}
-        lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {_toml(impairment)}"]
+        lines += ["[[rigs]]", f'name = "{name}"', f"arm = {arm}", f"impairment = {toml_value(impairment)}"]
     try:
         config.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise OperationError(f"{config}: can't write the lab file: {error.strerror}") from error
-
-
-def _toml(value: Any) -> str:
-    """Return a number, string, list or dictionary as an inline TOML value."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)
 
 
 def _run_point(

@@ -5,9 +5,9 @@ impairment. Several twins are run. Only joints 1 and 2 are compared, because the
 for its controller; this does not affect joints 1 and 2.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,10 +59,6 @@ class TwinComparison:
     latency_ks: float
     """Kolmogorov-Smirnov distance between the two distributions of the loop latency, 0 to 1."""
     as_predicted: bool
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the comparison as JSON values."""
-        return asdict(self)
 
 
 def compare_with_twins(study: StudyConfig, cell: NDArray[np.void], run: Run, folder: Path) -> TwinComparison:

@@ -21,7 +21,6 @@ from hilrig_runtime.errors import InputError
 from hilrig_study.controllers.control_laws import LawController, Measurement
 from hilrig_study.linear_model import LinearPlant
 from hilrig_study.simulation.simulated_loop import EFFORT_COST, ERROR_SCALE
-from hilrig_study.simulation.timing import NO_POLL, Timeline
 from hilrig_study.theory.margins import LinearLaw
 
 Floats = NDArray[np.float64]
@@ -50,13 +49,6 @@ class AgeChain:
         return int(self.ages.max())
 
 
-def ages_by_tick(line: Timeline) -> Ints:
-    """Return the age of the acting command at every tick, steps, (T,); 0: no command acts."""
-    acts = line.in_force != NO_POLL
-    ages = np.arange(len(line.in_force)) - line.basis[np.maximum(line.in_force, 0)]
-    return np.where(acts, ages, 0)
-
-
 def age_chain(sequences: Sequence[Ints]) -> AgeChain:
     """Estimate the Markov chain from sequences of ages, one per run, (T,) each.
 
@@ -74,8 +66,9 @@ def age_chain(sequences: Sequence[Ints]) -> AgeChain:
         np.add.at(counts, (rows[:-1], rows[1:]), 1.0)
         start[rows[0]] += 1.0
     total = counts.sum(axis=1, keepdims=True)
-    # A state that occurs only at the end of a run becomes absorbing, so that each row sums to 1.
-    transition = np.where(total > 0, counts / np.maximum(total, 1.0), np.eye(len(states)))
+    # A state that occurs only at the end of a run is followed by any age, as often as it occurs: it is not absorbing.
+    occurs = np.where(states > 0, np.bincount(np.searchsorted(states, np.concatenate(labels))), 0)
+    transition = np.where(total > 0, counts / np.maximum(total, 1.0), occurs / occurs.sum())
     return AgeChain(np.maximum(states, 0), transition, start / start.sum())
 
 

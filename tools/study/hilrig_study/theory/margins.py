@@ -172,13 +172,6 @@ def spectral_radius(matrix: Floats) -> float:
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def is_stable(
-    phi: Floats, gamma: Floats, law: LinearLaw, timing: LoopTiming, state_delay_ns: int = 0, command_delay_ns: int = 0
-) -> bool:
-    """Return whether the loop is stable for constant delays; arguments as `loop_matrix`."""
-    return spectral_radius(loop_matrix(phi, gamma, law, timing, state_delay_ns, command_delay_ns)) < STABLE_RADIUS
-
-
 def loop_transfer(phi: Floats, gamma: Floats, law: LinearLaw, latency_steps: int, frequency: Floats) -> Complex:
     """Return the loop transfer function -C(z) P(z) z^-n, opened at the arm's input, (K, 4, 4), at ω, rad/s, (K,).
 
