@@ -297,17 +297,18 @@ def _answered(server: zenoh.Session, querier: zenoh.Session, expected: set[str])
 
 def tokens_seen(sessions: Sessions) -> set[str]:
     tokens = [sessions.client.liveliness().declare_token(key(name)) for name in TOKENS]
+    reference = "alive/edge/east" if sessions.reference_key == "edge/event" else "alive/recorder/1"
     reference_token = sessions.reference.liveliness().declare_token(
-        key(f"alive/{sessions.reference_key.partition('/')[0]}/1")
+        key(reference)
     )
     shown: set[str] = set()
 
     def query_tokens() -> bool:
         replies = sessions.tested.liveliness().get(key("alive/**"), timeout=0.3)
         shown.update(str(reply.ok.key_expr).removeprefix("hil/lab/") for reply in replies if reply.ok is not None)
-        return MAY_DECLARE[sessions.name] | {f"alive/{sessions.reference_key.partition('/')[0]}/1"} <= shown
+        return MAY_DECLARE[sessions.name] | {reference} <= shown
 
     eventually(query_tokens)
     for token in (*tokens, reference_token):
         token.undeclare()
-    return shown - {f"alive/{sessions.reference_key.partition('/')[0]}/1"}
+    return shown - {reference}

@@ -163,7 +163,8 @@ def test_wall_clock_at_a_limit_of_int64_is_dropped() -> None:
     with service(hub, "1", ("rig1",), 2_000) as running:
         running.ready()
         running.health.report(0)
-        assert (running.counters.malformed, running.health.clock_offset().peer) == (1, "")
+        assert running.counters.malformed >= 1
+        assert running.health.clock_offset().peer == ""
 
 
 def test_health_report_contains_clock_offset() -> None:
