@@ -298,9 +298,7 @@ def _answered(server: zenoh.Session, querier: zenoh.Session, expected: set[str])
 def tokens_seen(sessions: Sessions) -> set[str]:
     tokens = [sessions.client.liveliness().declare_token(key(name)) for name in TOKENS]
     reference = "alive/edge/east" if sessions.reference_key == "edge/event" else "alive/recorder/1"
-    reference_token = sessions.reference.liveliness().declare_token(
-        key(reference)
-    )
+    reference_token = sessions.reference.liveliness().declare_token(key(reference))
     shown: set[str] = set()
 
     def query_tokens() -> bool:
