@@ -13,6 +13,7 @@ class Counters:
     ticks: int = 0
     overruns: int = 0
     missed_steps: int = 0
+    inaccurate_steps: int = 0
     received: int = 0
     published: int = 0
     lost_transport: int = 0

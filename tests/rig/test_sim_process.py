@@ -108,7 +108,7 @@ def test_exits_with_0_on_signal(sim: SimProcess, how: signal.Signals) -> None:
 
 
 def test_unstable_step_is_rejected_in_one_line(tmp_path: Path) -> None:
-    done = hilrig("sim", "--config", write_lab(tmp_path, extra="sim.step_ms = 60"))
+    done = hilrig("sim", "--config", write_lab(tmp_path, extra="sim.step_ms = 60\nsim.substeps = 1"))
     assert done.returncode == 2
     (line,) = [line for line in done.stderr.splitlines() if "unstable" in line]
     assert "set sim.substeps = 3 or a shorter sim.step_ms" in line

@@ -271,6 +271,7 @@ def write(
     arrival_lag_ns: int = 0,
     lab_toml: str = "",
     urdf_text: str | None = None,
+    fetched_until_s: float = 0.0,
 ) -> Path:
     """Write messages as the recorder does.
 
@@ -288,6 +289,7 @@ def write(
         missing: sequence numbers of messages that are not written, by topic.
         arrival_lag_ns: additional arrival delay of the second half of the messages.
         lab_toml: content of the attached lab file.
+        fetched_until_s: messages up to this time arrived at this time, from the caches of their senders.
         urdf_text: content of the attached URDF; None: that of the rig.
     """
     if arrival_lag_ns:
@@ -334,7 +336,7 @@ def write(
             late_ns = 3 * MS + (arrival_lag_ns if arrival_lag_ns and one.publish_wall_ns > late_from else 0)
             writer.add_message(
                 channels[one.topic],
-                log_time=one.publish_wall_ns + late_ns,
+                log_time=max(one.publish_wall_ns + late_ns, START_WALL_NS + round(fetched_until_s * 1e9)),
                 publish_time=one.publish_wall_ns,
                 sequence=sequences[one.topic],
                 data=one.message.SerializeToString(),

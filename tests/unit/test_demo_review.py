@@ -18,7 +18,7 @@ FAILED: dict[str, Any] = {}
 
 def review(controller: dict[str, Any], *in_tray: str) -> Review:
     parts = [PartPlacement(name, 0, 0.25) if name in in_tray else PartPlacement(name, None, None) for name in SCENE]
-    exact = Verification(100, 0, 0, True, 0.0, (0, 0, 0, 0), (0, 0, 0, 0), 0.0, None, "here")
+    exact = Verification(100, 0, 0, True, 0.0, (0, 0, 0, 0), (0, 0, 0, 0), 0.0, None, {}, (), "here")
     latency = cast(LatencyReport, SimpleNamespace(samples=100))
     run = DemoRun(Path("run.mcap"), controller)
     return Review(run, latency, exact, PlacementReport(tuple(parts)), Path("latency.png"), Path("run.rrd"))

@@ -7,7 +7,7 @@ from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics, stage_views
 from hilrig_sim.arm.integrators import EULER, RK4, RKF45, TABLEAUS, Tableau, reference_solution
 from hilrig_sim.arm.model import ArmParameters, RigParameters, StepParameters
-from hilrig_sim.arm.stability import check_stable, fastest_mode, largest_safe_step
+from hilrig_sim.arm.stability import base_substeps, check_stable, fastest_mode, largest_safe_step
 from hilrig_sim.arm.stepping import FixedStep
 
 PAPER = ArmParameters(masses=(1.0, 0.5, 0.5))
@@ -105,14 +105,37 @@ def test_mode_grows_just_beyond_the_stability_limit(table: Tableau, limit_s: flo
 
 
 def test_unstable_step_is_rejected_with_the_fix() -> None:
-    unstable = RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000))
+    unstable = RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000, substeps=1))
     with pytest.raises(InputError, match=r"the largest safe step is 22\.7 ms \(20% margin\); set sim.substeps = 2"):
         check_stable(unstable)
     check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=25_000_000, substeps=2)))
-    check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=20_000_000)))
+    check_stable(RigParameters(arm=PAPER, sim=StepParameters(step_ns=20_000_000, substeps=1)))
     with pytest.raises(InputError, match="unstable with euler"):
-        check_stable(RigParameters(arm=PAPER, sim=StepParameters(integrator="euler")))
+        check_stable(RigParameters(arm=PAPER, sim=StepParameters(substeps=1, integrator="euler")))
 
 
 def test_arm_without_friction_has_no_step_limit() -> None:
     assert largest_safe_step(ArmParameters(friction=(0.0, 0.0, 0.0, 0.0)), "rkf45") == float("inf")
+
+
+def test_automatic_substeps_resolve_the_fastest_mode() -> None:
+    for step_ns, expected in ((1_000_000, 1), (10_000_000, 1), (20_000_000, 2), (40_000_000, 4)):
+        assert base_substeps(PAPER, StepParameters(step_ns=step_ns)) == expected
+
+
+STIFF = ArmParameters(masses=(0.0001, 0.0001, 0.0001))
+"""Its fastest mode is 10,000 times as fast."""
+
+
+@pytest.mark.parametrize(
+    ("sim", "text"),
+    [
+        (StepParameters(), r"set sim\.step_ms to 0\.0\d+ or less, or a heavier arm"),
+        (StepParameters(substeps=1), r"largest safe step is 0\.00\d+ ms .* set sim\.step_ms to 0\.\d+ or less with"),
+        (StepParameters(integrator="rk4"), r"needs an integrator with an error estimate \(rkf45\), and rk4 has none"),
+    ],
+    ids=["automatic", "fixed", "no estimate"],
+)
+def test_stiff_arm_is_rejected_with_the_remedy(sim: StepParameters, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        check_stable(RigParameters(arm=STIFF, sim=sim))

@@ -15,7 +15,11 @@ from hilrig_schemas import Health, RigReport
 
 
 def sim(uptime_s: float = 1.0, cpu_s: float = 0.0, loops_us: tuple[int, ...] = (20_000, 20_100, 40_000)) -> Health:
-    reports = [RigReport(rig="rig1", loop_us=loops_us), RigReport(rig="rig2", safe=True)]
+    ages_us = [20_000, 40_000, 60_000]
+    reports = [
+        RigReport(rig="rig1", loop_us=loops_us, age_us=ages_us),
+        RigReport(rig="rig2", safe=True, age_us=[900_000]),
+    ]
     return Health(
         service="sim",
         instance="1",
@@ -51,6 +55,13 @@ def test_rig_status_combines_reports_of_all_services() -> None:
     assert (first.loop_ms(0.0), first.loop_ms(0.5), first.loop_ms(0.99)) == (20.0, 20.1, 40.0)
     assert (second.watchdog_tripped, second.safe, second.loop_ms(0.5)) == (True, True, None)
     assert (third.served, third.simulated) == (False, False)
+
+
+def test_age_is_that_of_a_rig_with_a_lease_holder() -> None:
+    first, second, _ = view().rigs(11.0)
+    assert (first.age_ms(0.5), first.age_ms(0.99)) == (40.0, 60.0)
+    # A torque that its last controller left is not a loop.
+    assert second.age_ms(0.5) is None
 
 
 def test_rig_missing_in_the_file_is_shown() -> None:
@@ -132,6 +143,7 @@ def test_json_contains_the_same_values() -> None:
     assert [service["service"] for service in plain["services"]] == ["edge", "recorder", "sim"]
     assert plain["rigs"][0]["loop_p99_ms"] == 40.0
     assert plain["rigs"][1]["loop_p99_ms"] is None
+    assert plain["rigs"][0]["age_p99_ms"] == 60.0
     assert plain["services"][2]["cpu_percent"] == pytest.approx(50)
 
 
@@ -142,6 +154,7 @@ def test_metrics_are_in_prometheus_text_format() -> None:
         assert line.startswith(("# HELP ", "# TYPE ")) or sample.match(line), line
     assert 'hilrig_overruns_total{lab="lab",service="sim",instance="1"} 3' in text
     assert 'hilrig_rig_loop_seconds{lab="lab",rig="rig1",quantile="0.99"} 0.04' in text
+    assert 'hilrig_rig_age_seconds{lab="lab",rig="rig1",quantile="0.99"} 0.06' in text
     assert 'hilrig_rig_held{lab="lab",rig="rig2"} 0' in text
     families = re.findall(r"^# TYPE (\S+)", text, re.MULTILINE)
     assert len(families) == len(set(families))

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilrig_runtime.errors import InputError, OperationError
@@ -23,6 +24,19 @@ def test_experiment_44_gives_the_published_numbers() -> None:
     assert limits == pytest.approx(expected, rel=0.01)
     assert all(holds for *_, holds in result.checks())
     assert json.loads(json.dumps(result.as_dict()))["methods"]["euler"]["theta_end_rad"] is None
+
+
+def test_curves_of_experiment_44_agree_with_the_reference() -> None:
+    result = compute()
+    position, speed = result.curve_errors(result.automatic)
+    assert position < np.radians(0.1) / 100
+    assert speed < 0.003
+    # The fixed step of the paper ends right, but its speed is wrong after each change of the torque.
+    position, speed = result.curve_errors(result.fehlberg)
+    assert position < 2e-4
+    assert 0.10 < speed < 0.13
+    found = result.as_dict()["curve_errors"]
+    assert found["automatic"]["speed_share"] < 0.003 < found["rkf45"]["speed_share"]
 
 
 def test_euler_is_stable_at_a_short_step_and_checks_fail() -> None:

@@ -1,11 +1,11 @@
 """Recovery of truncated and damaged files: complete chunks are kept, damaged ones are not, and nothing crashes."""
 
 import errno
+import os
 import random
 import shutil
 import struct
 from pathlib import Path
-from typing import IO, Any
 
 import pytest
 from mcap.reader import make_reader
@@ -363,9 +363,9 @@ def test_write_errors_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
-    for method in ("unlink", "open"):
+    for owner, method in ((Path, "unlink"), (os, "open")):
         with monkeypatch.context() as patch:
-            patch.setattr(Path, method, refuse)
+            patch.setattr(owner, method, refuse)
             if method == "unlink":
                 with pytest.raises(OperationError, match="can't be written: Read-only file system"):
                     recover(source, tmp_path / "new.mcap")
@@ -378,14 +378,14 @@ def test_file_on_a_read_only_disk_is_recovered_elsewhere(tmp_path: Path, monkeyp
     good_file(tmp_path / "run.mcap")
     source = tmp_path / "truncated.mcap"
     source.write_bytes((tmp_path / "run.mcap").read_bytes()[:-10])
-    open_path = Path.open
+    open_original = os.open
 
-    def read_only(path: Path, mode: str = "r", **options: Any) -> IO[Any]:
-        if "+" in mode:
+    def read_only(path: Path, flags: int, *mode: int) -> int:
+        if path == source and flags & os.O_RDWR:
             raise OSError(errno.EROFS, "Read-only file system")
-        return open_path(path, mode, **options)
+        return open_original(path, flags, *mode)
 
-    monkeypatch.setattr(Path, "open", read_only)
+    monkeypatch.setattr(os, "open", read_only)
     assert recover(source, tmp_path / "new.mcap").messages > 0
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from hilrig_replay.analysis.compare import Origin, compare, find_origin
 from hilrig_replay.analysis.stages import LOOP_STAGES
-from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize
+from hilrig_replay.analysis.summary import TRAJECTORY_POINTS, summarize, under_command
 from hilrig_replay.export.foxglove_messages import LOG_LEVELS
 from hilrig_replay.geometry.scene import tool_positions
 from hilrig_replay.io.paths import display_names
@@ -39,7 +39,10 @@ def test_summary_has_the_scripted_motion(tmp_path: Path) -> None:
     t = np.arange(0, 10.0, 0.001)
     path = tool_positions(PARAMETERS.arm, np.array([position(seconds) for seconds in t]))
     assert summary.motion.tool_path_m == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum(), rel=0.01)
-    work = np.abs(run.states["effort"] * run.states["velocity"]).sum() * 0.02
+    # Trapezoidal rule: the effort is constant over a step, the speed is not.
+    speed, effort = np.abs(run.states["velocity"]), np.abs(run.states["effort"])
+    rows = np.flatnonzero(acting(run)[:-1])
+    work = (effort[rows] * (speed[rows] + speed[rows + 1]) / 2).sum() * 0.02
     assert summary.motion.work_j == pytest.approx(work)
     assert summary.motion.saturated_share == (0, 0, 0, 0)
     assert (summary.events, summary.alarms) == ({"SESSION_END": {"INFO": 1}, "SESSION_START": {"INFO": 1}}, 0)
@@ -54,8 +57,33 @@ def test_saturation_is_the_share_of_steps_at_the_limit(tmp_path: Path) -> None:
     for state in states[:50]:
         state.effort[2] = -32.767
     summary = summarize(named(tmp_path, "run", script, made))
-    assert summary.motion.saturated_share == (0, 0, 0.25, 0)
+    run = open_run(tmp_path / "run.mcap")
+    acts = acting(run)[:-1]
+    share = (acts & (run.states["effort"][:-1, 2] == -32.767)).sum() / acts.sum()
+    assert 0.2 < share < 0.26
+    assert summary.motion.saturated_share == (0, 0, pytest.approx(share), 0)
     assert summary.motion.peak_effort[2] == 32.767
+
+
+def acting(run: Run) -> np.ndarray:
+    """Return at which states a controller acts."""
+    return np.asarray(under_command(run, run.states) & (run.states["effort"] != 0).any(axis=1))
+
+
+def test_quill_that_falls_after_the_controller_does_not_count(tmp_path: Path) -> None:
+    script = Script(seconds=4.0)
+    made = make(script)
+    expected = summarize(named(tmp_path, "whole", script, made)).motion
+    states = [one.message for one in made if isinstance(one.message, JointState)]
+    for number, state in enumerate(states[-20:]):
+        # Zero torque of the watchdog: the quill falls at 2 m/s.
+        state.effort[:] = (0.0, 0.0, 0.0, 0.0)
+        state.position[2] += 0.04 * number
+        state.velocity[2] = 2.0
+    motion = summarize(named(tmp_path, "fallen", script, made)).motion
+    assert motion.top_speed == pytest.approx(expected.top_speed, rel=0.05)
+    assert motion.tool_path_m < expected.tool_path_m
+    assert motion.work_j < expected.work_j
 
 
 def test_trajectory_length_is_bounded(tmp_path: Path) -> None:

@@ -120,9 +120,14 @@ def test_start_event_has_the_step_parameters() -> None:
     with RegistryRig() as lab:
         assert lab.kinds() == ["CONFIGURATION"] * 3
         assert [event.rig for event in lab.events] == ["rig1", "rig2", "rig3"]
-        assert lab.events[0].text == "simulation started: step 20 ms, rkf45"
+        assert lab.events[0].text == "simulation started: step 20 ms, rkf45, automatic sub-steps"
         parameters = json.loads(lab.events[0].configuration_data.text)
-        assert parameters == {"step_ns": 20_000_000, "substeps": 1, "integrator": "rkf45"}
+        assert parameters == {
+            "step_ns": 20_000_000,
+            "substeps": "auto",
+            "integrator": "rkf45",
+            "plant_version": 2,
+        }
 
 
 def test_rig_is_added_described_and_removed_by_query() -> None:

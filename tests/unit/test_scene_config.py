@@ -51,8 +51,8 @@ def parameters(text: str) -> None:
         ),
         ("[[rigs]]\n[rigs.arm]\nstart_position = [140, 0, 0, 0]", "theta1: the start"),
         ("[[rigs]]\n[rigs.arm]\nlower_limits = [0, 160, 0, 0]", "theta2: the lower limit"),
-        ("[sim]\nstep_ms = 30", "largest safe step is 23.9 ms"),
-        ("[sim]\nstep_ms = 20\nintegrator = 'euler'", "unstable with euler"),
+        ("[sim]\nstep_ms = 30\nsubsteps = 1", "largest safe step is 23.8 ms"),
+        ("[sim]\nstep_ms = 20\nsubsteps = 1\nintegrator = 'euler'", "unstable with euler"),
     ],
 )
 def test_invalid_value_is_reported_with_its_place(text: str, says: str) -> None:

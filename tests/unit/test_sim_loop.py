@@ -62,6 +62,32 @@ def test_loop_latency_is_time_from_basis_to_new_command(rig: VirtualRig) -> None
     assert (after.basis_step, after.command_arrived_ns, after.loop_latency_ns, after.command_seq) == (0, 0, 0, 1)
 
 
+def test_report_has_the_age_of_the_basis_at_each_step(rig: VirtualRig) -> None:
+    rig.tick(3)
+    rig.command((1.0, 0.0, 0.0, 0.0), basis_step=2)
+    rig.tick(3)
+    (report,) = rig.service.health.rig_reports()
+    assert (list(report.loop_us), list(report.age_us)) == ([40_000], [40_000, 60_000, 80_000])
+    # The command is held over the report, and another one without a basis replaces it.
+    rig.tick(2)
+    rig.command((2.0, 0.0, 0.0, 0.0))
+    rig.tick(2)
+    rig.command((3.0, 0.0, 0.0, 0.0), basis_step=10)
+    rig.tick(2)
+    (report,) = rig.service.health.rig_reports()
+    assert (list(report.loop_us), list(report.age_us)) == ([20_000], [100_000, 120_000, 20_000, 40_000])
+
+
+def test_timed_out_command_has_no_age(rig: VirtualRig) -> None:
+    rig.tick(2)
+    rig.command((1.0, 0.0, 0.0, 0.0), basis_step=2)
+    timeout_steps = rig.lab.sim.command_timeout_ns // rig.lab.sim.step_ns
+    rig.tick(timeout_steps + 20)
+    (report,) = rig.service.health.rig_reports()
+    assert report.safe
+    assert timeout_steps <= len(report.age_us) <= timeout_steps + 2
+
+
 def test_unknown_basis_gives_no_latency(rig: VirtualRig) -> None:
     rig.tick(2)
     for options in ({"basis_step": 99}, {"basis_step": 1, "basis_incarnation": 5}, {"basis_step": 0}):
@@ -166,15 +192,15 @@ def test_chattering_joint_is_reported_once_per_period() -> None:
     reported: list[Event] = []
     events = SimulationEvents(reported.append, ["rig1"], Plant([RigParameters()]))
     hit = PlantEvent(PlantEventKind.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
-    for now_ms in (0, 100, 300, 520, 800):
+    for now_ms in (0, 400, 1200, 2080, 3200):
         events.report_plant_events([hit], now_ms, now_ms * 1_000_000, ["session"])
-    assert [event.step for event in reported] == [0, 300, 800]
+    assert [event.step for event in reported] == [0, 1200, 3200]
     assert [event.text for event in reported] == [
         "joint 1 hit its upper stop at 29 °/s",
         "joint 1 hit its upper stop at 29 °/s (2 times)",
         "joint 1 hit its upper stop at 29 °/s (2 times)",
     ]
-    events.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
+    events.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 3201, 3_201_000_000, ["session"])
     assert [event.text for event in reported[3:]] == [
         "joint 1 hit its lower stop at 29 °/s",
         "joint 2 hit its upper stop at 29 °/s",
@@ -183,7 +209,10 @@ def test_chattering_joint_is_reported_once_per_period() -> None:
 
 def test_diverged_rig_is_reset_to_the_start() -> None:
     arm = ArmConfig(masses_kg=(0.05, 0.02, 0.02), friction=(0.01, 0.01, 0.1, 0.01))
-    with VirtualRig(LabConfig(rigs=(RigSettings(arm=arm),))) as rig, np.errstate(all="ignore"):
+    with (
+        VirtualRig(LabConfig(sim=SimConfig(substeps=1), rigs=(RigSettings(arm=arm),))) as rig,
+        np.errstate(all="ignore"),
+    ):
         for turn in range(300):
             rig.command([32.0, -32.0, 0.0, 1.0] if turn % 2 else [-32.0, 32.0, 0.0, 1.0])
             rig.tick()
@@ -194,6 +223,31 @@ def test_diverged_rig_is_reset_to_the_start() -> None:
         state = rig.tick()
     assert state.step == reset.step
     assert list(state.position) == [0.0] * 4
+
+
+def test_inaccurate_steps_are_counted_and_reported_once_a_second() -> None:
+    with VirtualRig(LabConfig(sim=SimConfig(substeps=1))) as rig:
+        for turn in range(40):
+            rig.command([16.0, -16.0, -4.9, 0.0] if turn % 2 else [-16.0, 16.0, -4.9, 0.0])
+            state = rig.tick()
+        assert state.substeps == 1
+        reports = [event for event in rig.events if event.kind == Event.INACCURATE_STEP]
+        assert len(reports) == 1
+        assert reports[0].severity == Event.WARNING
+        assert reports[0].rig == "rig1"
+        assert reports[0].integration_data.steps == 1
+        assert max(reports[0].integration_data.error[:2]) > np.radians(0.1)
+        assert "inaccurate step: the estimated error of joint" in reports[0].text
+        assert rig.service.counters.inaccurate_steps > 5
+
+
+def test_automatic_substeps_are_accurate_and_published() -> None:
+    with VirtualRig(LabConfig()) as rig:
+        for turn in range(40):
+            rig.command([16.0, -16.0, -4.9, 0.0] if turn % 2 else [-16.0, 16.0, -4.9, 0.0])
+            assert rig.tick().substeps >= 2
+        assert "INACCURATE_STEP" not in rig.kinds()
+        assert rig.service.counters.inaccurate_steps == 0
 
 
 def test_rigs_apply_their_own_commands_only() -> None:
@@ -218,7 +272,7 @@ def test_parameters_survive_json() -> None:
 
 
 def test_unstable_step_is_rejected_with_the_rig() -> None:
-    lab = LabConfig(sim=SimConfig(step_ms=40))
+    lab = LabConfig(sim=SimConfig(step_ms=40, substeps=1))
     with pytest.raises(InputError, match=r"rig 'rig1': the step of 40 ms would be unstable.*sim\.substeps = 2"):
         rig_parameters(lab, lab.rigs[0])
 

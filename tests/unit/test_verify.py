@@ -1,6 +1,7 @@
 """Verification: a recording is reproduced bit for bit, and each change is found at its step."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from hilrig_replay.analysis.verify import OTHER_PLATFORM_TOLERANCE, verify
 from hilrig_runtime.errors import InputError
-from hilrig_schemas import JointState
+from hilrig_schemas import JointState, TorqueCommand
 from hilrig_sim.platform_fingerprint import machine_name
 from support.recordings import TimedMessage, record, write
 from support.virtual_rig import VirtualRig, run_controller
@@ -114,6 +115,94 @@ def test_finds_a_changed_held_part(run: list[TimedMessage], tmp_path: Path) -> N
     found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
     assert found.first_diverging_step == state.step - 1
     assert found.largest_part_deviation == np.inf
+
+
+def _change_limit_flags(state: JointState) -> None:
+    state.limit_flags ^= 1
+
+
+def _change_integration_error(state: JointState) -> None:
+    state.integration_error[0] += 1e-6
+
+
+def _change_substeps(state: JointState) -> None:
+    state.substeps += 1
+
+
+def _change_external_force(state: JointState) -> None:
+    state.external_force_z += 0.5
+
+
+def _change_part_yaw(state: JointState) -> None:
+    state.parts[0].yaw += 0.01
+
+
+def _change_part_velocity(state: JointState) -> None:
+    state.parts[0].vx += 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (_change_limit_flags, "limit flags"),
+        (_change_integration_error, "integration error"),
+        (_change_substeps, "sub-steps"),
+        (_change_external_force, "external wrench"),
+        (_change_part_yaw, "parts"),
+        (_change_part_velocity, "parts"),
+    ],
+)
+def test_finds_a_change_of_each_published_field(
+    run: list[TimedMessage], tmp_path: Path, change: Callable[[JointState], None], field: str
+) -> None:
+    changed = copied(run)
+    state = next(state for state in states(changed)[300:] if state.parts)
+    change(state)
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert not found.same
+    assert set(found.differing) == {field}
+    assert found.first_diverging_step == state.step - 1
+    assert f"{field} ({found.differing[field]} state" in found.sentence()
+
+
+def test_finds_a_command_that_differs_from_its_state(run: list[TimedMessage], tmp_path: Path) -> None:
+    made = commands_of(run)
+    assert verify(write(tmp_path / "run.mcap", [*run, *made]), tolerance=0.0).same
+    made[200].message.effort[0] += 0.001
+    made[300].message.magnet ^= True
+    found = verify(write(tmp_path / "run.mcap", [*run, *made]), tolerance=0.0)
+    assert not found.same
+    assert found.differing == {"effort or magnet of the command": 2}
+    assert "differing from the recording: effort or magnet of the command (2 states)" in found.sentence()
+
+
+def commands_of(made: list[TimedMessage]) -> list[TimedMessage]:
+    """Return the commands that act at the states."""
+    commands = {}
+    for one in made:
+        state = one.message
+        if isinstance(state, JointState) and state.command_seq and not state.safe:
+            command = TorqueCommand(
+                rig=state.rig,
+                session=state.session,
+                seq=state.command_seq,
+                effort=list(state.effort),
+                magnet=state.magnet,
+            )
+            commands.setdefault(
+                (state.session, state.command_seq), TimedMessage("command", one.publish_wall_ns, command)
+            )
+    return list(commands.values())
+
+
+def test_reports_fields_that_an_old_recording_lacks(run: list[TimedMessage], tmp_path: Path) -> None:
+    old = copied(run)
+    for state in states(old):
+        state.ClearField("substeps")
+    found = verify(write(tmp_path / "run.mcap", old), tolerance=0.0)
+    assert found.same
+    assert found.not_checked == ("sub-steps",)
+    assert found.sentence().endswith("bit-identical to the recording; not in the recording, not checked: sub-steps")
 
 
 def test_default_tolerance_depends_on_the_platform(run: list[TimedMessage], tmp_path: Path) -> None:

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from hilrig_sim.arm import kinematics
-from hilrig_sim.arm.model import GRAVITY, ArmParameters, PartParameters, RigParameters, SceneParameters, TrayParameters
+from hilrig_sim.arm.model import (
+    GRAVITY,
+    ArmParameters,
+    PartParameters,
+    RigParameters,
+    SceneParameters,
+    StepParameters,
+    TrayParameters,
+)
 from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG, PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.plant.static_geometry import TABLE_ABOVE_GROUND_M
@@ -283,3 +291,63 @@ def test_rig_without_parts_and_trays_has_a_table() -> None:
     plant = Plant([RigParameters()])
     steps(plant, 60, np.zeros((4, 1)), ON)
     assert plant.tool(np.array([0]))[2, 0] == pytest.approx(TABLE, abs=1e-12)
+
+
+def thrown(step_ns: int, release_m: float, *, version: int = 2) -> tuple[Plant, np.ndarray]:
+    """Return a rig that has released a part in motion, and the velocity of the part at that time, (3,)."""
+    sim = StepParameters(step_ns=step_ns, plant_version=version)
+    item = replace(part("a", 0.5, 0.0), position=(0.5, 0.0, release_m - 0.015))
+    plant = Plant([RigParameters(sim=sim, scene=SceneParameters(parts=(item,)))])
+    start = kinematics.inverse(ARM, (0.5, 0.0, release_m, 0.0))[0]
+    plant.set_state(0, start, np.zeros(4), [(0.51, 0.0, release_m - 0.015, 0.0)], 0)
+    for _ in range(round(0.1e9 / step_ns)):
+        plant.step(np.array([[4.0], [1.0], [-8.0], [0.5]]), ON)
+    before = np.array([plant.world.x[0, 0], plant.world.y[0, 0], plant.world.z[0, 0]])
+    ahead = Plant([RigParameters(sim=StepParameters(step_ns=10_000), scene=SceneParameters(parts=(item,)))])
+    pose = (*before, float(plant.world.yaw[0, 0]))
+    ahead.set_state(0, plant.position[:, 0], plant.velocity[:, 0], [pose], 0)
+    ahead.step(np.array([[4.0], [1.0], [-8.0], [0.5]]), ON)
+    after = np.array([ahead.world.x[0, 0], ahead.world.y[0, 0], ahead.world.z[0, 0]])
+    return plant, (after - before) / 1e-5
+
+
+@pytest.mark.parametrize("step_ns", [20_000_000, 5_000_000, 1_000_000])
+def test_released_part_flies_ballistically_and_stays(step_ns: int) -> None:
+    plant, velocity = thrown(step_ns, 0.08)
+    start = np.array([plant.world.x[0, 0], plant.world.y[0, 0], plant.world.z[0, 0]])
+    assert np.hypot(*velocity[:2]) > 0.2
+    height = start[2] - 0.015 - TABLE
+    flight = (velocity[2] + np.sqrt(velocity[2] ** 2 + 2 * GRAVITY * height)) / GRAVITY
+    plant.step(hold(plant), OFF)
+    moving = np.array([values[0, 0] for values in plant.world.velocity])
+    step = step_ns * 1e-9
+    np.testing.assert_allclose(moving, velocity - (0, 0, GRAVITY * step), rtol=1e-3, atol=1e-3)
+    for _ in range(round(flight / step) + 3):
+        plant.step(hold(plant), OFF)
+    landed = np.array([plant.world.x[0, 0], plant.world.y[0, 0]])
+    np.testing.assert_allclose(landed, start[:2] + velocity[:2] * flight, atol=1e-5 + 1e-3 * flight)
+    assert plant.world.z[0, 0] == TABLE + 0.015
+    assert not any(values[0, 0] for values in plant.world.velocity)
+    assert plant.world.at_rest(0)
+
+
+def test_part_thrown_over_the_edge_falls_to_the_ground() -> None:
+    table = SceneParameters(table_size=(1.0, 1.0), parts=(part("a", 0.45, 0.0),))
+    plant = Plant([RigParameters(scene=table)])
+    plant.world.set_state(0, [(0.45, 0.0, 0.2, 0.0)], NO_PART, plant.tool(np.array([0]))[:, 0])
+    plant.world._falling[0, 0] = True
+    plant.world.falling = True
+    plant.world._drift[0, 0, 0] = 1.0
+    for _ in range(60):
+        plant.step(np.array([[0.0], [0.0], [-0.5 * GRAVITY], [0.0]]), OFF)
+    assert plant.world.z[0, 0] == pytest.approx(TABLE - TABLE_ABOVE_GROUND_M + 0.015)
+    assert plant.world.x[0, 0] > 0.7
+
+
+def test_plant_version_1_releases_parts_at_rest() -> None:
+    plant, velocity = thrown(20_000_000, 0.08, version=1)
+    start = plant.world.x[0, 0], plant.world.y[0, 0]
+    assert np.hypot(*velocity[:2]) > 0.2
+    for _ in range(20):
+        plant.step(hold(plant), OFF)
+    assert (plant.world.x[0, 0], plant.world.y[0, 0]) == start

@@ -70,8 +70,8 @@ class SimConfig(Section):
 
     step_ms: Annotated[float, Field(strict=True, ge=0.5, le=1000)] = 20.0
     """Length of a step, ms."""
-    substeps: Annotated[int, Field(strict=True, ge=1, le=100)] = 1
-    """Integration steps in one step of the loop."""
+    substeps: Annotated[int, Field(strict=True, ge=1, le=100)] | Literal["auto"] = "auto"
+    """Integration steps in one step of the loop; "auto" chooses them for each rig and step by their error estimate."""
     integrator: Literal["rkf45", "rk4", "euler"] = "rkf45"
     command_timeout_ms: NotNegative = 600.0
     """Time without a command after which the effort is set to zero; 0: never."""

@@ -1,13 +1,14 @@
+from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Mapping as _Mapping
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("rig", "session", "kind", "severity", "text", "wall_ns", "source", "step", "session_data", "controller_data", "watchdog_data", "limit_data", "part_data", "overrun_data", "configuration_data")
+    __slots__ = ("rig", "session", "kind", "severity", "text", "wall_ns", "source", "step", "session_data", "controller_data", "watchdog_data", "limit_data", "part_data", "overrun_data", "configuration_data", "integration_data")
     class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         KIND_UNSPECIFIED: _ClassVar[Event.Kind]
@@ -31,6 +32,7 @@ class Event(_message.Message):
         RECORDING: _ClassVar[Event.Kind]
         RIG_ADDED: _ClassVar[Event.Kind]
         RIG_REMOVED: _ClassVar[Event.Kind]
+        INACCURATE_STEP: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -52,6 +54,7 @@ class Event(_message.Message):
     RECORDING: Event.Kind
     RIG_ADDED: Event.Kind
     RIG_REMOVED: Event.Kind
+    INACCURATE_STEP: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]
@@ -77,6 +80,7 @@ class Event(_message.Message):
     PART_DATA_FIELD_NUMBER: _ClassVar[int]
     OVERRUN_DATA_FIELD_NUMBER: _ClassVar[int]
     CONFIGURATION_DATA_FIELD_NUMBER: _ClassVar[int]
+    INTEGRATION_DATA_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
     kind: Event.Kind
@@ -92,7 +96,8 @@ class Event(_message.Message):
     part_data: PartData
     overrun_data: OverrunData
     configuration_data: ConfigurationData
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., severity: _Optional[_Union[Event.Severity, str]] = ..., text: _Optional[str] = ..., wall_ns: _Optional[int] = ..., source: _Optional[str] = ..., step: _Optional[int] = ..., session_data: _Optional[_Union[SessionData, _Mapping]] = ..., controller_data: _Optional[_Union[ControllerData, _Mapping]] = ..., watchdog_data: _Optional[_Union[WatchdogData, _Mapping]] = ..., limit_data: _Optional[_Union[LimitData, _Mapping]] = ..., part_data: _Optional[_Union[PartData, _Mapping]] = ..., overrun_data: _Optional[_Union[OverrunData, _Mapping]] = ..., configuration_data: _Optional[_Union[ConfigurationData, _Mapping]] = ...) -> None: ...
+    integration_data: IntegrationData
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., severity: _Optional[_Union[Event.Severity, str]] = ..., text: _Optional[str] = ..., wall_ns: _Optional[int] = ..., source: _Optional[str] = ..., step: _Optional[int] = ..., session_data: _Optional[_Union[SessionData, _Mapping]] = ..., controller_data: _Optional[_Union[ControllerData, _Mapping]] = ..., watchdog_data: _Optional[_Union[WatchdogData, _Mapping]] = ..., limit_data: _Optional[_Union[LimitData, _Mapping]] = ..., part_data: _Optional[_Union[PartData, _Mapping]] = ..., overrun_data: _Optional[_Union[OverrunData, _Mapping]] = ..., configuration_data: _Optional[_Union[ConfigurationData, _Mapping]] = ..., integration_data: _Optional[_Union[IntegrationData, _Mapping]] = ...) -> None: ...
 
 class SessionData(_message.Message):
     __slots__ = ("reason", "controller")
@@ -159,3 +164,11 @@ class ConfigurationData(_message.Message):
     TEXT_FIELD_NUMBER: _ClassVar[int]
     text: str
     def __init__(self, text: _Optional[str] = ...) -> None: ...
+
+class IntegrationData(_message.Message):
+    __slots__ = ("error", "steps")
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    error: _containers.RepeatedScalarFieldContainer[float]
+    steps: int
+    def __init__(self, error: _Optional[_Iterable[float]] = ..., steps: _Optional[int] = ...) -> None: ...

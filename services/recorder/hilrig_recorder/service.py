@@ -136,7 +136,7 @@ class Recorder:
 
     def _restore(self, unfinished: list[Path]) -> None:
         for path in unfinished:
-            with contextlib.suppress(HilrigError, ValueError):
+            with contextlib.suppress(HilrigError, ValueError, KeyError):
                 session = read_session_metadata(path)
                 if session.get("keeper") == self._service.source:
                     start_wall_ns = int(session["start_wall_ns"])

@@ -27,16 +27,17 @@ class StepTimes:
     def __init__(self, capacity: int = 8192) -> None:
         self._times_ns = [0] * capacity
         self._capacity = capacity
-        self._step = 0
+        self.step = 0
+        """The last step."""
 
     def add(self, step: int, sampled_ns: int) -> None:
         """Add the sampling time of the next step."""
         self._times_ns[step % self._capacity] = sampled_ns
-        self._step = step
+        self.step = step
 
     def get(self, step: int) -> int | None:
         """Return the sampling time of a step, ns; None: it is too old, or has not been sampled."""
-        if 0 < step <= self._step and self._step - step < self._capacity:
+        if 0 < step <= self.step and self.step - step < self._capacity:
             return self._times_ns[step % self._capacity]
         return None
 

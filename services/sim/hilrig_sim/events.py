@@ -1,16 +1,23 @@
-"""Events of the simulation: joint limits, parts, lost commands, resets, divergence and overruns."""
+"""Events of the simulation: joint limits, parts, lost commands, resets, accuracy, divergence and overruns."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hilrig_runtime.timing.rate import Tick
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
-from hilrig_schemas.v1.event_pb2 import LimitData, OverrunData, PartData, WatchdogData
+from hilrig_schemas.v1.event_pb2 import IntegrationData, LimitData, OverrunData, PartData, WatchdogData
+from hilrig_sim.arm.joints import JOINT_SCALE
+from hilrig_sim.arm.stability import ERROR_BOUND
 from hilrig_sim.commands import CommandLatch
 from hilrig_sim.plant.limits import PlantEvent, PlantEventKind
 from hilrig_sim.plant.plant import Plant
+
+Floats = NDArray[np.float64]
 
 LIMIT_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events of one limit of a rig, ns: a joint may chatter at its stop."""
@@ -18,6 +25,10 @@ MAX_LIMITS: Final = 4096
 """Number of limits whose events are rate-limited; a rig has 9."""
 OVERRUN_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two overrun events, ns."""
+ACCURACY_EVENT_PERIOD_NS: Final = 1_000_000_000
+"""Shortest time between two events of one rig that its steps are inaccurate, ns."""
+MAX_RIGS: Final = 4096
+"""Number of rigs whose accuracy events are rate-limited."""
 
 
 class SimulationEvents:
@@ -29,6 +40,9 @@ class SimulationEvents:
         self._plant = plant
         self._limits: RateLimiter[tuple[str, int, bool]] = RateLimiter(LIMIT_EVENT_PERIOD_NS, MAX_LIMITS)
         self._overruns: RateLimiter[None] = RateLimiter(OVERRUN_EVENT_PERIOD_NS)
+        self._inaccurate: RateLimiter[str] = RateLimiter(ACCURACY_EVENT_PERIOD_NS, MAX_RIGS)
+        self._errors: dict[str, Floats] = {}
+        """Largest error estimate of each joint since the last event, by rig."""
         self.overran = False
         """Whether there are overruns that were not reported yet."""
         self._overrun_step = 0
@@ -80,6 +94,25 @@ class SimulationEvents:
         event = Event(
             kind=Event.RESET, severity=Event.ERROR, text=text, rig=self._rigs[rig], session=session, step=step
         )
+        self._emit(event)
+
+    def report_inaccurate(self, rig: int, error: Floats, session: str, step: int, now_ns: int) -> None:
+        """Emit that the error estimate of a step exceeds its bound, rate-limited; `step` is the one after it."""
+        name = self._rigs[rig]
+        worst = self._errors[name] = np.maximum(self._errors.get(name, error), error)
+        count = self._inaccurate.record(name, now_ns)
+        if not count:
+            return
+        del self._errors[name]
+        joint = int(np.argmax(worst / ERROR_BOUND))
+        size = f"{worst[joint] * JOINT_SCALE[joint]:.3g} {'mm' if joint == 2 else '°'}"
+        text = (
+            f"inaccurate step: the estimated error of joint {joint + 1} is {size}; use less torque, a shorter "
+            f'sim.step_ms or sim.substeps = "auto"{repeat_suffix(count)}'
+        )
+        data = IntegrationData(error=worst.tolist(), steps=count)
+        event = Event(kind=Event.INACCURATE_STEP, severity=Event.WARNING, text=text, integration_data=data)
+        event.rig, event.session, event.step = name, session, step
         self._emit(event)
 
     def record_overrun(self, tick: Tick, step: int, step_ns: int, now_ns: int) -> None:

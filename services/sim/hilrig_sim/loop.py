@@ -14,6 +14,7 @@ from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import JointState, RigReport, topics
 from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.stability import ERROR_BOUND
 from hilrig_sim.commands import CommandLatch, StepTimes
 from hilrig_sim.events import SimulationEvents
 from hilrig_sim.plant.plant import Plant
@@ -101,14 +102,16 @@ class Simulation:
         latencies_ns = {basis: sampled_ns - (times.get(basis) or sampled_ns) for basis in {r.basis_step for r in rigs}}
         ends = {basis: encode_loop_latency(latency_ns) for basis, latency_ns in latencies_ns.items()}
         self._states.publish([common + rig.encoded + ends[rig.basis_step] for rig in rigs])
+        for rig, latch in zip(rigs, latches, strict=True):
+            rig.on_published(step, latencies_ns[rig.basis_step], latch.changed)
         self._apply_commands()
-        for rig in rigs:
-            rig.on_published(latencies_ns[rig.basis_step])
         events = plant.step(self._effort, self._magnet)
         if events:
             self._events.report_plant_events(events, step + 1, sampled_ns, [latch.session for latch in latches])
         if not isfinite(plant.velocity.sum()):
             self._reset_diverged(step + 1)
+        if plant.is_inaccurate():
+            self._report_inaccurate(step + 1, sampled_ns)
         self._update_motion()
         self._counters.count_tick(tick, self._step_ns)
         if overrun:
@@ -177,7 +180,7 @@ class Simulation:
         self._update_motion()
 
     def _rig_reports(self) -> list[RigReport]:
-        return [rig.report(latch.safe) for rig, latch in zip(self._rigs, self._latches, strict=True)]
+        return [rig.report(latch.safe, self._times) for rig, latch in zip(self._rigs, self._latches, strict=True)]
 
     def _reset_diverged(self, step: int) -> None:
         """Reset the rigs whose state is not finite any more, because the motion was too fast for the step."""
@@ -185,6 +188,14 @@ class Simulation:
             if not np.isfinite(self._plant.velocity[:, index]).all():
                 self._plant.reset(index)
                 self._events.report_divergence(index, latch.session, step)
+
+    def _report_inaccurate(self, step: int, now_ns: int) -> None:
+        """Count and report the rigs whose error estimate of the last step exceeds its bound."""
+        error = np.abs(self._plant.error)
+        for index in np.flatnonzero((error > np.array(ERROR_BOUND)[:, np.newaxis]).any(axis=0)).tolist():
+            self._counters.inaccurate_steps += 1
+            session = self._latches[index].session
+            self._events.report_inaccurate(index, error[:, index], session, step, now_ns)
 
     def _warm_up(self) -> None:
         """Compute a few steps in advance, because the first ones are slow, and reset the rigs."""

@@ -18,7 +18,7 @@ from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, RigConfig, topics
-from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.model import RigParameters, describe_substeps
 from hilrig_sim.arm.urdf import urdf
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
@@ -71,7 +71,7 @@ class RigRegistry:
         """Emit that a simulation starts, with its step: an open session then records that it was replaced."""
         sim = parameters.sim
         event = Event(kind=Event.CONFIGURATION, severity=Event.INFO, rig=rig)
-        steps = f", {sim.substeps} sub-steps" if sim.substeps > 1 else ""
+        steps = "" if sim.substeps == 1 else f", {describe_substeps(sim.substeps)}"
         event.text = f"simulation started: step {sim.step * 1e3:g} ms, {sim.integrator}{steps}"
         event.configuration_data.text = json.dumps(asdict(sim))
         self._service.emit(event)

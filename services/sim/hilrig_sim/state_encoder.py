@@ -33,17 +33,27 @@ def _vector_head(field: str) -> bytes:
 
 
 _VECTORS: Final = ("position", "velocity", "integration_error")
-_MOTION: Final = np.dtype([item for name in _VECTORS for item in ((f"{name} head", "V2"), (name, "<f8", _JOINTS))])
+_SUBSTEPS_HEAD: Final = JointState(substeps=1).SerializeToString()[:-1]
+_MOTION: Final = np.dtype(
+    [
+        *(item for name in _VECTORS for item in ((f"{name} head", "V2"), (name, "<f8", _JOINTS))),
+        ("substeps head", f"V{len(_SUBSTEPS_HEAD)}"),
+        # A protobuf number below 128 is one byte.
+        ("substeps", "u1"),
+    ]
+)
 _EFFORT: Final = struct.Struct(f"<2s{_JOINTS}d")
 _EFFORT_HEAD: Final = _vector_head("effort")
 
 
 def encode_motion(plant: Plant) -> list[bytes]:
-    """Encode position, velocity and integration error of each rig as fields of a `JointState`."""
+    """Encode position, velocity, integration error and sub-steps of each rig as fields of a `JointState`."""
     rows = np.empty(plant.count, _MOTION)
     for name, values in zip(_VECTORS, (plant.position, plant.velocity, plant.error), strict=True):
         rows[f"{name} head"] = np.void(_vector_head(name))
         rows[name] = values.T
+    rows["substeps head"] = np.void(_SUBSTEPS_HEAD)
+    rows["substeps"] = plant.substeps
     encoded, size = rows.tobytes(), _MOTION.itemsize
     return [encoded[start : start + size] for start in range(0, len(encoded), size)]
 
@@ -71,7 +81,11 @@ class RigStateEncoder:
         """Values that `_slow_fields` was encoded from."""
         self._slow_fields = b""
         self._command_fields = JointState()
-        self._loops_us: list[int] = []
+        self._effects: list[tuple[int, int]] = []
+        """Steps since the last report at which the command changed, and its loop latency, ns; 0: it has no basis."""
+        self._basis_ns = 0
+        """Tick of the basis of the command that acted at the last report; 0: none."""
+        self._reported_step = 0
         self._parts_due_ns = 0
         self._parts_encoded_ns = 0
         """Tick whose encoded state has the parts, ns; 0: the encoded state has none."""
@@ -114,18 +128,38 @@ class RigStateEncoder:
             )
         )
 
-    def on_published(self, latency_ns: int) -> None:
-        """Record that the state was published; `latency_ns`: its loop latency, 0: none."""
+    def on_published(self, step: int, latency_ns: int, changed: bool) -> None:
+        """Record that the state of a step was published.
+
+        Args:
+            step: the step.
+            latency_ns: loop latency of the new command; 0: no new command, or it has no basis.
+            changed: whether the effort is that of another command, or is zero because the commands timed out.
+        """
         if self._parts_encoded_ns:
             # Not in `encode`: the state may have been encoded several times before the tick.
             self._parts_due_ns = self._parts_encoded_ns + ALL_PARTS_PERIOD_NS
-        if latency_ns:
-            self._loops_us.append(latency_ns // 1000)
+        if changed or latency_ns:
+            self._effects.append((step, latency_ns))
 
-    def report(self, safe: bool) -> RigReport:
+    def report(self, safe: bool, times: StepTimes) -> RigReport:
         """Return the report on the rig since the last report; `safe`: its commands have timed out."""
-        loops_us, self._loops_us = self._loops_us, []
-        return RigReport(rig=self.name, loop_us=loops_us, safe=safe)
+        effects, self._effects = self._effects, []
+        report = RigReport(rig=self.name, safe=safe, loop_us=[latency // 1000 for _, latency in effects if latency])
+        step = self._reported_step + 1
+        for following, latency_ns in effects:
+            self._add_ages(report, times, step, following)
+            self._basis_ns = (times.get(following) or 0) - latency_ns if latency_ns else 0
+            step = following
+        self._add_ages(report, times, step, times.step + 1)
+        self._reported_step = times.step
+        return report
+
+    def _add_ages(self, report: RigReport, times: StepTimes, begin: int, end: int) -> None:
+        """Add the ages of the acting command's basis at the steps from `begin` to before `end`."""
+        if self._basis_ns > 0:
+            sampled = (times.get(step) for step in range(begin, end))
+            report.age_us.extend([(at_ns - self._basis_ns) // 1000 for at_ns in sampled if at_ns is not None])
 
     def _encode_slow_fields(self, command: CommandLatch) -> bytes:
         """Encode the fields that rarely change."""
@@ -148,15 +182,12 @@ class RigStateEncoder:
         A new message each time: a reused one would keep the memory of every part that was ever added.
         """
         world, index = self._world, self.index
-        poses = zip(
-            self._part_names,
-            world.x[:, index].tolist(),
-            world.y[:, index].tolist(),
-            world.z[:, index].tolist(),
-            world.yaw[:, index].tolist(),
-            strict=False,
-        )
+        columns = (world.x, world.y, world.z, world.yaw, *world.velocity)
+        motions = zip(self._part_names, *(column[:, index].tolist() for column in columns), strict=False)
         held = int(world.held[index])
         self._held_part = self._part_names[held] if held != NO_PART else ""
-        parts = [PartState(name=name, x=x, y=y, z=z, yaw=yaw) for name, x, y, z, yaw in poses]
+        parts = [
+            PartState(name=name, x=x, y=y, z=z, yaw=yaw, vx=vx, vy=vy, vz=vz)
+            for name, x, y, z, yaw, vx, vy, vz in motions
+        ]
         return JointState(parts=parts).SerializeToString()

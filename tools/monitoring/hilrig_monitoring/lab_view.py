@@ -1,7 +1,7 @@
 """Status of a lab, combined from health reports: the data of `hilrig top`, `hilrig metrics` and `hilrig console`.
 
-Each service reports once a second: the simulation reports the loop latencies of each rig, the edge its lease holder,
-the recorder the rigs that it records. No I/O: reports and time are passed in.
+Each service reports once a second: the simulation reports the loop latencies and ages of each rig, the edge its lease
+holder, the recorder the rigs that it records. No I/O: reports and time are passed in.
 """
 
 from collections import deque
@@ -11,7 +11,7 @@ from typing import Any, Final
 from hilrig_schemas import Health
 
 WINDOW_S: Final = 10.0
-"""Window of the loop latency percentiles."""
+"""Window of the percentiles of loop latency and age."""
 SILENT_AFTER_S: Final = 3.5
 """Time without a report after which a service is shown as silent and its rig reports are discarded."""
 REMOVED_AFTER_S: Final = 600.0
@@ -54,11 +54,16 @@ class RigStatus:
     """Ticks of the simulation that began more than a step late, since its start."""
     loops_us: list[int] = field(default_factory=list)
     """Loop latencies within the window, µs, sorted."""
+    ages_us: list[int] = field(default_factory=list)
+    """Ages of the acting command's basis at each step within the window, µs, sorted; empty without a lease holder."""
 
     def loop_ms(self, share: float) -> float | None:
         """A percentile of the loop latency, ms; None: no command took effect within the window."""
-        loops = self.loops_us
-        return loops[round(share * (len(loops) - 1))] / 1e3 if loops else None
+        return _percentile_ms(self.loops_us, share)
+
+    def age_ms(self, share: float) -> float | None:
+        """A percentile of the age, ms; None: no command with a basis acted within the window, or the rig is free."""
+        return _percentile_ms(self.ages_us, share)
 
     @property
     def state(self) -> str:
@@ -74,13 +79,18 @@ class RigStatus:
         return "no command" if self.safe else "in use"
 
 
+def _percentile_ms(values_us: list[int], share: float) -> float | None:
+    return values_us[round(share * (len(values_us) - 1))] / 1e3 if values_us else None
+
+
 class LabView:
     """Status of a lab, updated by health reports."""
 
     def __init__(self, rigs: tuple[str, ...] = ()) -> None:
         self._rigs = rigs
         self._services: dict[str, ServiceStatus] = {}
-        self._loops: dict[str, deque[tuple[float, tuple[int, ...]]]] = {}
+        self._loops: dict[str, deque[tuple[float, tuple[int, ...], tuple[int, ...]]]] = {}
+        """By rig: times of the reports within the window, with loop latencies and ages, µs."""
 
     def update(self, health: Health, now_s: float) -> None:
         """Update the status with a report that arrived at `now_s`."""
@@ -93,8 +103,9 @@ class LabView:
             status.cpu_share = cpu_ns / elapsed_ns if elapsed_ns > 0 else before.cpu_share
         self._services[status.name] = status
         for report in health.rig_reports:
-            if report.loop_us:
-                self._loops.setdefault(report.rig, deque()).append((now_s, tuple(report.loop_us)))
+            if report.loop_us or report.age_us:
+                timing = (now_s, tuple(report.loop_us), tuple(report.age_us))
+                self._loops.setdefault(report.rig, deque()).append(timing)
 
     def _evict(self, now_s: float) -> None:
         for name in [name for name, one in self._services.items() if now_s - one.reported_s > REMOVED_AFTER_S]:
@@ -132,7 +143,9 @@ class LabView:
             while loops and now_s - loops[0][0] > WINDOW_S:
                 loops.popleft()
             if rig in found:
-                found[rig].loops_us = sorted(value for _, values in loops for value in values)
+                found[rig].loops_us = sorted(value for _, values, _ in loops for value in values)
+                if found[rig].controller:
+                    found[rig].ages_us = sorted(value for _, _, values in loops for value in values)
         return list(found.values())
 
     def alerts(self, now_s: float) -> list[str]:
@@ -198,6 +211,8 @@ def _rig_row(rig: RigStatus) -> dict[str, Any]:
         "loop_p50_ms": rig.loop_ms(0.5),
         "loop_p99_ms": rig.loop_ms(0.99),
         "loop_samples": len(rig.loops_us),
+        "age_p50_ms": rig.age_ms(0.5),
+        "age_p99_ms": rig.age_ms(0.99),
         "lateness_p99_ms": rig.lateness_p99_ns / 1e6,
         "overruns": rig.overruns,
     }

@@ -5,7 +5,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
-from hilrig_monitoring.lab_view import LabView, ServiceStatus
+from hilrig_monitoring.lab_view import LabView, RigStatus, ServiceStatus
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
@@ -16,6 +16,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("ticks_total", "counter", "Ticks of the service's loop.", "ticks", 1),
     ("overruns_total", "counter", "Ticks that began more than a period late.", "overruns", 1),
     ("missed_steps_total", "counter", "Steps skipped because of overruns.", "missed_steps", 1),
+    ("inaccurate_steps_total", "counter", "Steps of a rig with a too large error estimate.", "inaccurate_steps", 1),
     ("lateness_p50_seconds", "gauge", "Tick lateness in the last second, p50.", "lateness_p50_ns", 1e-9),
     ("lateness_p99_seconds", "gauge", "Tick lateness in the last second, p99.", "lateness_p99_ns", 1e-9),
     ("lateness_max_seconds", "gauge", "Tick lateness in the last second, maximum.", "lateness_max_ns", 1e-9),
@@ -63,13 +64,16 @@ def _lines(view: LabView, lab: str, now_s: float) -> Iterator[str]:
     yield from of_rigs("rig_watchdog_tripped", "Whether the watchdog tripped.", [rig.watchdog_tripped for rig in rigs])
     yield from of_rigs("rig_served", "Whether an edge serves the rig.", [rig.served for rig in rigs])
     yield from of_rigs("rig_simulated", "Whether a simulation steps the rig.", [rig.simulated for rig in rigs])
-    quantiles = (
-        (_labels(lab=lab, rig=rig.rig, quantile=f"{share:g}"), value / 1e3)
-        for rig in rigs
-        for share in (0.5, 0.99)
-        if (value := rig.loop_ms(share)) is not None
-    )
-    yield from _family("rig_loop_seconds", "gauge", "Loop latency in the last 10 s.", quantiles)
+
+    def quantiles(percentile_ms: Callable[[RigStatus, float], float | None]) -> Iterator[tuple[str, float]]:
+        for rig in rigs:
+            for share in (0.5, 0.99):
+                if (value := percentile_ms(rig, share)) is not None:
+                    yield _labels(lab=lab, rig=rig.rig, quantile=f"{share:g}"), value / 1e3
+
+    yield from _family("rig_loop_seconds", "gauge", "Loop latency in the last 10 s.", quantiles(RigStatus.loop_ms))
+    text = "Age of the acting command's basis at each step in the last 10 s."
+    yield from _family("rig_age_seconds", "gauge", text, quantiles(RigStatus.age_ms))
 
 
 def _family(name: str, kind: str, text: str, values: Iterable[tuple[str, float]]) -> Iterator[str]:

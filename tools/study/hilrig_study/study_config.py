@@ -265,10 +265,9 @@ class StudyConfig(Section):
     def lab(self, step_ms: float | None = None) -> LabConfig:
         """Return a lab with one rig, the task's start position and an empty scene."""
         step = step_ms or self.loop.step_ms
-        substeps = max(1, math.ceil(step / 20.0))
         start = tuple(p + o for p, o in zip(self.task.pose, self.task.offset, strict=True))
         arm = validate(ArmConfig, {**self.arm.model_dump(), "start_position": start})
-        sim = validate(SimConfig, {"step_ms": step, "substeps": substeps})
+        sim = validate(SimConfig, {"step_ms": step})
         return LabConfig(name="study", sim=sim, rigs=(RigSettings(arm=arm, scene=SceneConfig(trays=(), parts=())),))
 
     def link_impairments(self, controller: int) -> LinkImpairments:
@@ -287,11 +286,9 @@ class StudyConfig(Section):
     def discretized_plant(self, step_ms: float) -> tuple[Floats, Floats]:
         """Return Φ, (8, 8), and Γ, (8, 4), of the linear model, discretized as the study steps its plant.
 
-        The method is the simulation's integrator for the nonlinear arm, and exact for the linear model.
+        Automatic sub-steps resolve the modes of the arm, so the exact discretization describes them.
         """
-        sim = self.rig(step_ms).sim
-        method = (sim.integrator, sim.substeps) if self.plant == "arm" else ()
-        return self.linear_plant().discretize(sim.step_ns * 1e-9, *method)
+        return self.linear_plant().discretize(self.rig(step_ms).sim.step)
 
 
 def load_study(path: Path) -> StudyConfig:

@@ -1,9 +1,12 @@
 """File system helpers: mapped files, advisory file locks and durable renames."""
 
+import errno
 import mmap
 import os
+import stat
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 from hilrig_runtime.errors import InputError
 
@@ -42,6 +45,27 @@ def lock_file(descriptor: int) -> bool:
     return True
 
 
+def open_file(path: Path, *, is_writable: bool = False) -> BinaryIO:
+    """Open a regular file for reading, or for reading and writing.
+
+    Opening a FIFO or a device could wait forever.
+
+    Raises:
+        OSError: the file can't be opened, or is not a regular file.
+    """
+    descriptor = os.open(path, (os.O_RDWR if is_writable else os.O_RDONLY) | getattr(os, "O_NONBLOCK", 0))
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "expected a regular file, found a FIFO, device or socket", str(path))
+        return os.fdopen(descriptor, "r+b" if is_writable else "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
 def map_file(path: Path) -> memoryview:
     """Map a file into memory.
 
@@ -49,8 +73,8 @@ def map_file(path: Path) -> memoryview:
         InputError: the file can't be read.
     """
     try:
-        with path.open("rb") as file:
-            if path.stat().st_size == 0:
+        with open_file(path) as file:
+            if os.fstat(file.fileno()).st_size == 0:
                 return memoryview(b"")
             return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:

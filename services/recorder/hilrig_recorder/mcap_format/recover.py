@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
 
 from hilrig_recorder.mcap_format.file_names import recovering_path
-from hilrig_recorder.mcap_format.fsutil import lock_file, map_file
+from hilrig_recorder.mcap_format.fsutil import lock_file, map_file, open_file
 from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.records import (
@@ -181,7 +181,7 @@ def _check_interrupt(should_continue: Callable[[], bool], source: Path) -> None:
 def _locked(source: Path) -> Iterator[None]:
     """Lock a file against other processes that write or recover it."""
     try:
-        file = source.open("r+b")
+        file = open_file(source, is_writable=True)
     except PermissionError:
         # Without write permission the file can still be read, and no recorder of this user writes it.
         yield

@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 def find_unfinished(folder: Path) -> list[Path]:
     """The unfinished recordings of earlier recorders in the folder of a lab."""
-    return sorted(folder.glob(f"*/*{UNFINISHED_SUFFIX}"))
+    return sorted(path for path in folder.glob(f"*/*{UNFINISHED_SUFFIX}") if path.is_file())
 
 
 class MaintenanceWorker:
@@ -104,6 +104,10 @@ class MaintenanceWorker:
         except (HilrigError, OSError) as error:
             if not self._stopping.is_set():
                 self._on_error(str(error))
+        except Exception as error:
+            # One file must not prevent the recovery of the others and the deletion of expired recordings.
+            logger.exception("%s", source)
+            self._on_error(f"{source}: can't be recovered: {type(error).__name__}: {error}")
 
     def _delete_expired(self) -> None:
         days, gib = self._config.keep_days, self._config.keep_gib

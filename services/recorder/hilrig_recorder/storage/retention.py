@@ -1,5 +1,6 @@
 """Retention policy: selects the recordings to delete by age and total size."""
 
+import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,8 @@ def finished_recordings(folder: Path) -> list[StoredRecording]:
             info = path.stat()
         except OSError:
             # Deleted since it was listed.
+            continue
+        if not stat.S_ISREG(info.st_mode):
             continue
         found.append(StoredRecording(path, path.parent.name, info.st_size, info.st_mtime))
     return found

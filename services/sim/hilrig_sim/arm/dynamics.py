@@ -26,6 +26,7 @@ from hilrig_sim.arm.model import GRAVITY, ArmParameters
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 STAGE_ROWS: Final = 5
 """Number of quantities that the right-hand side depends on: four joint velocities and θ2."""
@@ -118,6 +119,17 @@ class ReducedDynamics:
         model.set_payload(np.array([payload]))
         return model
 
+    def select(self, source: "ReducedDynamics", rigs: Ints) -> None:
+        """Take the quantities of the equations of motion from rigs of another model, (N,); no joint is held."""
+        np.take(source.friction, rigs, 1, self.friction, "clip")
+        np.take(source._coupling_twice, rigs, 1, self._coupling_twice, "clip")
+        np.take(source.inertia, rigs, 1, self.inertia, "clip")
+        np.take(source._free.product, rigs, 0, self._free.product, "clip")
+        np.take(source._inverse34, rigs, 1, self._inverse34, "clip")
+        np.take(source._offset, rigs, 1, self._offset, "clip")
+        self._held_key = b""
+        self.release()
+
     def set_payload(self, payload: Floats) -> None:
         """Set the mass of the held parts, m4 = `payload`, kg, (N,)."""
         mass = self.m2 + self.m3 + payload
@@ -168,6 +180,12 @@ class ReducedDynamics:
     def drive(self, effort: Floats, out: Floats) -> None:
         """Compute the forces and torques that do not depend on the motion, (4, N), from the efforts, (4, N)."""
         np.add(effort, self._offset, out=out)
+
+    def linear_coefficients(self, joint: Ints, rig: Ints, effort: Floats) -> tuple[Floats, Floats]:
+        """Return c and r of q̈ = c - r q̇ for joints 3 and 4, `joint` 0 and 1, of rigs, (K,) each, (32)."""
+        inverse, row = self._inverse34[joint, rig], joint + 2
+        force = effort[row, rig] + self._offset[row, rig]
+        return force * inverse, self.friction[row, rig] * inverse
 
     def rates(
         self,

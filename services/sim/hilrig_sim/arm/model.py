@@ -9,7 +9,7 @@ import json
 import math
 import reprlib
 from dataclasses import dataclass
-from typing import Any, Final, Self, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 from hilrig_runtime.config.lab import ArmConfig, SimConfig
 from hilrig_runtime.config.scene import SceneConfig
@@ -26,6 +26,11 @@ LARGEST_NUMBER: Final = 1e10
 """Largest magnitude of a number in recorded parameters; a step of 10 s has 10¹⁰ ns."""
 MAX_JSON_CHARACTERS: Final = 1 << 20
 """Longest recorded parameters; those of 64 parts have 20,000 characters."""
+
+PLANT_VERSION: Final = 2
+"""Current rules of the plant; a recording is verified with its own."""
+AUTO: Final = "auto"
+"""Value of `StepParameters.substeps`: the number of integration steps is chosen for each rig and step."""
 
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -156,8 +161,11 @@ class StepParameters:
     """Step length and integration method."""
 
     step_ns: int = _SIM.step_ns
-    substeps: int = _SIM.substeps
+    substeps: int | Literal["auto"] = _SIM.substeps
+    """Integration steps of a step of the loop: a fixed number, or `AUTO`."""
     integrator: str = _SIM.integrator
+    plant_version: int = PLANT_VERSION
+    """Rules of the plant: 1, of recordings without this number: released parts fall from rest."""
 
     def __post_init__(self) -> None:
         known = get_args(SimConfig.model_fields["integrator"].annotation)
@@ -168,6 +176,11 @@ class StepParameters:
     def step(self) -> float:
         """Length of a step of the loop, s."""
         return self.step_ns * 1e-9
+
+
+def describe_substeps(substeps: int | Literal["auto"]) -> str:
+    """Return a number of integration steps as human-readable text."""
+    return "automatic sub-steps" if substeps == AUTO else f"{substeps} sub-steps"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +218,8 @@ class RigParameters:
             fields = json.loads(text)
             if not isinstance(fields, dict) or fields.keys() != {"arm", "sim", "scene"}:
                 raise ValueError("expected an object with the keys arm, sim, scene")
+            if isinstance(fields["sim"], dict):
+                fields["sim"].setdefault("plant_version", 1)
             found: Self = _decode(cls, fields, "parameters")
             return found
         except (ValueError, TypeError, RecursionError) as error:
@@ -227,6 +242,11 @@ def _decode(kind: Any, value: Any, place: str) -> Any:
         if not isinstance(value, list) or len(value) != len(kinds):
             raise ValueError(f"{place} must be a list of {len(kinds)} items, got {_shown(value)}")
         return tuple(_decode(one, item, place) for one, item in zip(kinds, value, strict=True))
+    if get_origin(kind) is Union:
+        # A number, or one of a few words.
+        kind, words = get_args(kind)
+        if value in get_args(words):
+            return value
     numeric = isinstance(value, int | float) and not isinstance(value, bool)
     if kind is float and not (numeric and abs(value) <= LARGEST_NUMBER):
         raise ValueError(f"{place} must be a number up to {LARGEST_NUMBER:g}, got {_shown(value)}")

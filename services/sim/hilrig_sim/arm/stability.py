@@ -12,10 +12,19 @@ import numpy as np
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import ArmParameters, RigParameters
+from hilrig_sim.arm.model import AUTO, ArmParameters, RigParameters, StepParameters
 
 STABILITY_MARGIN: Final = 0.2
 """Required safety margin, as a fraction of the limit."""
+
+RESOLVED_DECAY: Final = 1.3
+"""Largest λh with which `rkf45` resolves a decaying mode: the error of its speed is below 0.5 % of its amplitude."""
+MAX_SUBSTEPS: Final = 64
+"""Largest number of integration steps of a rig in a step of the loop, if it is chosen automatically."""
+ERROR_BOUND: Final = (math.radians(0.1), math.radians(0.1), 0.1e-3, math.radians(0.1))
+"""Error estimate of a step above which it is reported as inaccurate: 0.1° or 0.1 mm; rad, rad, m, rad."""
+MOST_FIXED_SUBSTEPS: Final = 100
+"""Largest fixed number, as in the configuration."""
 
 
 def fastest_mode(arm: ArmParameters, theta2: float | None = None, payload: float = 0.0) -> float:
@@ -37,19 +46,50 @@ def largest_safe_step(arm: ArmParameters, integrator: str) -> float:
     return math.inf if rate == 0 else (1 - STABILITY_MARGIN) * TABLEAUS[integrator].negative_real_limit() / rate
 
 
+def base_substeps(arm: ArmParameters, sim: StepParameters) -> int:
+    """Return the number of integration steps that resolve the fastest mode of the arm in a step of the loop."""
+    return max(1, math.ceil(fastest_mode(arm) * sim.step / RESOLVED_DECAY - 1e-9))
+
+
 def check_stable(parameters: RigParameters) -> None:
     """Check that the step is short enough for the arm.
 
     Raises:
-        InputError: the margin is violated; the message has the largest safe step and a sufficient number of sub-steps.
+        InputError: it is not; the message has the remedy.
     """
-    sim = parameters.sim
-    safe = largest_safe_step(parameters.arm, sim.integrator)
+    sim, arm = parameters.sim, parameters.arm
+    mode = f"the arm's fastest mode is {fastest_mode(arm):.1f} 1/s"
+    if sim.substeps == AUTO:
+        if TABLEAUS[sim.integrator].embedded is None:
+            raise InputError(
+                f'sim.substeps = "auto" needs an integrator with an error estimate (rkf45), and {sim.integrator} has '
+                f"none; set a number of sub-steps"
+            )
+        needed = base_substeps(arm, sim)
+        if needed > MAX_SUBSTEPS:
+            longest = sim.step * MAX_SUBSTEPS / needed
+            raise InputError(
+                f"the step of {sim.step * 1e3:g} ms is too long for this arm: {mode}, which needs {needed} sub-steps "
+                f"(at most {MAX_SUBSTEPS}); set sim.step_ms to {_milliseconds(longest)} or less, or a heavier arm or "
+                f"less friction"
+            )
+        return
+    safe = largest_safe_step(arm, sim.integrator)
     step = sim.step / sim.substeps
     if step > safe:
         each = f" in {sim.substeps} sub-steps" if sim.substeps > 1 else ""
+        needed = math.ceil(sim.step / safe)
+        more = f"set sim.substeps = {needed} or a shorter sim.step_ms"
+        if needed > MOST_FIXED_SUBSTEPS:
+            shorter = _milliseconds(MOST_FIXED_SUBSTEPS * safe)
+            more = f"set sim.step_ms to {shorter} or less with sim.substeps = {MOST_FIXED_SUBSTEPS}"
         raise InputError(
-            f"the step of {sim.step * 1e3:g} ms{each} would be unstable with {sim.integrator}: the arm's fastest mode "
-            f"is {fastest_mode(parameters.arm):.1f} 1/s, so the largest safe step is {safe * 1e3:.1f} ms "
-            f"({STABILITY_MARGIN:.0%} margin); set sim.substeps = {math.ceil(sim.step / safe)} or a shorter sim.step_ms"
+            f"the step of {sim.step * 1e3:g} ms{each} would be unstable with {sim.integrator}: {mode}, so the largest "
+            f"safe step is {_milliseconds(safe)} ms ({STABILITY_MARGIN:.0%} margin); {more}"
         )
+
+
+def _milliseconds(time_s: float) -> str:
+    """Return a time in ms with three digits, rounded down."""
+    digits = 2 - math.floor(math.log10(time_s * 1e3))
+    return f"{math.floor(time_s * 1e3 * 10**digits) / 10**digits:g}"

@@ -61,8 +61,8 @@ class FixedStep:
 
     def __init__(self, dynamics: ReducedDynamics, tableau: Tableau, length: float | Floats) -> None:
         count, stages = dynamics.count, tableau.stages
-        self._dynamics = dynamics
-        lengths = np.asarray(length, dtype=np.float64).reshape(1, -1)
+        self.dynamics = dynamics
+        lengths = np.asarray(length, dtype=np.float64)
         # Slot 0 is the state at the start of the step, slot i the rates of stage i.
         self._slots = np.zeros((1 + stages, STAGE_ROWS, count))
         self._states = np.zeros((stages, STAGE_ROWS, count))
@@ -74,10 +74,11 @@ class FixedStep:
         self._result = np.empty((STAGE_ROWS, count))
         self._result4 = self._result[:4]
 
-        one, scaled = _packed(tableau)
-        table = one + scaled * lengths
-        if count <= MAX_RIGS_WITH_OWN_WEIGHTS:
-            table = np.broadcast_to(table, (len(table), STAGE_ROWS, count)).copy()
+        self._one, self._scaled = _packed(tableau)
+        rows = STAGE_ROWS if count <= MAX_RIGS_WITH_OWN_WEIGHTS else 1
+        columns = count if count <= MAX_RIGS_WITH_OWN_WEIGHTS else lengths.size
+        self._table = table = np.empty((len(self._one), rows, columns))
+        self.set_length(length)
         used = 0
 
         def terms(number: int, values: Floats) -> _Sum:
@@ -92,13 +93,17 @@ class FixedStep:
         self._quadrature = terms(stages, self._states)
         self._error = terms(stages, self._states) if tableau.embedded else None
 
+    def set_length(self, length: float | Floats) -> None:
+        """Change the length of the step, s; it has as many numbers as that of the constructor."""
+        self._table[:] = self._one + self._scaled * np.asarray(length, dtype=np.float64).reshape(1, -1)
+
     def advance(self, position: Floats, velocity: Floats, effort: Floats, error: Floats | None = None) -> None:
         """Advance `position` and `velocity`, (4, N), by one step with constant `effort`, (4, N).
 
         `error`, (4, N), receives the embedded error estimate of the position, if the method has one.
         """
-        rates, drive, result, result4 = self._dynamics.rates, self._drive, self._result, self._result4
-        self._dynamics.drive(effort, drive)
+        rates, drive, result, result4 = self.dynamics.rates, self._drive, self._result, self._result4
+        self.dynamics.drive(effort, drive)
         self._start_velocity[:] = velocity
         self._start_theta2[:] = position[1]
         self._first[:] = self._start
@@ -116,8 +121,8 @@ class FixedStep:
 
     def accelerations(self, position: Floats, velocity: Floats, effort: Floats) -> Floats:
         """Return the joint accelerations, (4, N), of a state and effort, (4, N) each; valid until the next call."""
-        self._dynamics.drive(effort, self._drive)
+        self.dynamics.drive(effort, self._drive)
         self._states[0, :4] = velocity
         self._states[0, 4] = position[1]
-        self._dynamics.rates(self._stages[0], self._drive)
+        self.dynamics.rates(self._stages[0], self._drive)
         return self._slots[1, :4]

@@ -55,9 +55,17 @@ def crossing(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, l
     clipped to the step.
     """
     distance = end - start
+    line = np.clip((limit - start) / np.where(distance == 0, 1.0, distance), 0.0, 1.0)
+    return _crossing_from(line, start, end, start_rate, end_rate, limit)
+
+
+def _crossing_from(
+    fraction: Floats, start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, limit: Floats
+) -> Floats:
+    """Return the crossing to which Newton's method converges from a fraction of the step."""
+    distance = end - start
     cubic = start_rate + end_rate - 2 * distance
     square = 3 * distance - 2 * start_rate - end_rate
-    fraction = np.clip((limit - start) / np.where(distance == 0, 1.0, distance), 0.0, 1.0)
     for _ in range(NEWTON_ITERATIONS):
         value = ((cubic * fraction + square) * fraction + start_rate) * fraction + start - limit
         slope = (3 * cubic * fraction + 2 * square) * fraction + start_rate
@@ -65,3 +73,50 @@ def crossing(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, l
             fraction - np.where(slope * distance > 0, value / np.where(slope == 0, 1.0, slope), 0.0), 0.0, 1.0
         )
     return fraction
+
+
+def first_arrival(
+    start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, lower: Floats, upper: Floats
+) -> Floats:
+    """Return the fraction of a step after which a joint first reaches a stop, also if it returns before the end.
+
+    The arguments are those of `crossing`; the joint starts between its stops `lower` and `upper`.
+
+    Returns:
+        Fractions of the step; infinity where the joint reaches no stop.
+    """
+    # A joint that turns within the step may reach the stop that it moves toward first; else it may end beyond one.
+    turns = start_rate * end_rate < 0
+    turning = np.where(turns, _turning_point(start, end, start_rate, end_rate), 1.0)
+    farthest = np.where(turns, _cubic(start, end, start_rate, end_rate, turning), end)
+    toward_upper = np.where(turns, start_rate > 0, end > start)
+    limit = np.where(toward_upper, upper, lower)
+    before = np.where(toward_upper, farthest > limit, farthest < limit)
+    # The cubic up to its turning point is the interpolant with an end rate of zero.
+    fraction = turning * crossing(start, farthest, turning * start_rate, np.where(turns, 0.0, end_rate), limit)
+    # A joint that first moves away from a stop reaches it when it comes back: Newton's method starts at the end.
+    back = np.where(toward_upper, lower, upper)
+    after = turns & ~before & np.where(toward_upper, end < back, end > back)
+    if after.any():
+        returning = _crossing_from(np.ones_like(fraction), start, end, start_rate, end_rate, back)
+        fraction = np.where(after, returning, fraction)
+    return np.where(before | after, fraction, np.inf)
+
+
+def _cubic(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, fraction: Floats) -> Floats:
+    """Return the cubic Hermite interpolant at a fraction of the step."""
+    distance = end - start
+    cubic = start_rate + end_rate - 2 * distance
+    square = 3 * distance - 2 * start_rate - end_rate
+    return ((cubic * fraction + square) * fraction + start_rate) * fraction + start
+
+
+def _turning_point(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats) -> Floats:
+    """Return the fraction of the step at which the rate of the cubic interpolant changes its sign."""
+    distance = end - start
+    cubic = 3 * (start_rate + end_rate - 2 * distance)
+    square = 3 * distance - 2 * start_rate - end_rate
+    root = np.sqrt(np.maximum(square * square - cubic * start_rate, 0.0))
+    divisor = np.where(start_rate > 0, root, -root) - square
+    fraction = start_rate / np.where(divisor == 0, np.inf, divisor)
+    return np.asarray(np.clip(fraction, 0.0, 1.0))

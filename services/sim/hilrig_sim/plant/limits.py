@@ -13,8 +13,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 TOOL_CONTACT_FLAG: Final = 1 << 8
-
-
+_LOWER: Final = 1 << np.arange(4)
+_UPPER: Final = 1 << np.arange(4, 8)
 _TRUE: Final = b"\x01"
 
 
@@ -49,6 +49,7 @@ class LimitFlags:
         self._stop3 = stop3
         self._below = np.zeros(len(stop3), dtype=np.bool_)
         self._key = b""
+        self._numbers = np.zeros(len(stop3), dtype=np.int64)
         self.flags = [0] * len(stop3)
         """For each rig: bit j-1 joint j at its lower stop, bit 3+j at its upper stop, bit 8 tool touches an object."""
         self.any = False
@@ -66,20 +67,14 @@ class LimitFlags:
         if key == self._key:
             return
         self._key = key
-        self.any = False
-        touching = at_lower.any(axis=0) | at_upper.any(axis=0)
-        for rig in np.flatnonzero(touching | (np.asarray(self.flags) != 0)).tolist():
-            flags = 0
-            for joint in range(4):
-                if at_lower[joint, rig]:
-                    flags |= 1 << joint
-                if at_upper[joint, rig]:
-                    flags |= TOOL_CONTACT_FLAG if joint == 2 and self._below[rig] else 1 << (4 + joint)
-            new = flags & ~self.flags[rig]
-            self.flags[rig] = flags
-            self.any |= flags != 0
-            if new and impact_velocity is not None:
-                events.extend(_hits(rig, new, impact_velocity[:, rig].tolist()))
+        old, self._numbers = self._numbers, _LOWER @ at_lower + _UPPER @ at_upper
+        self._numbers += (at_upper[2] & self._below) * (TOOL_CONTACT_FLAG - (1 << 6))
+        self.flags = self._numbers.tolist()
+        self.any = bool(self._numbers.any())
+        if impact_velocity is not None:
+            new = self._numbers & ~old
+            for rig in np.flatnonzero(new).tolist():
+                events.extend(_hits(rig, int(new[rig]), impact_velocity[:, rig].tolist()))
 
 
 def _hits(rig: int, new: int, impact_velocity: list[float]) -> list[PlantEvent]:

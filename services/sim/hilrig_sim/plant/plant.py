@@ -2,8 +2,7 @@
 
 A step is a pure function of state, effort and parameters. `Plant` owns the state and the scratch memory of the step. It
 has no clock and no bus, so the same class runs in real time, in the verification of a recording and in a study of a
-thousand rigs. The published state contains everything that the next step depends on, except the speed of a falling
-part.
+thousand rigs. The published state contains everything that the next step depends on.
 """
 
 from collections.abc import Sequence
@@ -15,10 +14,13 @@ from numpy.typing import NDArray
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics
 from hilrig_sim.arm.integrators import TABLEAUS, Tableau
-from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.model import AUTO, RigParameters
+from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps
 from hilrig_sim.arm.stepping import FixedStep
-from hilrig_sim.plant.hard_stops import crossing, stop_outward
+from hilrig_sim.plant.hard_stops import crossing, first_arrival, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
+from hilrig_sim.plant.linear_joints import move_between_stops
+from hilrig_sim.plant.plane_solver import STEP_TOLERANCE, PlaneSolver
 from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M
 from hilrig_sim.plant.world import ALL_RIGS, NO_PART, World
 
@@ -48,17 +50,25 @@ class Plant:
         sim = rigs[0].sim
         self._arms = [rig.arm for rig in rigs]
         self._tableau: Tableau = TABLEAUS[sim.integrator]
-        self._substeps = sim.substeps
-        self._step = sim.step / sim.substeps
+        base = [sim.substeps if sim.substeps != AUTO else base_substeps(arm, sim) for arm in self._arms]
+        self._adaptive = sim.substeps == AUTO
+        self._base_substeps = np.array(base)
+        self._lengths = sim.step / self._base_substeps
+        """Length of an integration step of each rig, before it is divided further, s, (N,)."""
+        self._duration = sim.step if self._adaptive else float(self._lengths[0]) * base[0]
+        self.substeps = self._base_substeps.copy()
+        """Number of integration steps of the last step, (N,)."""
         self.position = np.empty((4, count))
         """q: rad, rad, m, rad, (4, N)."""
         self.velocity = np.zeros((4, count))
         """q̇: rad/s, rad/s, m/s, rad/s, (4, N)."""
         self.error = np.zeros((4, count))
         """Embedded error estimate of q for the last integration step, (4, N)."""
-        self.world = World([rig.scene for rig in rigs], max(arm.l2 + arm.l3 for arm in self._arms))
+        reach = max(arm.l2 + arm.l3 for arm in self._arms)
+        self.world = World([rig.scene for rig in rigs], reach, ballistic=sim.plant_version > 1)
         self.dynamics = ReducedDynamics(self._arms)
-        self._integrator = FixedStep(self.dynamics, self._tableau, self._step)
+        self._integrators = self._steppers()
+        self._integrator = self._integrators[0]
         self._l1 = np.array([arm.l1 for arm in self._arms])
         self._lower = np.array([arm.lower for arm in self._arms]).T.copy()
         self._stop = np.array([arm.upper for arm in self._arms]).T.copy()
@@ -68,6 +78,10 @@ class Plant:
         """d3 up to which the tool cannot touch any object, m, (N,)."""
         self._at_lower = np.zeros((4, count), dtype=np.bool_)
         self._at_upper = np.zeros((4, count), dtype=np.bool_)
+        self._regular = np.ones((4, 4, count), dtype=np.bool_)
+        """Where an integration step is valid: each joint is above its lower stop, below its upper stop, did not turn,
+        and its error estimate is small; (4, 4, N)."""
+        self._refined = False
         self._switched = np.zeros(count, dtype=np.bool_)
         self._low = np.zeros(count, dtype=np.bool_)
         self._contact_known = np.full((4, count), np.nan)
@@ -79,8 +93,16 @@ class Plant:
         self._start_velocity = np.empty((4, count))
         self._limits = LimitFlags(self._stop[2])
         self._touching_plane = False
+        self._work = np.empty((4, count))
+        self._step_error = np.zeros((4, count))
+        self._tolerance = np.empty((4, count))
+        self._tolerance[:] = np.array(STEP_TOLERANCE)[:, np.newaxis]
+        self._error_bound = np.empty((4, count))
+        self._error_bound[:] = np.array(ERROR_BOUND)[:, np.newaxis]
+        self._inaccurate = np.zeros((4, count), dtype=np.bool_)
         self._nothing_held = (np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_))
         self._held = self._nothing_held
+        self._plane = PlaneSolver(self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2])
         self._events: list[PlantEvent] = []
         self.position[:] = np.array([arm.start for arm in self._arms]).T
         self._refresh_derived_state()
@@ -95,6 +117,12 @@ class Plant:
         """For each rig: bit j-1 joint j at its lower stop, bit 3+j at its upper stop, bit 8 tool touches an object."""
         return self._limits.flags
 
+    def is_inaccurate(self) -> bool:
+        """Return whether the error estimate of the last step exceeds its bound for any rig."""
+        np.absolute(self.error, self._work)
+        np.greater(self._work, self._error_bound, self._inaccurate)
+        return any_true(self._inaccurate)
+
     def tool(self, rigs: Ints | slice) -> Floats:
         """Return the tool poses (x, y, z, yaw) of rigs, (4, K); (1)–(4)."""
         theta1, theta2, d3, theta4 = position = self.position[:, rigs]
@@ -106,6 +134,16 @@ class Plant:
         np.subtract(self._l1[rigs], d3, pose[2])
         np.add(sum12, theta4, pose[3])
         return pose
+
+    def _tool_velocity(self, rigs: Ints) -> Floats:
+        """Return the derivatives of the tool poses of rigs, (4, K)."""
+        theta1, theta2 = self.position[:2, rigs]
+        v1, v2, v3, v4 = self.velocity[:, rigs]
+        w2 = v1 + v2
+        link1, link2 = self.dynamics.l2[rigs] * v1, self.dynamics.l3[rigs] * w2
+        vx = -link1 * np.sin(theta1) - link2 * np.sin(theta1 + theta2)
+        vy = link1 * np.cos(theta1) + link2 * np.cos(theta1 + theta2)
+        return np.stack([vx, vy, -v3, w2 + v4])
 
     def reset(self, rig: int) -> None:
         """Move a rig and its parts to the start pose, at rest."""
@@ -154,13 +192,20 @@ class Plant:
         np.not_equal(magnet, world.holds, self._switched)
         if any_true(self._switched):
             self._switch_magnets(magnet)
-        for _ in range(self._substeps):
-            self._substep(effort)
+        if self._adaptive:
+            if self._refined:
+                self.substeps[:] = self._base_substeps
+                self._refined = False
+            for number, integrator in enumerate(self._integrators):
+                self._adaptive_substep(number, integrator, effort)
+        else:
+            for _ in self._integrators:
+                self._substep(effort)
         if world.holding:
             holding = np.flatnonzero(world.holds)
             world.move_held_parts(holding, self.tool(holding))
         if world.falling:
-            world.fall(self._step * self._substeps)
+            world.fall(self._duration)
             self._invalidate_contact()
         return events
 
@@ -170,7 +215,7 @@ class Plant:
         if dropping.size:
             for rig in dropping:
                 self._events.append(PlantEvent(PlantEventKind.PART_DROPPED, int(rig), part=int(world.held[rig])))
-            world.release(dropping)
+            world.release(dropping, self.tool(dropping), self._tool_velocity(dropping))
             self.dynamics.set_payload(world.payload())
         switching_on = np.flatnonzero(self._switched & magnet)
         if switching_on.size:
@@ -232,6 +277,135 @@ class Plant:
         np.minimum(speed34, 0.0, out=speed34, where=upper34)
         self._limits.update(lower, upper, self._upper[2], impact_velocity, self._events)
 
+    def _steppers(self) -> list[FixedStep]:
+        """Return the integrator of each integration step of a step; a rig with fewer of them has a length of zero."""
+        base, dynamics, tableau = self._base_substeps, self.dynamics, self._tableau
+        if base.min() == base.max():
+            return [FixedStep(dynamics, tableau, float(self._lengths[0]))] * int(base[0])
+        lengths = (np.where(number < base, self._lengths, 0.0) for number in range(int(base.max())))
+        return [FixedStep(dynamics, tableau, length) for length in lengths]
+
+    def _adaptive_substep(self, number: int, integrator: FixedStep, effort: Floats) -> None:
+        """Make integration step `number` of a step, which is divided further for the rigs that need it."""
+        position, velocity = self.position, self.velocity
+        error = self._step_error if number else self.error
+        above, below, straight, accurate = regular = self._regular
+        self._start_position[:] = position
+        start_velocity = self._start_velocity
+        start_velocity[:] = velocity
+        integrator.advance(position, velocity, effort, error)
+        np.greater(position[2], self._free3, self._low)
+        if any_true(self._low):
+            self._find_contact()
+        np.absolute(error, error)
+        np.less_equal(error, self._tolerance, accurate)
+        np.greater(position, self._lower, above)
+        np.less(position, self._upper, below)
+        # A joint that turned within the step may have reached a stop.
+        np.multiply(start_velocity, velocity, self._work)
+        np.greater_equal(self._work, 0.0, straight)
+        if self._touching_plane or _FALSE in regular.tobytes():
+            self._resolve(number, error, effort)
+        elif self._limits.any:
+            self._update_limits()
+        if number:
+            np.add(self.error, error, self.error)
+
+    def _resolve(self, number: int, error: Floats, effort: Floats) -> None:
+        """Repeat an integration step for the rigs that reach or leave a stop, or are not accurate enough."""
+        position, velocity, lower, upper = self.position, self.velocity, self._lower, self._upper
+        start, start_velocity = self._start_position, self._start_velocity
+        above, below, straight, accurate = self._regular
+        repeat = ~(above & below & accurate)
+        if _FALSE in straight.tobytes():
+            repeat |= self._arrivals(~straight)
+        if self._touching_plane:
+            repeat[:2] |= (start[:2] <= lower[:2]) | (start[:2] >= upper[:2])
+        if len(self._integrators) > 1:
+            repeat &= number < self._base_substeps
+        if not any_true(repeat):
+            if self._limits.any:
+                self._update_limits()
+            return
+        plane = np.logical_or(repeat[0], repeat[1])
+        if any_true(plane):
+            self._resolve_plane(np.flatnonzero(plane), error, effort)
+            if any_true(self._low):
+                self._find_contact()
+                repeat[2] |= position[2] >= upper[2]
+        linear = repeat[2:]
+        if any_true(linear):
+            # A joint that is pushed against its stop from rest stays there.
+            clipped = np.minimum(np.maximum(position[2:], lower[2:]), upper[2:])
+            rests = linear & (clipped == start[2:]) & (start_velocity[2:] == 0)
+            np.copyto(position[2:], clipped, where=rests)
+            np.copyto(velocity[2:], 0.0, where=rests)
+            np.copyto(error[2:], 0.0, where=rests)
+            linear &= ~rests
+            if any_true(linear):
+                joint, rig = linear.nonzero()
+                self._resolve_linear(joint, rig, error, effort)
+        self._update_limits()
+
+    def _update_limits(self) -> None:
+        at_lower, at_upper = self._at_lower, self._at_upper
+        np.less_equal(self.position, self._lower, at_lower)
+        np.greater_equal(self.position, self._upper, at_upper)
+        self._touching_plane = any_true(at_lower[:2]) or any_true(at_upper[:2])
+        self._limits.update(at_lower, at_upper, self._upper[2], None, self._events)
+
+    def _arrivals(self, turned: Bools) -> Bools:
+        """Return where a joint that turned within the integration step reached a stop before."""
+        start, velocity, lower, upper, work = (
+            self._start_position,
+            self._start_velocity,
+            self._lower,
+            self._upper,
+            self._work,
+        )
+        # While it turns, a joint moves less than with twice its speed: few joints can be near enough to a stop.
+        np.multiply(velocity, 2 * self._lengths, work)
+        np.add(start, work, work)
+        arrives = turned & ((work < lower) | (work > upper))
+        if any_true(arrives):
+            at = np.nonzero(arrives)
+            length = self._lengths[at[1]]
+            fraction = first_arrival(
+                start[at], self.position[at], length * velocity[at], length * self.velocity[at], lower[at], upper[at]
+            )
+            arrives[at] = fraction < 1
+        return arrives
+
+    def _resolve_plane(self, rigs: Ints, error: Floats, effort: Floats) -> None:
+        q, v = self._start_position[:, rigs], self._start_velocity[:, rigs]
+        errors, steps, impacts = self._plane.solve(
+            rigs, q, v, effort[:, rigs], self._lengths[rigs], self.substeps[rigs]
+        )
+        self.position[:2, rigs], self.velocity[:2, rigs] = q[:2], v[:2]
+        error[:2, rigs] = errors
+        self.substeps[rigs] += steps - 1
+        self._refined = True
+        for rig, joint, is_upper, speed in impacts:
+            self._events.append(PlantEvent(PlantEventKind.LIMIT_HIT, rig, joint + 1, is_upper, speed))
+
+    def _resolve_linear(self, joint: Ints, rig: Ints, error: Floats, effort: Floats) -> None:
+        """Move joints 3 and 4, `joint` 0 and 1, of rigs by their closed form."""
+        row = joint + 2
+        start, lower, upper = self._start_position[row, rig], self._lower[row, rig], self._upper[row, rig]
+        acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
+        motion = move_between_stops(
+            start, self._start_velocity[row, rig], acceleration, rate, lower, upper, self._lengths[rig]
+        )
+        self.position[row, rig], self.velocity[row, rig] = motion.position, motion.velocity
+        error[row, rig] = 0.0
+        for index in np.flatnonzero(motion.side != 0).tolist():
+            number, is_upper = int(rig[index]), bool(motion.side[index] > 0)
+            below = is_upper and joint[index] == 0 and upper[index] < self._stop[2, number]
+            hit = PlantEvent(
+                PlantEventKind.LIMIT_HIT, number, 0 if below else int(row[index]) + 1, is_upper, motion.speed[index]
+            )
+            self._events.append(hit)
+
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 that are pressed against a stop at the start of a step; return whether any is."""
         rates = self._integrator.accelerations(self.position, self.velocity, effort)
@@ -270,6 +444,7 @@ class Plant:
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
         if any_true(beyond):
+            step = float(self._lengths[0])
             rigs = np.flatnonzero(beyond.any(axis=0))
             limit = np.where(position[:2] > self._stop[:2], self._stop[:2], self._lower[:2])[:, rigs]
             q0, v0 = self._start_position[:, rigs], self._start_velocity[:, rigs]
@@ -277,7 +452,7 @@ class Plant:
             outside = beyond[:, rigs]
             fractions = np.ones((2, rigs.size))
             for joint in (0, 1):
-                fraction = crossing(q0[joint], q1[joint], v0[joint] * self._step, v1[joint] * self._step, limit[joint])
+                fraction = crossing(q0[joint], q1[joint], v0[joint] * step, v1[joint] * step, limit[joint])
                 fractions[joint] = np.where(outside[joint], fraction, 1.0)
             first = fractions.min(axis=0)
             arms = [self._arms[rig] for rig in rigs]
@@ -286,13 +461,13 @@ class Plant:
             dynamics.hold(self._held[0][rigs], self._held[1][rigs], q0[1])
             acting = effort[:, rigs]
             plane, plane_rate = q0.copy(), v0.copy()
-            FixedStep(dynamics, self._tableau, first * self._step).advance(plane, plane_rate, acting)
+            FixedStep(dynamics, self._tableau, first * step).advance(plane, plane_rate, acting)
             hitting = outside & (fractions == first)
             np.copyto(plane[:2], limit, where=hitting)
             side = _sides(plane, self._lower[:, rigs], self._stop[:, rigs])
             self._stop_plane(dynamics, plane, plane_rate, side)
             # The remainder of the step starts at the stop, pressed against it or leaving it.
-            rest = FixedStep(dynamics, self._tableau, (1.0 - first) * self._step)
+            rest = FixedStep(dynamics, self._tableau, (1.0 - first) * step)
             rates = rest.accelerations(plane, plane_rate, acting)
             mass = dynamics.mass_matrix_12(plane[1])
             resting = np.where(plane_rate[:2] == 0, side, 0.0)
@@ -320,10 +495,7 @@ class Plant:
         if any_true(self._low):
             self._start_position[:] = self.position
             self._find_contact()
-        np.less_equal(self.position, self._lower, self._at_lower)
-        np.greater_equal(self.position, self._upper, self._at_upper)
-        self._touching_plane = bool(self._at_lower[:2].any() or self._at_upper[:2].any())
-        self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
+        self._update_limits()
 
     def _invalidate_contact(self) -> None:
         """Invalidate the computed surfaces below the tools, because the scene has changed."""

@@ -31,7 +31,7 @@ class StaticGeometry:
         edge = self._table_half - np.abs(self._table_center)
         magnet_reach = max(scene.magnet_reach for scene in scenes)
         self._is_table_everywhere = bool(np.all(edge >= reach + magnet_reach))
-        """Whether no tool and no part can be beside a table."""
+        """Whether nothing within reach of the arm can be beside a table."""
         rows = max(len(scene.trays) for scene in scenes)
         self._tray = np.zeros((5, rows, count))
         self._tray[0] = FAR_AWAY_M
@@ -45,10 +45,15 @@ class StaticGeometry:
         self.highest = np.maximum(self._table, self._tray[4].max(axis=0, initial=-np.inf, where=self._half[0] > 0))
         """World z of the highest surface, m, (N,)."""
 
-    def under(self, rigs: Rigs, x: Floats, y: Floats, radius: Floats, bottom: Floats) -> Floats:
-        """Return the height of the highest surface, m, (K,), that a disc overlaps and that is not above `bottom`."""
+    def under(
+        self, rigs: Rigs, x: Floats, y: Floats, radius: Floats, bottom: Floats, *, in_reach: bool = True
+    ) -> Floats:
+        """Return the height of the highest surface, m, (K,), that a disc overlaps and that is not above `bottom`.
+
+        `in_reach`: whether the discs are within reach of the arm.
+        """
         height = table = self._table[rigs]
-        if not self._is_table_everywhere:
+        if not (in_reach and self._is_table_everywhere):
             half_x, half_y = self._table_half[:, rigs]
             center_x, center_y = self._table_center[:, rigs]
             beside = (np.abs(x - center_x) > half_x + radius) | (np.abs(y - center_y) > half_y + radius)

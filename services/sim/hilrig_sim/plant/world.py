@@ -5,6 +5,7 @@ stop on the highest object below them, and no part is pushed sideways. Rigs may 
 trays; the arrays have the size of the largest number, and unused entries are far away.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,6 +23,8 @@ NO_PART: Final = -1
 """Value of `held` if the magnet holds no part."""
 ALL_RIGS: Final = slice(None)
 """Selects all rigs, without a copy."""
+FALL_RESOLUTION_M: Final = 0.005
+"""Horizontal distance after which the surface below a falling part is determined again, m."""
 _DEPTH_RESOLUTION: Final = 2.0**-30
 """Resolution of the depth of a tip inside a part, m: a depth recomputed from a recorded pose is bit-identical."""
 
@@ -29,8 +32,12 @@ _DEPTH_RESOLUTION: Final = 2.0**-30
 class World:
     """The scenes of N rigs."""
 
-    def __init__(self, scenes: Sequence[SceneParameters], reach: float) -> None:
-        """Initialize the scenes of rigs whose tools stay within `reach` of joint 1, m."""
+    def __init__(self, scenes: Sequence[SceneParameters], reach: float, *, ballistic: bool = True) -> None:
+        """Initialize the scenes of rigs whose tools stay within `reach` of joint 1, m.
+
+        Without `ballistic`, released parts fall from rest, as in plant version 1.
+        """
+        self._ballistic = ballistic
         count = len(scenes)
         self._scenes = tuple(scenes)
         self.part_names = tuple(tuple(part.name for part in scene.parts) for scene in scenes)
@@ -42,6 +49,8 @@ class World:
         """Centers of the parts, world, m, (P, N)."""
         self.yaw = np.zeros((rows, count))
         self._fall_speed = np.zeros((rows, count))
+        self._drift = np.zeros((2, rows, count))
+        """Horizontal velocity of the falling parts, m/s, (2, P, N)."""
         self._falling = np.zeros((rows, count), dtype=np.bool_)
         self._radius = np.zeros((rows, count))
         self.half_height = np.zeros((rows, count))
@@ -85,6 +94,7 @@ class World:
         self._falling[:, rig] = False
         self.falling = bool(self._falling.any())
         self._fall_speed[:, rig] = 0.0
+        self._drift[:, :, rig] = 0.0
         self._clear_held(np.array([rig]))
         self._moved(rig)
 
@@ -93,6 +103,7 @@ class World:
         rows = min(self.x.shape[0], other.x.shape[0])
         for name in ("x", "y", "z", "yaw", "_fall_speed", "_falling"):
             getattr(self, name)[:rows, mine] = getattr(other, name)[:rows, theirs]
+        self._drift[:, :rows, mine] = other._drift[:, :rows, theirs]
         for name in ("held", "_grip", "held_height", "_held_radius", "highest", "moving", "holds"):
             getattr(self, name)[..., mine] = getattr(other, name)[..., theirs]
         self.falling = bool(self._falling.any())
@@ -105,6 +116,8 @@ class World:
             self.x[row, rig], self.y[row, rig], self.z[row, rig], self.yaw[row, rig] = pose
         self._falling[:, rig] = False
         self.falling = bool(self._falling.any())
+        self._fall_speed[:, rig] = 0.0
+        self._drift[:, :, rig] = 0.0
         rigs = np.array([rig])
         self._clear_held(rigs)
         if held != NO_PART:
@@ -123,12 +136,30 @@ class World:
         rows = [row for row in range(len(self.part_names[rig])) if row != self.held[rig]]
         return all(abs(self._bottom(row, rig) - self._support_of(row, rig)) <= CONTACT_TOLERANCE_M for row in rows)
 
-    def release(self, rigs: Ints) -> None:
-        """Switch off the magnets of these rigs, which hold parts: the parts fall from rest."""
-        self._falling[self.held[rigs], rigs] = True
+    def release(self, rigs: Ints, tip: Floats, tip_velocity: Floats) -> None:
+        """Switch off the magnets of these rigs, which hold parts: the parts fall with the velocity that they have.
+
+        Args:
+            rigs: indices, (K,).
+            tip: tool poses (x, y, z, yaw) of these rigs, (4, K).
+            tip_velocity: their derivatives, (4, K).
+        """
+        rows = self.held[rigs]
+        self._falling[rows, rigs] = True
         self.falling = True
-        self._fall_speed[self.held[rigs], rigs] = 0.0
+        self._fall_speed[rows, rigs] = 0.0
+        if self._ballistic:
+            x, y = self.footprint_center(rigs, tip)
+            vx, vy, vz, turn = tip_velocity
+            self._drift[0, rows, rigs] = vx - turn * (y - tip[1])
+            self._drift[1, rows, rigs] = vy + turn * (x - tip[0])
+            self._fall_speed[rows, rigs] = -vz
         self._clear_held(rigs)
+
+    @property
+    def velocity(self) -> tuple[Floats, Floats, Floats]:
+        """Velocities of the parts along x, y and z, m/s, (P, N) each; 0 for parts that do not fall."""
+        return self._drift[0], self._drift[1], 0.0 - self._fall_speed
 
     def pick(self, rigs: Ints, tip: Floats) -> Ints:
         """Pick the parts within reach of the magnets of these rigs, which are on and hold no part.
@@ -156,10 +187,15 @@ class World:
         picked: Ints = rigs[picking]
         self._hold(picked, nearest[picking], tip[:, picking])
         # Parts that lay on the picked part now fall.
+        starts = np.ones((self.x.shape[0], picked.size), dtype=np.bool_)
+        if self._ballistic:
+            starts = ~self._falling[:, picked]
+            starts[self.held[picked], np.arange(picked.size)] = True
+            self._drift[:, :, picked] = np.where(starts, 0.0, self._drift[:, :, picked])
         self._falling[:, picked] = True
         self._falling[self.held[picked], picked] = False
         self.falling = bool(self._falling.any())
-        self._fall_speed[:, picked] = 0.0
+        self._fall_speed[:, picked] = np.where(starts, 0.0, self._fall_speed[:, picked])
         return picked
 
     def payload(self) -> Floats:
@@ -213,14 +249,28 @@ class World:
         self.falling = bool(self._falling.any())
 
     def _fall(self, row: int, rig: int, duration: float) -> None:
-        bottom, support = self._bottom(row, rig), self._support_of(row, rig)
-        speed = self._fall_speed[row, rig]
-        lower = bottom - (speed * duration + 0.5 * GRAVITY * duration * duration)
-        if lower <= support:
-            lower = support
-            self._falling[row, rig] = False
-        self._fall_speed[row, rig] = speed + GRAVITY * duration if lower > support else 0.0
-        self.z[row, rig] = lower + self.half_height[row, rig]
+        drift = self._drift[:, row, rig]
+        distance = float(np.hypot(*drift)) * duration
+        # A part that drifts may pass the edge of an object below it.
+        number = max(1, math.ceil(distance / FALL_RESOLUTION_M))
+        time = duration / number
+        for _ in range(number):
+            before = self.x[row, rig], self.y[row, rig]
+            if distance:
+                self.x[row, rig], self.y[row, rig] = before + drift * time
+            bottom, support = self._bottom(row, rig), self._support_of(row, rig)
+            speed = self._fall_speed[row, rig]
+            lower = bottom - (speed * time + 0.5 * GRAVITY * time * time)
+            self._fall_speed[row, rig] = speed + GRAVITY * time if lower > support else 0.0
+            self.z[row, rig] = max(lower, support) + self.half_height[row, rig]
+            if lower <= support:
+                self._falling[row, rig] = False
+                if distance:
+                    height = max(bottom - support, 0.0)
+                    landing = (math.sqrt(speed * speed + 2 * GRAVITY * height) - speed) / GRAVITY
+                    self.x[row, rig], self.y[row, rig] = before + drift * landing
+                    self._drift[:, row, rig] = 0.0
+                break
         self._moved(rig)
 
     def _hold(self, rigs: Ints, rows: Ints, tip: Floats) -> None:
@@ -271,12 +321,27 @@ class World:
         one = np.array([rig])
         bottom = np.array([self._bottom(row, rig)])
         radius = self._radius[row, one]
-        height = self._support(one, self.x[row, one], self.y[row, one], radius, bottom, np.array([row]))
+        height = self._support(
+            one, self.x[row, one], self.y[row, one], radius, bottom, np.array([row]), in_reach=not self._ballistic
+        )
         return float(height[0])
 
-    def _support(self, rigs: Rigs, x: Floats, y: Floats, radius: Floats, bottom: Floats, ignored: Ints) -> Floats:
-        """Return the highest top, m, (K,), under discs and not above `bottom`; `ignored`: the parts of the discs."""
-        height = self._static.under(rigs, x, y, radius, bottom)
+    def _support(
+        self,
+        rigs: Rigs,
+        x: Floats,
+        y: Floats,
+        radius: Floats,
+        bottom: Floats,
+        ignored: Ints,
+        *,
+        in_reach: bool = True,
+    ) -> Floats:
+        """Return the highest top, m, (K,), under discs and not above `bottom`; `ignored`: the parts of the discs.
+
+        `in_reach`: whether the discs are within reach of the arm.
+        """
+        height = self._static.under(rigs, x, y, radius, bottom, in_reach=in_reach)
         if not self.x.shape[0]:
             return height
         dx, dy = self.x[:, rigs] - x, self.y[:, rigs] - y

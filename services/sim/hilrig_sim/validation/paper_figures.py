@@ -2,6 +2,7 @@
 
 Two torque pulses move joints 1 and 2 of an arm at rest. At the paper's step of 20 ms, Euler's method exceeds its
 stability limit and diverges, Runge–Kutta–Fehlberg is stable, and Dormand–Prince with a variable step is the reference.
+The whole curves of the fixed step and of automatic sub-steps are compared with it.
 """
 
 from dataclasses import dataclass
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.arm.dynamics import ReducedDynamics, stage_views
 from hilrig_sim.arm.integrators import EULER, RK4, RKF45, Tableau, reference_solution
-from hilrig_sim.arm.model import GRAVITY, ArmParameters
+from hilrig_sim.arm.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.arm.stability import fastest_mode
 from hilrig_sim.arm.stepping import FixedStep
+from hilrig_sim.plant.plant import Plant
 
 Floats = NDArray[np.float64]
 
@@ -75,6 +77,10 @@ class ExperimentResult:
     euler: Solution
     reference: Solution
     fehlberg: Solution
+    automatic: Solution
+    """Runge–Kutta–Fehlberg with automatic sub-steps, the default of a lab."""
+    at_steps: Solution
+    """The reference at the times of the fixed steps."""
     limits_ms: dict[str, float]
     """Largest stable step of each method, ms."""
 
@@ -85,6 +91,12 @@ class ExperimentResult:
         return (
             None if end is None or reference is None else max(abs(e - r) for e, r in zip(end, reference, strict=True))
         )
+
+    def curve_errors(self, solution: Solution) -> tuple[float, float]:
+        """Return the largest errors of positions, rad, and of speeds, as a share of their peak, over all steps."""
+        position = float(np.abs(solution.position - self.at_steps.position).max())
+        peak = np.abs(self.at_steps.velocity).max(axis=1, keepdims=True)
+        return position, float((np.abs(solution.velocity - self.at_steps.velocity) / peak).max())
 
     def checks(self) -> list[tuple[str, str, str, bool]]:
         """Rows (quantity, expected value at the paper's step, computed value, agreement)."""
@@ -111,6 +123,8 @@ class ExperimentResult:
                 "diverged" if deviation is None else f"{deviation:.1e} rad",
                 deviation is not None and deviation <= 2.05e-6,
             ),
+            self._curves(self.fehlberg, "RKF", 0.0002, 0.13),
+            self._curves(self.automatic, "automatic sub-steps", 0.00001, 0.003),
             ("fastest mode at θ2 = 0", "129.5 1/s", f"{self.mode:.1f} 1/s", abs(self.mode - 129.5) < 0.1),
         ]
         for name, expected in EXPECTED_LIMITS_MS.items():
@@ -119,6 +133,15 @@ class ExperimentResult:
                 (f"largest stable step, {name}", f"{expected} ms", f"{found:.2f} ms", abs(found / expected - 1) < 0.01)
             )
         return rows
+
+    def _curves(self, solution: Solution, name: str, most: float, most_speed: float) -> tuple[str, str, str, bool]:
+        position, speed = self.curve_errors(solution)
+        return (
+            f"{name} at {self.step_ms:g} ms, largest errors of the curves",
+            f"at most {most:.0e} rad, {most_speed:.1%} of the peak speed",
+            f"{position:.1e} rad, {speed:.1%}",
+            position <= most and speed <= most_speed,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-compatible values."""
@@ -133,9 +156,13 @@ class ExperimentResult:
                     if solution.diverged_s is not None
                     else np.abs(solution.velocity).max(axis=1).tolist(),
                 }
-                for solution in (self.euler, self.reference, self.fehlberg)
+                for solution in (self.euler, self.reference, self.fehlberg, self.automatic)
             },
             "deviation_rad": self.deviation,
+            "curve_errors": {
+                solution.name: dict(zip(("position_rad", "speed_share"), self.curve_errors(solution), strict=True))
+                for solution in (self.fehlberg, self.automatic)
+            },
             "limits_ms": self.limits_ms,
             "checks": [
                 {"what": what, "expected": expected, "found": found, "holds": holds}
@@ -160,12 +187,15 @@ def compute(step_ms: float = PAPER_STEP_MS) -> ExperimentResult:
     limits = {table.name: table.negative_real_limit() / mode * 1e3 for table in (EULER, RK4, RKF45)}
     limits["rkf45, order 4"] = RKF45.negative_real_limit(RKF45.embedded) / mode * 1e3
     count = round(DURATION_S * per_second)
+    fehlberg = _fixed(RKF45, "Runge–Kutta–Fehlberg", step_ms, count)
     return ExperimentResult(
         step_ms=step_ms,
         mode=mode,
         euler=_fixed(EULER, "Euler", step_ms, count),
-        reference=_reference(),
-        fehlberg=_fixed(RKF45, "Runge–Kutta–Fehlberg", step_ms, count),
+        reference=_reference(np.linspace(0.0, DURATION_S, 1001)),
+        fehlberg=fehlberg,
+        automatic=_automatic(step_ms, count),
+        at_steps=_reference(fehlberg.time_s),
         limits_ms={name: limits[name] for name in EXPECTED_LIMITS_MS},
     )
 
@@ -185,7 +215,22 @@ def _fixed(table: Tableau, title: str, step_ms: float, count: int) -> Solution:
     return Solution(table.name, f"{title}, fixed step of {step_ms:g} ms", time_s, positions, velocities)
 
 
-def _reference() -> Solution:
+def _automatic(step_ms: float, count: int) -> Solution:
+    sim = StepParameters(step_ns=round(step_ms * 1e6))
+    plant = Plant([RigParameters(arm=ARM, sim=sim, scene=SceneParameters(table_height=-1.0))])
+    effort, magnet = np.zeros((4, 1)), np.zeros(1, dtype=np.bool_)
+    effort[2] = -ARM.masses[2] * GRAVITY
+    positions, velocities = np.zeros((2, count + 1)), np.zeros((2, count + 1))
+    time_s = np.asarray(np.arange(count + 1) * (step_ms / 1e3), dtype=np.float64)
+    for k in range(count):
+        effort[:2, 0] = torque(time_s[k] + 1e-9)
+        plant.step(effort, magnet)
+        positions[:, k + 1], velocities[:, k + 1] = plant.position[:2, 0], plant.velocity[:2, 0]
+    title = f"Runge–Kutta–Fehlberg, automatic sub-steps of {step_ms:g} ms"
+    return Solution("automatic", title, time_s, positions, velocities)
+
+
+def _reference(time_s: Floats) -> Solution:
     dynamics = ReducedDynamics([ARM])
     state, rates, drive = np.zeros((5, 1)), np.zeros((5, 1)), np.zeros((4, 1))
     views = stage_views(state, rates)
@@ -199,7 +244,6 @@ def _reference() -> Solution:
         dynamics.rates(views, drive)
         return np.concatenate([y[2:], rates[:2, 0]])
 
-    time_s = np.asarray(np.linspace(0.0, DURATION_S, 1001), dtype=np.float64)
     y = reference_solution(derivative, np.zeros(4), time_s, breaks=TORQUE_SWITCH_TIMES_S)
     return Solution("dop853", "Dormand–Prince, variable step", time_s, y[:2], y[2:])
 

@@ -1,6 +1,7 @@
 """`hilrig check`: validates a lab's configuration file."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -27,15 +28,18 @@ def check(
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
     from hilrig_runtime.errors import InputError
+    from hilrig_sim.accuracy import accuracy_warnings
+    from hilrig_sim.arm.model import describe_substeps
     from hilrig_sim.parameters import rig_parameters
 
     if template:
         print(lab_template(), end="")
         return
     lab = load_lab(file)
+    rigs = {}
     try:
         for rig in lab.rigs:
-            parameters = rig_parameters(lab, rig)
+            parameters = rigs[rig.name] = rig_parameters(lab, rig)
             if lab.task is not None:
                 validate_task(lab.task, parameters)
     except InputError as error:
@@ -49,8 +53,10 @@ def check(
     title = f"{file or 'defaults'}: lab {lab.name!r} is valid"
     table = Table(*columns, "step", "integrator", title=title, title_justify="left")
     for rig in lab.rigs:
-        substeps = f", {lab.sim.substeps} sub-steps" if lab.sim.substeps > 1 else ""
+        substeps = "" if lab.sim.substeps == 1 else f", {describe_substeps(lab.sim.substeps)}"
         allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
         table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
     Console().print(table)
+    for warning in accuracy_warnings(rigs):
+        print(f"warning: {warning}", file=sys.stderr)

@@ -23,7 +23,7 @@ def live(
 ) -> None:
     """Show a running rig in the rerun viewer, like `replay`, until the viewer is closed or Ctrl-C."""
     from hilrig_cli.client import check_rig
-    from hilrig_replay.io.output_file import output_file
+    from hilrig_replay.io.output_file import check_output
     from hilrig_replay.rerun_view.layout import layout
     from hilrig_replay.rerun_view.live import FILE_PERIOD_S, VIEWER_PERIOD_S, Follower, follow
     from hilrig_replay.rerun_view.sinks import to_file, to_viewer
@@ -46,7 +46,9 @@ def live(
         check_rig(bus, lab, name)
         viewer = None
         if save is not None:
-            stream = to_file(closing.enter_context(output_file(save)), f"live-{name}", blueprint)
+            # Not an `output_file`, because the file can be read while it grows.
+            check_output(save)
+            stream = to_file(save, f"live-{name}", blueprint)
         else:
             grpc_port, web_port = free_port(), free_port() if web else None
             viewer = closing.enter_context(running_viewer(grpc_port, web_port))

@@ -123,7 +123,7 @@ class Arm {
 // ---- a rig as a card and as a table row
 
 const FIGURES = [
-  ["loop", "loop latency p50 / p99", "big wide"], ["late", "lateness", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
+  ["loop", "loop latency p50 / p99", "big wide"], ["age", "age p99", ""], ["late", "lateness", ""], ["overruns", "overruns", ""], ["watchdog", "watchdog", ""],
   ["controller", "controller", "line"], ["address", "address", "line"], ["recorded", "session", "wide"],
 ];
 
@@ -141,7 +141,7 @@ class Rig {
     this.card = html("li", {}, html("div", {class: "head"}, html("h3", {title: name}, name), this.pill), this.arm.svg, figures);
     this.card.rig = this;
     this.rowPill = html("span", {class: "pill"});
-    this.cells = ["", "", "n", "n", "n", "n", "", ""].map((kind) => html("td", kind ? {class: kind} : {}));
+    this.cells = ["", "", "n", "n", "n", "n", "n", "", ""].map((kind) => html("td", kind ? {class: kind} : {}));
     this.row = html("tr", {}, html("th", {scope: "row"}, name), html("td", {}, this.rowPill), ...this.cells);
   }
 
@@ -157,6 +157,8 @@ class Rig {
     }
     setLevel(this.card, this.level);
     setText(this.figures.loop, rig.loop_samples ? `${p50} / ${p99} ms` : "–");
+    const age = fixed(rig.age_p99_ms, 1);
+    setText(this.figures.age, rig.age_p99_ms === null ? age : `${age} ms`);
     setText(this.figures.controller, rig.controller || "none");
     setText(this.figures.address, rig.address || "–");
     setText(this.figures.late, rig.simulated ? `${late} ms` : late);
@@ -166,9 +168,9 @@ class Rig {
     setText(this.figures.recorded, recorded);
     this.figures.recorded.classList.toggle("rec", rig.recording);
     this.figures.recorded.title = recorded;
-    const cells = [rig.address || "–", rig.controller || "none", p50, p99, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
+    const cells = [rig.address || "–", rig.controller || "none", p50, p99, age, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
     cells.forEach((text, number) => setText(this.cells[number], text));
-    this.cells[7].classList.toggle("rec", rig.recording);
+    this.cells[8].classList.toggle("rec", rig.recording);
   }
 
   matches(terms, which) {

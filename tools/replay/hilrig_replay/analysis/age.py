@@ -35,8 +35,9 @@ AGE_DTYPE: Final = np.dtype(
         ("effect_ns", "<i8"),
     ]
 )
-"""One row per step of a session; times on the clock of the simulation. `age_ns`: age, or `NO_AGE` or `UNKNOWN`;
-`basis_step`: step of the basis of the acting command, 0: none; `effect_ns`: tick at which that command took effect."""
+"""One row per step of a session; times on the clock of the simulation. `command_seq`: number of the acting command, 0:
+none; `basis_step`: step of its basis, 0: none; `age_ns`: age, or `NO_AGE` or `UNKNOWN`; `effect_ns`: tick at which the
+command took effect."""
 OLD_STEPS: Final = (1, 2, 5)
 """Ages, steps, for which the share of older steps is reported."""
 MAX_PERIOD_RATIO: Final = 3.0
@@ -61,49 +62,17 @@ class LoopAge:
     """Share of the aged steps whose age exceeds a number of steps, by this number (`OLD_STEPS`)."""
 
 
-class AgeTable:
-    """Ages of a run, collected block by block; call `finish` after the last block."""
+class AgeTracker:
+    """Computes the ages of consecutive states."""
 
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._table = DiskTable(AGE_DTYPE)
+    def __init__(self) -> None:
         self._last_state: Rows | None = None
         self._last_row = np.zeros(1, AGE_DTYPE)
         self._basis_ns = UNKNOWN
         """Tick of the basis of the command that acts at the last state, or `NO_AGE` or `UNKNOWN`."""
-        self._first_seq: int | None = None
-        """Number of the first command that the controller of the session wrote."""
-        self._last_written_ns = self._lease_lost_ns = 0
-        """Times of the last command and of the last loss of the lease, wall clock of the edge."""
-        self._session_ended = False
-        self._begin = self._end = 0
 
-    def add(self, block: Records) -> None:
-        """Add the states, commands and events of the next block."""
-        for event in block.events[np.isin(block.events["kind"], ("LEASE_LOST", "SESSION_END"))]:
-            if event["kind"] == "LEASE_LOST":
-                self._lease_lost_ns = int(event["wall_ns"])
-            elif event["message"].session == self._run.session:
-                self._session_ended = True
-        written = block.commands[(block.commands["write_arrived_ns"] > 0) & self._in_session(block.commands)]
-        if len(written):
-            if self._first_seq is None:
-                self._first_seq = int(written["seq"].min())
-            self._last_written_ns = int(written["wall_ns"][-1])
-        if len(block.states):
-            self._add_states(block.states)
-
-    def _in_session(self, rows: Rows) -> NDArray[np.bool_]:
-        # A manual recording can contain sessions of several controllers.
-        if not self._run.controller:
-            return np.asarray(rows["session"] != 0)
-        return np.asarray(rows["session"] == self._run.names.code(self._run.session))
-
-    def _in_use(self, states: Rows) -> NDArray[np.bool_]:
-        # A restarted simulation does not know the session until it receives a command.
-        return np.asarray(self._in_session(states) | ((states["session"] == 0) & bool(self._run.controller)))
-
-    def _add_states(self, states: Rows) -> None:
+    def add(self, states: Rows) -> NDArray[np.void]:
+        """Ages of the next states, fields as `STATE_DTYPE`, at least one; one row each, fields as `AGE_DTYPE`."""
         changed, hidden = self._changes(states)
         based = states["basis_step"] != 0
         own_ns = np.where(hidden, UNKNOWN, NO_AGE)
@@ -119,9 +88,10 @@ class AgeTable:
             rows[name] = np.concatenate((self._last_row[name], rows[name]))[effect]
         rows["age_ns"] = np.where(basis_ns > 0, states["sampled_ns"] - basis_ns, basis_ns)
         rows["age_ns"][states["safe"]] = NO_AGE
-        self._table.add(rows[self._in_use(states)])
+        rows["command_seq"][states["safe"]] = 0
         self._basis_ns = int(basis_ns[-1])
         self._last_state, self._last_row = states[-1:].copy(), rows[-1:].copy()
+        return rows
 
     def _changes(self, states: Rows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """States whose command is another one than that of the state before, and those where states are missing.
@@ -141,23 +111,58 @@ class AgeTable:
             return changed, hidden
         return changed[1:], hidden[1:]
 
+
+class AgeTable:
+    """Ages of a run, collected block by block; call `finish` after the last block."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._table = DiskTable(AGE_DTYPE)
+        self._tracker = AgeTracker()
+        self._written: tuple[int, int] | None = None
+        """Numbers of the first and the last command that the controller of the session wrote."""
+        self._last_written_ns = self._lease_lost_ns = 0
+        """Times of the last command and of the last loss of the lease, wall clock of the edge."""
+        self._session_ended = False
+        self._begin = self._end = 0
+
+    def add(self, block: Records) -> None:
+        """Add the states, commands and events of the next block."""
+        for event in block.events[np.isin(block.events["kind"], ("LEASE_LOST", "SESSION_END"))]:
+            if event["kind"] == "LEASE_LOST":
+                self._lease_lost_ns = int(event["wall_ns"])
+            elif event["message"].session == self._run.session:
+                self._session_ended = True
+        written = block.commands[(block.commands["write_arrived_ns"] > 0) & self._in_session(block.commands)]
+        if len(written):
+            first, last = int(written["seq"].min()), int(written["seq"].max())
+            self._written = (first, last) if self._written is None else (min(first, self._written[0]), last)
+            self._last_written_ns = int(written["wall_ns"][-1])
+        if len(block.states):
+            self._table.add(self._tracker.add(block.states)[self._in_use(block.states)])
+
+    def _in_session(self, rows: Rows) -> NDArray[np.bool_]:
+        # A manual recording can contain sessions of several controllers.
+        if not self._run.controller:
+            return np.asarray(rows["session"] != 0)
+        return np.asarray(rows["session"] == self._run.names.code(self._run.session))
+
+    def _in_use(self, states: Rows) -> NDArray[np.bool_]:
+        # A restarted simulation does not know the session until it receives a command.
+        return np.asarray(self._in_session(states) | ((states["session"] == 0) & bool(self._run.controller)))
+
     def finish(self) -> None:
         """Find the first and the last step of the controller."""
-        position, last = 0, np.zeros(1, AGE_DTYPE)
-        begun = False
+        position, last, begun = 0, np.zeros(1, AGE_DTYPE), False
+        first_seq, last_seq = self._written or (1, 0)
         for rows in self._table.blocks(*(AGE_DTYPE.names or ())):
-            aged = rows["age_ns"] > 0
-            begins = aged | (
-                (rows["age_ns"] == NO_AGE) & (rows["command_seq"] >= self._first_seq)
-                if self._first_seq is not None
-                else np.False_
-            )
-            if not begun and begins.any():
-                begun, self._begin = True, position + int(np.argmax(begins))
-            if aged.any():
-                at = int(np.flatnonzero(aged)[-1])
-                # Without the trailing steps of the watchdog's zero torque.
-                self._end, last = position + at + 1, rows[at : at + 1].copy()
+            # Not the zero torque of the edge's watchdog, whose number is higher at the end.
+            written = (rows["command_seq"] >= first_seq) & (rows["command_seq"] <= last_seq)
+            used = np.flatnonzero((rows["age_ns"] > 0) | (written & (rows["age_ns"] == NO_AGE)))
+            if len(used):
+                if not begun:
+                    begun, self._begin = True, position + int(used[0])
+                self._end, last = position + int(used[-1]) + 1, rows[used[-1] :][:1].copy()
             position += len(rows)
         silent_ns = self._silent_ns()
         if silent_ns is None or not self._end:

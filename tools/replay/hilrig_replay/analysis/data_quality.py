@@ -16,6 +16,7 @@ from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Losses, Run
 from hilrig_replay.io.sequence_order import Repairs
+from hilrig_sim.arm.stability import ERROR_BOUND
 
 MIN_SAMPLES: Final = 500
 """Required number of samples; with fewer, p99 depends on fewer than five samples."""
@@ -23,8 +24,6 @@ MAX_UNCONTROLLED_SHARE: Final = 0.01
 """Largest share of steps without an age."""
 MAX_HELD_PERIODS: Final = 3
 """Control periods by which the p99 of the age may exceed that of the loop latency, beside one step."""
-MAX_INTEGRATION_ERROR: Final = np.array([np.radians(0.1), np.radians(0.1), 1e-4, np.radians(0.1)])
-"""Largest error estimate of a step: 0.1° or 0.1 mm; rad, rad, m, rad."""
 MIN_MISSING_BASES: Final = 5
 """Number of bases before the first state that shows that the beginning is missing: a controller may have read once,
 long before its first write."""
@@ -189,7 +188,7 @@ class DataQuality:
 
     def _add_errors(self, states: Rows) -> None:
         error = np.abs(states["integration_error"])
-        self._inaccurate_steps += int((error > MAX_INTEGRATION_ERROR).any(axis=1).sum())
+        self._inaccurate_steps += int((error > ERROR_BOUND).any(axis=1).sum())
         self._largest_error = np.maximum(self._largest_error, error.max(axis=0))
 
     def _add_events(self, events: Rows) -> None:
@@ -295,9 +294,7 @@ class DataQuality:
     def _disturbed(self, edge_stalls: Stalls) -> Iterator[Reason]:
         """Reasons why the services did not run undisturbed."""
         run = self._run
-        for service, count in self._restarted().items():
-            text = f"{service} was restarted during the session"
-            yield Reason("restart", text if count == 1 else f"{text} ({count} times)")
+        yield from self._restarted()
         # The recorder counts the events of all services.
         overruns = max(self.stalls.count, (run.number("summary", "overruns") or 0) - self._edge_overruns)
         if overruns:
@@ -312,26 +309,34 @@ class DataQuality:
         if clock_steps:
             yield Reason("clock_step", f"{_count(clock_steps, 'step')} of the wall clock during the run")
         if self._inaccurate_steps:
-            joint = int(np.argmax(self._largest_error / MAX_INTEGRATION_ERROR))
+            joint = int(np.argmax(self._largest_error / ERROR_BOUND))
             error, unit = self._largest_error[joint], "mm" if joint == 2 else "°"
             largest = error * 1e3 if joint == 2 else np.degrees(error)
             text = f"{_count(self._inaccurate_steps, 'step')} with an integration error above 0.1° or 0.1 mm"
             yield Reason("integration_error", f"{text}, up to {largest:.2f} {unit} (joint {joint + 1})")
 
-    def _restarted(self) -> dict[str, int]:
-        """Number of restarts during the session by service."""
+    def _restarted(self) -> Iterator[Reason]:
+        """Reasons for the services that were started during the session."""
         run = self._run
-        start_wall_ns = run.number("session", "start_wall_ns") or 0
-        # The incarnation of a service is the wall clock at its start.
-        started = [
-            source["source"]
-            for name, source in run.metadata.items()
-            if name.startswith("hilrig.source") and start_wall_ns and int(source["incarnation"]) > start_wall_ns
-        ]
-        found = {source: started.count(source) for source in dict.fromkeys(started)}
-        if self._restarts and not any(source.startswith("sim/") for source in found):
-            found["the simulation"] = self._restarts
-        return found
+        session_ns = run.number("session", "start_wall_ns") or 0
+        incarnations: dict[str, list[int]] = {}
+        for name, source in run.metadata.items():
+            if name.startswith("hilrig.source"):
+                # The incarnation of a service is the wall clock at its start.
+                started_ns = run.number(name.removeprefix("hilrig."), "incarnation") or 0
+                incarnations.setdefault(source.get("source", ""), []).append(started_ns)
+        restarts = {
+            name: (sum(started_ns > session_ns for started_ns in found), len(found))
+            for name, found in incarnations.items()
+            if session_ns
+        }
+        if self._restarts and not any(count for name, (count, _) in restarts.items() if name.startswith("sim/")):
+            restarts["the simulation"] = (self._restarts, self._restarts + 1)
+        for name, (count, total) in restarts.items():
+            if count:
+                verb = "restarted" if total > 1 else "started"
+                times = f" ({count} times)" if count > 1 else ""
+                yield Reason("restart", f"{name} was {verb} during the session{times}")
 
     def _omitted(self, loop_ms: Statistics, age: LoopAge) -> Iterator[Reason]:
         """Reasons why the samples do not represent the run."""

@@ -7,27 +7,31 @@ is only a cache: it can be deleted at any time and is rebuilt from the files.
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
-from mcap.records import Metadata, MetadataIndex, Statistics
+from mcap.records import Channel, Metadata, MetadataIndex, Statistics
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, UNFINISHED_SUFFIX
-from hilrig_recorder.mcap_format.reader import NoMcapError, RecordReader, TruncatedError, file_reader
-from hilrig_recorder.mcap_format.records import DamagedError, decode_record
+from hilrig_recorder.mcap_format.fsutil import open_file
+from hilrig_recorder.mcap_format.reader import NoMcapError, Record, RecordReader, TruncatedError, file_reader
+from hilrig_recorder.mcap_format.records import DamagedError, decode_chunk_index, decode_record
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.data_quality import Reason
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.io.extent import Extent, state_extent
 from hilrig_replay.io.isolation import EvaluationError, isolated
+from hilrig_replay.io.paths import walk_recordings
 from hilrig_replay.io.recording_file import DamagedRecordingError
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import HilrigError, InputError
+from hilrig_schemas.topics import STATE
 
 INDEX_NAME: Final = ".hilrig-index.json"
-INDEX_VERSION: Final = 4
+INDEX_VERSION: Final = 5
 VERDICT_SUFFIX: Final = ".verified"
 """Suffix of the file next to a recording with the result of `hilrig verify`."""
 IN_PROGRESS: Final = "recording"
@@ -50,8 +54,9 @@ class RunEntry:
     """Number of the segment in its session, from 1."""
     controller: str = ""
     start_wall_ns: int = 0
-    """Arrival of the first message, ns since 1970-01-01 UTC."""
+    """Time of the first state by the clock of its sender, ns since 1970-01-01 UTC."""
     duration_s: float = 0.0
+    """Time from the first state to the last."""
     messages: int = 0
     ended: str = ""
     """How the recording ended, as recorded; `recording`: it is being written."""
@@ -59,7 +64,7 @@ class RunEntry:
     lost_transport: int = 0
     lost_recorder: int = 0
     lost_file: int = 0
-    """Number of messages that were lost by damage of the file."""
+    """Number of messages that the file counts, but does not contain."""
     overruns: int = 0
     missed_steps: int = 0
     clock_steps: int = 0
@@ -101,14 +106,17 @@ class RunIndex:
         known = {} if rebuild else self._known or self._read()
         self._changed = rebuild
         self._known = {}
-        for relative, info in _walk(self.folder):
+        for relative, info in walk_recordings(self.folder, (MCAP_SUFFIX, UNFINISHED_SUFFIX)):
             entry = known.get(relative)
             if entry is None or (entry.size, entry.mtime_ns) != (info.st_size, info.st_mtime_ns):
                 entry = read_entry(self.folder, relative, info)
                 self._changed = True
             self._known[relative] = entry
         self._changed |= len(known) != len(self._known)
-        entries = [replace(entry, verified=read_verdict(self.folder / entry.path)) for entry in self._known.values()]
+        entries = [
+            entry if entry.error else replace(entry, verified=read_verdict(self.folder / entry.path))
+            for entry in self._known.values()
+        ]
         return sorted(entries, key=lambda entry: (entry.start_wall_ns, entry.path), reverse=True)
 
     def measure(self, entries: list[RunEntry], on_progress: Callable[[int], None] | None = None) -> list[RunEntry]:
@@ -121,7 +129,7 @@ class RunIndex:
                 found = measure_entry(self.folder, entry)
                 self._known[entry.path] = replace(found, verified=None)
                 self._changed = True
-                measured.append(found)
+                measured.append(replace(found, verified=None) if found.error else found)
             else:
                 measured.append(entry)
         return measured
@@ -163,7 +171,7 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
     blank = RunEntry(relative, info.st_size, info.st_mtime_ns, rig=Path(relative).parent.name)
     path = folder / relative
     try:
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             if relative.endswith(UNFINISHED_SUFFIX):
                 entry = _with_session(blank, session_metadata(stream.read(MAX_BEGIN_BYTES)))
                 return replace(entry, ended=IN_PROGRESS, reason="being written, or not yet recovered")
@@ -209,7 +217,7 @@ def write_verdict(path: Path, verified: bool, detail: str = "") -> None:
     Raises:
         OSError: the file can't be written.
     """
-    verdict = {"verified": verified, "size": path.stat().st_size, "detail": detail}
+    verdict = {"verified": verified, **_identity(path), "detail": detail}
     path.with_name(path.name + VERDICT_SUFFIX).write_text(json.dumps(verdict) + "\n")
 
 
@@ -217,38 +225,37 @@ def read_verdict(path: Path) -> bool | None:
     """Result of the last verification of a recording; None: no result, or a result of another file of this name."""
     try:
         verdict = json.loads(path.with_name(path.name + VERDICT_SUFFIX).read_text())
-        return bool(verdict["verified"]) if verdict["size"] == path.stat().st_size else None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return bool(verdict["verified"]) if verdict.items() >= _identity(path).items() else None
+    except (OSError, AttributeError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
-def _walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
-    waiting = [""]
-    while waiting:
-        below = waiting.pop()
+def _identity(path: Path) -> dict[str, int]:
+    """Size, time of modification and checksum of the summary section of a recording."""
+    with open_file(path) as stream:
+        info = os.fstat(stream.fileno())
         try:
-            found = list(os.scandir(folder / below))
-        except OSError:
-            continue
-        for item in found:
-            relative = f"{below}/{item.name}" if below else item.name
-            try:
-                if item.is_dir(follow_symlinks=False):
-                    waiting.append(relative)
-                elif item.name.endswith((MCAP_SUFFIX, UNFINISHED_SUFFIX)):
-                    yield relative, item.stat()
-            except OSError:
-                # Renamed or deleted after the folder was listed.
-                continue
+            checksum = file_reader(stream).summary().checksum
+        except DamagedError:
+            checksum = 0
+    return {"size": info.st_size, "mtime_ns": info.st_mtime_ns, "summary_crc": checksum}
 
 
 def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
     summary = reader.summary()
     statistics: Statistics | None = None
     metadata_index: dict[str, MetadataIndex] = {}
+    channel = 0
+    chunks: list[Record] = []
     for record in reader.summary_records(summary) if summary.start else ():
-        # Chunk indexes are most of the summary section of a long recording, and are not used here.
-        if record.opcode in (Opcode.STATISTICS, Opcode.METADATA_INDEX):
+        # Chunk indexes are most of the summary section of a long recording. Only the first and last are decoded.
+        if record.opcode == Opcode.CHUNK_INDEX:
+            chunks.append(record)
+        elif record.opcode == Opcode.CHANNEL:
+            item = decode_record(record.opcode, record.content, record.offset)
+            if isinstance(item, Channel) and item.topic == STATE.channel:
+                channel = item.id
+        elif record.opcode in (Opcode.STATISTICS, Opcode.METADATA_INDEX):
             item = decode_record(record.opcode, record.content, record.offset)
             if isinstance(item, Statistics):
                 statistics = item
@@ -257,12 +264,17 @@ def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
     if statistics is None:
         return replace(blank, error="no summary section with statistics: run `hilrig recover` to add it")
     session, trailer = (_metadata(reader, metadata_index.get(name)) for name in ("hilrig.session", "hilrig.summary"))
-    written = int(trailer.get("messages", 0)) if "hilrig.recovered" in metadata_index else 0
+    written = int(trailer.get("messages", 0))
     entry = _with_session(blank, session)
+    first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
+    extent = Extent(first_ns or entry.start_wall_ns, (last_ns - first_ns) / 1e9)
+    # Damage of a chunk is reported when the recording is measured.
+    with contextlib.suppress(DamagedError):
+        extent = state_extent(reader, _with(channel, chunks), _with(channel, reversed(chunks)), channel) or extent
     return replace(
         entry,
-        start_wall_ns=statistics.message_start_time or entry.start_wall_ns,
-        duration_s=(statistics.message_end_time - statistics.message_start_time) / 1e9,
+        start_wall_ns=extent.start_wall_ns,
+        duration_s=extent.duration_s,
         messages=statistics.message_count,
         ended=trailer.get("ended", ""),
         reason=trailer.get("reason", ""),
@@ -274,6 +286,14 @@ def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
         clock_steps=int(trailer.get("clock_steps", 0)),
         error="" if session else "not a hilrig recording",
     )
+
+
+def _with(channel: int, chunks: Iterable[Record]) -> Iterator[tuple[int, int]]:
+    """Offset and length of the chunks with messages of a channel, from their indexes."""
+    for record in chunks:
+        index = decode_chunk_index(record.content, record.offset)
+        if not index.channels or channel in index.channels:
+            yield index.offset, index.length
 
 
 def _with_session(blank: RunEntry, session: dict[str, str]) -> RunEntry:

@@ -20,7 +20,7 @@ from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_schemas import Event
-from hilrig_sim.arm.kinematics import forward
+from hilrig_sim.arm.kinematics import forward, jacobian
 from hilrig_sim.arm.model import LARGEST_REGISTER_FORCE, RigParameters
 
 TRAJECTORY_POINTS: Final = 4000
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of the arm in a run."""
+    """Motion of the arm in a run while a controller acts: its command holds, and an effort is not zero."""
 
     tool_path_m: float
     """Path length of the tool, m."""
@@ -172,7 +172,8 @@ class _Collector:
         self._every = max(1, run.file.counts["state"] // TRAJECTORY_POINTS)
         self._pieces: list[tuple[Floats, Rows, Floats]] = []
         self._seen = 0
-        self._last_tip: Floats | None = None
+        self._acting = 0
+        self._last: tuple[Rows, Floats] | None = None
         self._path = self._top_speed = self._work = 0.0
         self._peak, self._saturated = np.zeros(4), np.zeros(4)
         self._poses: dict[str, Any] = {}
@@ -204,16 +205,10 @@ class _Collector:
         pose = np.ascontiguousarray(forward(self._parameters.arm, states["position"].T).T)
         tip = pose[:, :3]
         if self._grader is not None:
-            self._grader.add_states(time_s, pose, under_command(self._run, states))
-        path = tip if self._last_tip is None else np.concatenate((self._last_tip, tip))
-        lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        step_s = self._run.step_ns / 1e9
-        self._path += float(lengths.sum())
-        self._top_speed = max(self._top_speed, float(lengths.max(initial=0.0)) / step_s)
-        self._work += float(np.abs(states["effort"] * states["velocity"]).sum()) * step_s
-        magnitude = np.abs(states["effort"])
-        self._peak = np.maximum(self._peak, magnitude.max(axis=0))
-        self._saturated += (magnitude >= _SATURATED).sum(axis=0)
+            jacobians = jacobian(self._parameters.arm, states["position"].T)
+            velocity = np.einsum("ijn,nj->ni", jacobians, states["velocity"])
+            self._grader.add_states(time_s, pose, velocity, under_command(self._run, states))
+        self._add_motion(states, tip)
         first = -self._seen % self._every
         self._pieces.append(
             (
@@ -224,7 +219,26 @@ class _Collector:
             )
         )
         self._seen += len(states)
-        self._last_tip = tip[-1:]
+
+    def _add_motion(self, states: Rows, tip: Floats) -> None:
+        """Add path, speed, work and efforts while a controller acts: from each such state to the next one."""
+        if self._last is not None:
+            states, tip = np.concatenate((self._last[0], states)), np.concatenate((self._last[1], tip))
+        self._last = states[-1:].copy(), tip[-1:].copy()
+        acts = under_command(self._run, states) & (states["effort"] != 0).any(axis=1)
+        follows = np.diff(states["step"].astype(np.int64)) == 1
+        follows &= states["incarnation"][1:] == states["incarnation"][:-1]
+        rows = np.flatnonzero(acts[:-1] & follows)
+        lengths = np.linalg.norm(tip[rows + 1] - tip[rows], axis=1)
+        step_s = self._run.step_ns / 1e9
+        self._path += float(lengths.sum())
+        self._top_speed = max(self._top_speed, float(lengths.max(initial=0.0)) / step_s)
+        # The effort is constant over a step: trapezoidal rule for the speed.
+        effort, velocity = np.abs(states["effort"][rows]), np.abs(states["velocity"])
+        self._work += float((effort * (velocity[rows] + velocity[rows + 1]) / 2).sum()) * step_s
+        self._acting += len(rows)
+        self._peak = np.maximum(self._peak, effort.max(axis=0, initial=0.0))
+        self._saturated += (effort >= _SATURATED).sum(axis=0)
 
     def grade(self) -> Grade | None:
         return None if self._grader is None else self._grader.grade(self.placement())
@@ -235,7 +249,7 @@ class _Collector:
             top_speed=self._top_speed,
             work_j=self._work,
             peak_effort=joint_values(self._peak),
-            saturated_share=joint_values(self._saturated / max(self._seen, 1)),
+            saturated_share=joint_values(self._saturated / max(self._acting, 1)),
         )
 
     def placement(self) -> PlacementReport | None:

@@ -4,8 +4,11 @@ A run is read in blocks. Each block is split into intervals that are simulated i
 rig: the results of a rig do not depend on the number of rigs. An interval starts at a recorded state and then uses only
 the recorded efforts and the magnet. Its last step must lead to the first state of the next interval, and the last
 interval of a block continues in the next block, so the complete run is re-simulated. An hour takes seconds.
+
+Every published field that the simulation computes is compared, and effort and magnet of each state with its command.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -20,7 +23,7 @@ from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
 from hilrig_sim.arm.joints import JOINT_SCALE
-from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.model import LARGEST_EFFORT, RigParameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.plant.world import NO_PART
 from hilrig_sim.platform_fingerprint import machine_name
@@ -35,6 +38,12 @@ MIN_INTERVAL_STEPS: Final = 50
 """Minimum number of steps per interval, unless a gap ends it earlier."""
 BLOCK_STATES: Final = 16_384
 """Number of states in memory."""
+
+COMMAND_WINDOW_ROWS: Final = 1024
+"""States and commands of previous blocks that are searched for a match."""
+_DRIVE: Final = np.dtype([("key", "<u8"), ("effort", "<f8", (4,)), ("magnet", "?")])
+_OPTIONAL_FIELDS: Final = ("integration error", "sub-steps", "velocity of the parts")
+_EFFORT_RANGE: Final = (-LARGEST_EFFORT, LARGEST_EFFORT)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -51,7 +60,7 @@ class Verification:
     gaps: int
     """Number of gaps in the recorded states."""
     exact: bool
-    """Position and velocity of all compared states are bit-identical to the recording."""
+    """All compared fields are bit-identical to the recording."""
     tolerance: float
     """Allowed deviation; rad, m, rad/s, m/s."""
     largest_deviation: JointValues
@@ -62,13 +71,17 @@ class Verification:
     """Largest deviation of the center of a part, m."""
     first_diverging_step: int | None
     """First step whose effort does not lead to the next recorded state; None: no divergence."""
+    differing: dict[str, int]
+    """Number of states with a deviation beyond the tolerance, by field; without the fields that agree."""
+    not_checked: tuple[str, ...]
+    """Fields that the recording lacks."""
     machine: str
     """Platform on which the run was recorded."""
 
     @property
     def same(self) -> bool:
         """Whether the re-simulation reproduces the recorded states."""
-        return self.first_diverging_step is None and self.steps > 0
+        return self.first_diverging_step is None and not self.differing and self.steps > 0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -79,12 +92,20 @@ class Verification:
         skipped = f" ({self.skipped} more skipped because of {self.gaps} gaps)" if self.skipped else ""
         if self.steps == 0:
             return f"no step could be re-simulated{skipped}"
-        head = f"{self.steps} steps re-simulated{skipped}"
+        missing = f"; not in the recording, not checked: {', '.join(self.not_checked)}" if self.not_checked else ""
+        return self._result(f"{self.steps} steps re-simulated{skipped}") + missing
+
+    def _result(self, head: str) -> str:
+        fields = ", ".join(
+            f"{name} ({count} {'state' if count == 1 else 'states'})" for name, count in self.differing.items()
+        )
+        if self.first_diverging_step is None and fields:
+            return f"{head}; differing from the recording: {fields}"
         if self.first_diverging_step is not None:
             step = self.first_diverging_step
             return (
                 f"{head}; step {step} does not lead to the recorded state of step {step + 1}; largest deviations "
-                f"{self._deviations()}"
+                f"{self._deviations()}; differing fields: {fields}"
             )
         if self.exact:
             return f"{head}, bit-identical to the recording"
@@ -114,8 +135,10 @@ def verify(path: Path, tolerance: float | None = None) -> Verification:
     if tolerance is None:
         tolerance = 0.0 if machine == machine_name() else OTHER_PLATFORM_TOLERANCE
     resimulation = _Resimulation(run, parameters, tolerance)
-    for block in run.blocks(frozenset({"state"}), rows=BLOCK_STATES):
-        resimulation.add(block.states, block.parts)
+    for block in run.blocks(frozenset({"state", "command"}), rows=BLOCK_STATES):
+        resimulation.check_commands(block.states, block.commands)
+        if len(block.states):
+            resimulation.add(block.states, block.parts)
     return resimulation.result(machine)
 
 
@@ -157,6 +180,14 @@ class _Resimulation:
         self._exact = True
         self._first: int | None = None
         self._largest, self._largest_velocity, self._largest_part = np.zeros(4), np.zeros(4), 0.0
+        self._differing: Counter[str] = Counter()
+        self._recorded: set[str] = set()
+        """Optional fields that the recording contains."""
+        self._commands = _CommandCheck()
+
+    def check_commands(self, states: Rows, commands: Rows) -> None:
+        """Compare the next block of commands with the states at which they act."""
+        self._differing["effort or magnet of the command"] += self._commands.add(states, commands)
 
     def add(self, states: Rows, parts: Rows) -> None:
         """Re-simulate the next block."""
@@ -185,6 +216,8 @@ class _Resimulation:
             largest_velocity_deviation=joint_values(self._largest_velocity),
             largest_part_deviation=self._largest_part,
             first_diverging_step=self._first,
+            differing={name: count for name, count in self._differing.items() if count},
+            not_checked=tuple(name for name in _OPTIONAL_FIELDS if name not in self._recorded),
             machine=machine,
         )
 
@@ -219,15 +252,39 @@ class _Resimulation:
 
     def _compare(self, block: _Block, plant: Plant, rigs: Ints, rows: Ints) -> int:
         """Compare the states of rigs with recorded rows; returns the first row that diverges, or the number of rows."""
-        off = np.abs(plant.position[:, rigs].T - block.states["position"][rows])
-        off_velocity = np.abs(plant.velocity[:, rigs].T - block.states["velocity"][rows])
-        worst = np.maximum(off, off_velocity).max(axis=1)
-        self._exact &= not worst.any()
+        states, arm = block.states[rows], self._parameters.arm
+        off = np.abs(plant.position[:, rigs].T - states["position"])
+        off_velocity = np.abs(plant.velocity[:, rigs].T - states["velocity"])
         np.maximum(self._largest, off.max(axis=0), out=self._largest)
         np.maximum(self._largest_velocity, off_velocity.max(axis=0), out=self._largest_velocity)
         off_parts = self._part_deviation(block, plant, rigs, rows)
         self._largest_part = max(self._largest_part, float(off_parts.max()))
-        diverging = ~(worst <= self._tolerance) | ~(off_parts <= PARTS_TOLERANCE)
+        wrench = np.stack([states["external_force_z"], states["external_torque_z"]], axis=1)
+        off_wrench = np.abs(wrench - (arm.external_force_z, arm.external_torque_z))
+        deviations = {
+            "position": (off, self._tolerance),
+            "velocity": (off_velocity, self._tolerance),
+            "parts": (off_parts[:, np.newaxis], PARTS_TOLERANCE),
+            "limit flags": (np.array(plant.limit_flags)[rigs, np.newaxis] != states["limit_flags"][:, np.newaxis], 0.0),
+            "external wrench": (off_wrench, 0.0),
+        }
+        if states["integration_error"].any():
+            self._recorded.add("integration error")
+        if "integration error" in self._recorded:
+            off_error = np.abs(plant.error[:, rigs].T - states["integration_error"])
+            deviations["integration error"] = (off_error, self._tolerance)
+        if states["substeps"].any():
+            self._recorded.add("sub-steps")
+        if "sub-steps" in self._recorded:
+            deviations["sub-steps"] = (plant.substeps[rigs, np.newaxis] != states["substeps"][:, np.newaxis], 0.0)
+        diverging = np.zeros(len(rows), dtype=np.bool_)
+        for name, (deviation, tolerance) in deviations.items():
+            worst = deviation.max(axis=1)
+            if name != "parts":
+                self._exact &= not worst.any()
+            differs = ~(worst <= tolerance)
+            self._differing[name] += int(np.count_nonzero(differs))
+            diverging |= differs
         return int(rows[diverging].min()) - 1 if diverging.any() else len(block.states)
 
     def _intervals(self, block: _Block) -> list[tuple[int, int]]:
@@ -264,17 +321,58 @@ class _Resimulation:
         plant.set_state(rig, state["position"], state["velocity"], poses, int(block.held[row]))
 
     def _part_deviation(self, block: _Block, plant: Plant, rigs: Ints, rows: Ints) -> Floats:
-        """Largest deviation of a part from the recording, m, shape (rigs,); infinite if another part is held."""
+        """Largest deviation of a part from the recording, m, m/s or rad, (rigs,); infinite if another part is held."""
         world = plant.world
         off = np.where(world.held[rigs] == block.held[rows], 0.0, np.inf)
         has_parts = np.flatnonzero(block.first_part[rows] >= 0)
         count = len(self._parameters.scene.parts)
         if has_parts.size and count:
             recorded = block.parts[block.first_part[rows[has_parts]][:, np.newaxis] + np.arange(count)]
-            for name, simulated in (("x", world.x), ("y", world.y), ("z", world.z)):
+            compared = {"x": world.x, "y": world.y, "z": world.z, "yaw": world.yaw}
+            if self._parameters.sim.plant_version > 1:
+                self._recorded.add("velocity of the parts")
+                compared |= dict(zip(("vx", "vy", "vz"), world.velocity, strict=True))
+            for name, simulated in compared.items():
                 distance = np.abs(simulated[:count, rigs[has_parts]].T - recorded[name]).max(axis=1)
                 off[has_parts] = np.maximum(off[has_parts], distance)
         return off
+
+
+class _CommandCheck:
+    """Compares the effort and magnet of each command with those of the state at which it first acts."""
+
+    def __init__(self) -> None:
+        self._applied = np.empty(0, _DRIVE)
+        self._waiting = np.empty(0, _DRIVE)
+
+    def add(self, states: Rows, commands: Rows) -> int:
+        """Add a block; return the number of commands that differ from their state. A command may never act."""
+        acting = states[(states["command_seq"] > 0) & ~states["safe"]]
+        applied = np.concatenate((self._applied, _drives(acting, acting["command_seq"])))
+        # The first state of each command.
+        applied = applied[np.sort(np.unique(applied["key"], return_index=True)[1])]
+        waiting = np.concatenate((self._waiting, _drives(commands, commands["seq"])))
+        order = np.argsort(applied["key"], kind="stable")
+        differing, found = 0, np.zeros(len(waiting), dtype=np.bool_)
+        if len(applied):
+            places = np.searchsorted(applied["key"][order], waiting["key"])
+            rows = order[np.minimum(places, len(order) - 1)]
+            found = applied["key"][rows] == waiting["key"]
+            sent, acts = waiting[found], applied[rows[found]]
+            effort = np.clip(np.nan_to_num(sent["effort"], posinf=np.inf, neginf=-np.inf), *_EFFORT_RANGE)
+            differs = (effort != acts["effort"]).any(axis=1) | (sent["magnet"] != acts["magnet"])
+            differing = int(np.count_nonzero(differs))
+        self._applied = applied[-COMMAND_WINDOW_ROWS:].copy()
+        self._waiting = waiting[~found][-COMMAND_WINDOW_ROWS:].copy()
+        return differing
+
+
+def _drives(rows: Rows, seq: NDArray[Any]) -> NDArray[np.void]:
+    drives = np.empty(len(rows), _DRIVE)
+    # A session code has 16 bits, a sequence number less than 48.
+    drives["key"] = (rows["session"].astype(np.uint64) << np.uint64(48)) | seq
+    drives["effort"], drives["magnet"] = rows["effort"], rows["magnet"]
+    return drives
 
 
 def _indices(codes: Rows, names: StringTable, parts: Sequence[str]) -> Ints:

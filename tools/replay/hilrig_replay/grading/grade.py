@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hilrig_replay.grading.interpolation import Interpolation
 from hilrig_replay.grading.path_goal import PathGoal, PathResult
 from hilrig_replay.grading.placement import PlacementReport
 from hilrig_replay.grading.pose_goal import PoseGoals, PoseResult
@@ -108,15 +109,17 @@ class Grader:
         self._parameters = parameters
         self._poses = PoseGoals(task.poses)
         self._path = None if task.path is None else PathGoal(task.path)
+        self._motion = Interpolation()
         self._dropped_s: dict[str, float] = {}
         self._began_s: float | None = None
 
-    def add_states(self, time_s: Floats, pose: Floats, commanded: NDArray[np.bool_]) -> None:
+    def add_states(self, time_s: Floats, pose: Floats, velocity: Floats, commanded: NDArray[np.bool_]) -> None:
         """Add states.
 
         Args:
             time_s: times of the states, increasing, shape (n,).
             pose: pose of the tool, shape (n, 4): x, y, z in m, yaw in rad.
+            velocity: derivatives of the pose, shape (n, 4).
             commanded: whether a command of the session's controller acted, shape (n,).
         """
         if self._began_s is None:
@@ -124,9 +127,9 @@ class Grader:
                 return
             first = int(np.argmax(commanded))
             self._began_s = float(time_s[first])
-            time_s, pose = time_s[first:], pose[first:]
+            time_s, pose, velocity = time_s[first:], pose[first:], velocity[first:]
         limit_s = self._task.time_limit_s
-        within = time_s - self._began_s
+        within, pose = self._motion.add(time_s - self._began_s, pose, velocity)
         if limit_s:
             count = int(np.searchsorted(within, limit_s, side="right"))
             within, pose = within[:count], pose[:count]

@@ -1,8 +1,9 @@
-"""Path goal: how much of a path the tool covered, and the tracking error.
+"""Path goal: how much of a path the tool covered in its order, and the tracking error.
 
 Tracking starts when the tool first reaches the first point of the path, and ends when the tool is at the last point and
-the path is covered. Covered are the points within the tolerance of the tool, and the points between two consecutive
-states along the path.
+the path is covered. The position along the path is followed continuously: near its last position, so that a stretch
+that the path passes twice, or a loop, counts each time that the tool passes it. All is measured on the motion between
+the states (`interpolation`).
 """
 
 import math
@@ -20,11 +21,16 @@ MIN_COVERED_SHARE: Final = 0.98
 """Minimum covered share of a finished path."""
 PATH_CELLS: Final = 1000
 """Number of cells of equal length in which coverage is counted."""
-STATES_PER_BLOCK: Final = 2000
-"""States that are processed together; bounds the memory."""
+LONGEST_MOVE_SHARE: Final = 0.25
+"""The motion is evaluated after each move of this share of the tolerance."""
+EVALUATION_PERIOD_S: Final = 0.02
+"""Longest time between two evaluations, s."""
 MAX_ADVANCE_RATIO: Final = 2.0
-"""Maximum advance along the path between two states, relative to the distance that the tool moved (plus the tolerance):
-the tool may cut corners slightly. A larger advance is a jump, and the path in between is not covered."""
+"""Maximum advance along the path, relative to the distance that the tool moved since it was last on the path (plus
+twice the tolerance): the tool may cut corners slightly. Points farther ahead are another stretch of the path."""
+BACKWARD_PENALTY: Final = 0.5
+"""Of two stretches within reach, the later one is taken unless the tool is nearer to the earlier one by this share of
+the tolerance: at a turning point both are equally near."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +62,20 @@ class PathResult:
 
 @dataclass(slots=True)
 class _Errors:
-    """Accumulated distances, m."""
+    """Accumulated distances over time, m, s."""
 
     squares: float = 0.0
-    count: int = 0
+    time_s: float = 0.0
     largest: float = 0.0
 
-    def add(self, error: float) -> None:
-        self.squares += error * error
-        self.count += 1
+    def add(self, error: float, time_s: float) -> None:
+        self.squares += error * error * time_s
+        self.time_s += time_s
         self.largest = max(self.largest, error)
 
     def join(self, other: "_Errors") -> None:
         self.squares += other.squares
-        self.count += other.count
+        self.time_s += other.time_s
         self.largest = max(self.largest, other.largest)
 
 
@@ -85,63 +91,89 @@ class PathGoal:
         self._ends = points[0], points[-1]
         self._tolerance = path.tolerance_mm / 1000
         self._covered = np.zeros(PATH_CELLS, np.bool_)
+        self._along: float | None = None
+        """Last position of the tool along the path, m; None: it has not reached the first point."""
+        self._on_path = False
+        """Whether the tool was on the path at the last evaluated state."""
+        self._moved = 0.0
+        """Distance that the tool moved since then, m."""
         self._last: tuple[float, Floats] | None = None
-        """Position of the tool along the path, m, and in the world at the previous state; None: not on the path."""
+        """Time, s, and position of the last state."""
+        self._pending_s = 0.0
+        """Time since the last evaluated state, s."""
         self._began_s: float | None = None
         self._done_s: float | None = None
         self._tracking, self._off_path = _Errors(), _Errors()
 
     def add(self, time_s: Floats, tip: Floats) -> None:
-        """Add states: times, shape (n,), and positions of the tool, shape (n, 3), m."""
-        for start in range(0, len(time_s), STATES_PER_BLOCK):
-            if self._done_s is not None:
-                return
-            self._add(time_s[start : start + STATES_PER_BLOCK], tip[start : start + STATES_PER_BLOCK])
-
-    def _add(self, time_s: Floats, tip: Floats) -> None:
+        """Add states of the interpolated motion: times, (n,), and positions of the tool, (n, 3), m."""
         if self._began_s is None:
             at_start = np.linalg.norm(tip - self._ends[0], axis=1) <= self._tolerance
             if not at_start.any():
                 return
             first = int(np.argmax(at_start))
-            self._began_s = float(time_s[first])
             time_s, tip = time_s[first:], tip[first:]
-        apart, along = self._nearest(tip)
-        at_end = np.linalg.norm(tip - self._ends[1], axis=1) <= self._tolerance
-        for row in range(len(tip)):
-            self._off_path.add(float(apart[row]))
-            if apart[row] > self._tolerance:
-                self._last = None
-                continue
-            # Deviations between two states on the path count; those after the last state on the path do not.
-            self._tracking.join(self._off_path)
-            self._off_path = _Errors()
-            self._cover(float(along[row]), tip[row])
-            if at_end[row] and self._covered.mean() >= MIN_COVERED_SHARE:
-                self._done_s = float(time_s[row])
-                break
+            self._began_s, self._along, self._on_path = float(time_s[0]), 0.0, True
+            self._last = float(time_s[0]), tip[0]
+            self._evaluate(float(time_s[0]), tip[0])
+            time_s, tip = time_s[1:], tip[1:]
+        if self._done_s is not None or not len(time_s):
+            return
+        assert self._last is not None
+        before = np.concatenate((self._last[1][np.newaxis], tip[:-1]))
+        moves = np.linalg.norm(tip - before, axis=1).tolist()
+        times = np.diff(time_s, prepend=self._last[0]).tolist()
+        longest = LONGEST_MOVE_SHARE * self._tolerance
+        self._last = float(time_s[-1]), tip[-1].copy()
+        since = self._moved if self._on_path else 0.0
+        for row, (move, span_s) in enumerate(zip(moves, times, strict=True)):
+            self._moved += move
+            since += move
+            self._pending_s += span_s
+            # A tool that hardly moves is evaluated less often.
+            if since >= longest or self._pending_s >= EVALUATION_PERIOD_S:
+                since = 0.0
+                self._evaluate(float(time_s[row]), tip[row])
+                if self._done_s is not None:
+                    return
 
-    def _cover(self, along: float, tip: Floats) -> None:
-        """Mark the path between the previous position and `along` (m along the path) as covered."""
-        before = along
-        if self._last is not None:
-            last_along, last_tip = self._last
-            moved = float(np.linalg.norm(tip - last_tip))
-            if abs(along - last_along) <= MAX_ADVANCE_RATIO * moved + self._tolerance:
-                before = last_along
+    def _evaluate(self, time_s: float, tip: Floats) -> None:
+        """Follow the position along the path, count coverage and error."""
+        assert self._along is not None
+        reach = MAX_ADVANCE_RATIO * self._moved + 2 * self._tolerance
+        apart, along = self._nearest(tip, self._along - reach, self._along + reach)
+        self._off_path.add(apart, self._pending_s)
+        self._pending_s = 0.0
+        if apart > self._tolerance:
+            self._on_path = False
+            return
+        # Deviations between two times on the path count; those after the last time on the path do not.
+        self._tracking.join(self._off_path)
+        self._off_path = _Errors()
+        before = self._along if self._on_path else along
         low, high = (along_m / self._length * PATH_CELLS for along_m in sorted((before, along)))
         around = self._tolerance / self._length * PATH_CELLS
         self._covered[max(0, math.floor(low - around)) : math.ceil(high + around)] = True
-        self._last = (along, tip)
+        self._along, self._on_path, self._moved = along, True, 0.0
+        at_end = float(np.linalg.norm(tip - self._ends[1])) <= self._tolerance
+        if at_end and along >= self._length - 2 * self._tolerance and self._covered.mean() >= MIN_COVERED_SHARE:
+            self._done_s = time_s
 
-    def _nearest(self, tip: Floats) -> tuple[Floats, Floats]:
-        """Distance of the tool from the path, and position of the nearest point along the path, m, shapes (n,)."""
-        share = np.einsum("nsk,sk->ns", tip[:, None] - self._begin, self._segments) / self._lengths**2
-        share = np.clip(share, 0.0, 1.0)
-        apart = np.linalg.norm(tip[:, None] - self._begin - share[..., None] * self._segments, axis=2)
-        segment = np.argmin(apart, axis=1)
-        rows = np.arange(len(tip))
-        return apart[rows, segment], self._from_start[segment] + share[rows, segment] * self._lengths[segment]
+    def _nearest(self, tip: Floats, low: float, high: float) -> tuple[float, float]:
+        """Return distance and position of the nearest point of the path between two positions along it, m."""
+        assert self._along is not None
+        starts, lengths = self._from_start[:-1], self._lengths
+        within = np.flatnonzero((starts <= high) & (starts + lengths >= low))
+        starts, lengths = starts[within], lengths[within]
+        begin, segments = self._begin[within], self._segments[within]
+        share = np.einsum("sk,sk->s", tip - begin, segments) / lengths**2
+        share = np.minimum(np.maximum(share, np.maximum(low - starts, 0.0) / lengths), (high - starts) / lengths)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        apart = np.linalg.norm(tip - begin - share[:, np.newaxis] * segments, axis=1)
+        along = starts + share * lengths
+        cost = apart + np.where(along < self._along, BACKWARD_PENALTY * self._tolerance, 0.0)
+        best = int(np.argmin(cost))
+        return float(apart[best]), float(along[best])
 
     def result(self) -> PathResult:
         """Result of the states that were added."""
@@ -151,6 +183,6 @@ class PathGoal:
             covered=float(self._covered.mean()) if self._done_s is None else 1.0,
             began_s=self._began_s,
             done_s=self._done_s,
-            rms_mm=1000 * math.sqrt(tracking.squares / tracking.count) if tracking.count else None,
-            largest_mm=1000 * tracking.largest if tracking.count else None,
+            rms_mm=1000 * math.sqrt(tracking.squares / tracking.time_s) if tracking.time_s else None,
+            largest_mm=1000 * tracking.largest if tracking.time_s else None,
         )

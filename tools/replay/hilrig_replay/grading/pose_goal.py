@@ -2,7 +2,8 @@
 
 A pose is reached when the tool was within its tolerances for its hold time; then the next pose is the target. As in a
 step response, the settling time is measured from the start of the target's turn until the tool stays within the
-tolerances, and the overshoot is measured along the straight line from the start position of the turn to the pose.
+tolerances, and the overshoot is measured along the straight line from the start position of the turn to the pose. All
+are measured on the motion between the states (`interpolation`).
 """
 
 import math
@@ -13,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hilrig_replay.grading.interpolation import yaw_error
 from hilrig_runtime.config.task import PoseConfig
 
 Floats = NDArray[np.float64]
@@ -39,7 +41,7 @@ class PoseResult:
     overshoot_share: float
     """Overshoot as a share of the distance to the pose, 0 to 1."""
     error_mm: float | None
-    """Mean distance from the pose during the hold time, mm."""
+    """Largest distance from the pose during the hold time, mm."""
     closest_mm: float | None
     """Smallest distance from the pose during its turn, mm; None: it never became the target."""
 
@@ -51,7 +53,7 @@ class PoseResult:
             return f"not held; closest distance {self.closest_mm:.1f} mm" if self.closest_mm is not None else "not held"
         return (
             f"reached at {self.reached_s:.1f} s, settled in {self.settling_s:.2f} s, "
-            f"overshoot {self.overshoot_mm:.1f} mm ({self.overshoot_share:.0%}), mean error {self.error_mm:.2f} mm"
+            f"overshoot {self.overshoot_mm:.1f} mm ({self.overshoot_share:.0%}), held within {self.error_mm:.2f} mm"
         )
 
 
@@ -101,7 +103,8 @@ class _Turn:
         self._closest = math.inf
         self._since_s: float | None = None
         """Time since which the tool is within the tolerances without interruption."""
-        self._sum, self._count = 0.0, 0
+        self._farthest = 0.0
+        """Largest distance during this time, m."""
         self.reached_s: float | None = None
 
     def add(self, time_s: Floats, pose: Floats) -> int:
@@ -109,8 +112,7 @@ class _Turn:
         apart = np.linalg.norm(pose[:, :3] - self._goal, axis=1)
         within = apart <= self._pose.tolerance_mm / 1000
         if self._pose.yaw_deg is not None:
-            yaw_error = np.abs(np.angle(np.exp(1j * (pose[:, 3] - math.radians(self._pose.yaw_deg)))))
-            within &= yaw_error <= math.radians(self._pose.yaw_tolerance_deg)
+            within &= yaw_error(pose[:, 3], self._pose.yaw_deg) <= math.radians(self._pose.yaw_tolerance_deg)
         used = self._update_hold(time_s, apart, within)
         apart, along = apart[:used], (pose[:used, :3] - self._start) @ self._direction - self._length
         near = apart <= max(OVERSHOOT_START_SHARE * self._length, self._pose.tolerance_mm / 1000)
@@ -127,14 +129,13 @@ class _Turn:
         changes = np.flatnonzero(np.diff(within)) + 1
         for begin, end in zip([0, *changes.tolist()], [*changes.tolist(), len(within)], strict=True):
             if not within[begin]:
-                self._since_s, self._sum, self._count = None, 0.0, 0
+                self._since_s, self._farthest = None, 0.0
                 continue
             if self._since_s is None:
                 self._since_s = float(time_s[begin])
             complete = begin + int(np.searchsorted(time_s[begin:end], self._since_s + self._pose.hold_s - _ROUNDING_S))
             last = min(complete + 1, end)
-            self._sum += float(apart[begin:last].sum())
-            self._count += last - begin
+            self._farthest = max(self._farthest, float(apart[begin:last].max()))
             if complete < end:
                 self.reached_s = float(time_s[complete])
                 return last
@@ -149,6 +150,6 @@ class _Turn:
             settling_s=self._since_s - self._turn_s if reached and self._since_s is not None else None,
             overshoot_mm=1000 * self._beyond,
             overshoot_share=self._beyond / self._length if self._length else 0.0,
-            error_mm=1000 * self._sum / self._count if reached and self._count else None,
+            error_mm=1000 * self._farthest if reached else None,
             closest_mm=1000 * self._closest if math.isfinite(self._closest) else None,
         )

@@ -58,6 +58,7 @@ STATE_DTYPE: Final = np.dtype(
         ("missed_steps", "<u4"),
         ("sequence", "<u4"),
         ("limit_flags", "<u2"),
+        ("substeps", "<u2"),
         ("session", "<u2"),
         ("held_part", "<u2"),
         ("magnet", "|b1"),
@@ -122,12 +123,15 @@ PART_DTYPE: Final = np.dtype(
         ("y", "<f8"),
         ("z", "<f8"),
         ("yaw", "<f8"),
+        ("vx", "<f8"),
+        ("vy", "<f8"),
+        ("vz", "<f8"),
         ("part", "<u2"),
         ("held", "|b1"),
     ]
 )
-"""One row per `PartState` in a state: center of the part (world, m) and yaw (rad); `part` is a code of a
-`StringTable`."""
+"""One row per `PartState` in a state: center (world, m), yaw (rad) and velocity (m/s) of the part; `part` is a code of
+a `StringTable`."""
 
 
 class StringTable:
@@ -250,6 +254,7 @@ def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> De
             message.missed_steps,
             sequence,
             message.limit_flags,
+            message.substeps,
             code(message.session),
             code(held_part) if held_part else 0,
             message.magnet,
@@ -257,7 +262,17 @@ def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> De
         )
         for part in message.parts:
             add_part(
-                message.step, message.wall_ns, part.x, part.y, part.z, part.yaw, code(part.name), part.name == held_part
+                message.step,
+                message.wall_ns,
+                part.x,
+                part.y,
+                part.z,
+                part.yaw,
+                part.vx,
+                part.vy,
+                part.vz,
+                code(part.name),
+                part.name == held_part,
             )
 
     return decode

@@ -6,6 +6,7 @@ length. For a time range, only the chunks that the file's index lists for it are
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +14,7 @@ import numpy as np
 from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema, Statistics
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
-from hilrig_recorder.mcap_format.fsutil import map_file
+from hilrig_recorder.mcap_format.fsutil import map_file, open_file
 from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.reader import (
     NoMcapError,
@@ -25,6 +26,7 @@ from hilrig_recorder.mcap_format.reader import (
 from hilrig_recorder.mcap_format.records import MAX_TIME_NS, Chunk, ChunkIndex, DamagedError, Message
 from hilrig_recorder.mcap_format.scan import Damage, read_chunk, scan
 from hilrig_replay.io.columns import RowBuffer, Rows
+from hilrig_replay.io.extent import Extent, state_extent
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
 
@@ -48,7 +50,7 @@ class DamagedRecordingError(InputError):
         super().__init__(f"{path}: {self.description}")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RecordingFile:
     """A validated recording file; create it with `open_recording`."""
 
@@ -90,7 +92,7 @@ class RecordingFile:
                     if isinstance(record, Message) and record.channel_id in wanted and low <= record.log_time < high:
                         yield record
                 return
-            with self.path.open("rb") as stream:
+            with open_file(self.path) as stream:
                 reader = file_reader(stream)
                 for chunk in self._select_chunks(wanted, low, high):
                     messages = chunk_records(reader.indexed_chunk(int(chunk["offset"]), int(chunk["length"])), wanted)
@@ -100,6 +102,25 @@ class RecordingFile:
                         yield from (message for message in messages if low <= message.log_time < high)
         except (DamagedError, OSError) as error:
             raise DamagedRecordingError(self.path, str(error)) from error
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Beginning and duration of the states; without states, or an index of them, of the arrivals.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        found = None
+        channels = [channel for channel, topic in self.topics.items() if topic == "state"]
+        chunks = self._select_chunks(channels, -1, MAX_TIME_NS)
+        try:
+            if channels and len(chunks):
+                with open_file(self.path) as stream:
+                    places = [(int(chunk["offset"]), int(chunk["length"])) for chunk in chunks]
+                    found = state_extent(file_reader(stream), places, places[::-1], channels[0])
+        except (DamagedError, OSError) as error:
+            raise DamagedRecordingError(self.path, str(error)) from error
+        return found or Extent(self.start_ns, (self.end_ns - self.start_ns) / 1e9)
 
     def _select_chunks(self, channels: Iterable[int], low: int, high: int) -> Rows:
         """The chunks that may contain messages of the given channels in a time range."""
@@ -149,7 +170,7 @@ def open_recording(path: Path) -> RecordingFile:
         InputError: the file is missing, not a recording, truncated, damaged, or of a newer version.
     """
     try:
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             contents = _read_summary(file_reader(stream)) or _scan_contents(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

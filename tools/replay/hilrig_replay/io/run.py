@@ -166,8 +166,8 @@ class Run:
 
     @property
     def duration_s(self) -> float:
-        """Time from the arrival of the first message at the recorder to the last, s."""
-        return (self.file.end_ns - self.file.start_ns) / 1e9
+        """Time from the first state to the last, s; with an unchanged simulation by its monotonic clock."""
+        return self.file.extent.duration_s
 
     # -- arrays ----------------------------------------------------------------------------------------------------
 

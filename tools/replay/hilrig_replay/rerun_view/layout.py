@@ -86,6 +86,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         if len(roots) == 1
         else plot("Loop latency, ms", paths.LOOP_LATENCY),
         rrb.Tabs(
+            plot("Age of the acting torque's basis at each step, ms", paths.LOOP_AGE, legend=False),
             plot("Tick lateness, ms, and events", paths.TICK_LATENESS, paths.EVENT_MARKERS, legend=False),
             plot("Modbus requests per second", paths.MODBUS),
         ),

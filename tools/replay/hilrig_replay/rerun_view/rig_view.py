@@ -17,6 +17,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
+from hilrig_replay.analysis.age import AgeTracker
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.samples import CommandMatcher, join_commands
 from hilrig_replay.analysis.stages import LOOP_STAGES
@@ -26,6 +27,7 @@ from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.plots.palette import (
+    AGE_COLOR,
     EFFORT_SYMBOLS,
     EVENT_COLORS,
     JOINT_COLORS,
@@ -101,6 +103,8 @@ class RerunRigWriter:
         self._root = root
         self._color = color
         self._matcher = CommandMatcher()
+        self._ages = AgeTracker()
+        self._had_age = False
         self._current_states: dict[str, str] = {}
         self._torque_source = ""
         self._source_colors = {_SAFE: "#e45756", _NO_CONTROLLER: "#3a424c"}
@@ -201,6 +205,7 @@ class RerunRigWriter:
         self._legend(paths.LOOP_LATENCY, ["loop latency"], ["#e0e4e8"])
         self._state_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
         self._state_legend("part", {part.name: part.colour for part in self._geometry.parameters.scene.parts})
+        self._legend(paths.LOOP_AGE, ["age"], [AGE_COLOR])
         self._legend(paths.TICK_LATENESS, ["tick lateness"], ["#e45756"])
 
     def _legend(self, path: str, names: Sequence[str], colors: Iterable[str], width: float = 1.5) -> None:
@@ -221,6 +226,7 @@ class RerunRigWriter:
             self._add_commands(records.commands)
         if len(records.states):
             self._add_states(records.states)
+            self._add_ages(records.states)
             self._add_state("torque", records.states, self._torque_sources(records.states, records.commands))
         if len(records.parts):
             self._add_parts(records.parts)
@@ -247,6 +253,16 @@ class RerunRigWriter:
         self._add_state("magnet", states, np.where(states["magnet"], "on", "off").astype(object))
         self._add_state("part", states, self._names.texts(states["held_part"]))
         self._add_state("limits", states, _limits(states["limit_flags"]))
+
+    def _add_ages(self, states: Rows) -> None:
+        age_ns = self._ages.add(states)["age_ns"]
+        aged = age_ns > 0
+        # The first step without an age ends the line.
+        shown = aged | np.concatenate(([self._had_age], aged[:-1]))
+        self._had_age = bool(aged[-1])
+        if shown.any():
+            ages_ms = np.where(aged, age_ns / 1e6, np.nan)[shown]
+            self._scalars(paths.LOOP_AGE, self._times(states[shown]), ages_ms[:, None])
 
     def _add_pose(self, times: list[rr.TimeColumn], q: NDArray[np.float64]) -> None:
         for joint, values in zip(self._geometry.arm.joints, q.T, strict=True):

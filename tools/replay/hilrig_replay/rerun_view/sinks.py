@@ -14,7 +14,7 @@ APPLICATION = "hilrig"
 
 
 def to_file(path: Path, name: str, blueprint: rrb.Blueprint) -> rr.RecordingStream:
-    """Open a recording stream into a file of `io.output_file.output_file`.
+    """Open a recording stream into a file; the caller has checked its name (`io.output_file`).
 
     Raises:
         OperationError: the file can't be written.

@@ -16,7 +16,7 @@ from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.io.run import Run
 from hilrig_runtime.errors import InputError
-from hilrig_sim.arm.model import RigParameters
+from hilrig_sim.arm.model import AUTO, RigParameters
 from hilrig_study.controllers.control_laws import LawController
 from hilrig_study.linear_model import linearize
 from hilrig_study.study_config import AxisConfig, ControllerConfig, StudyConfig
@@ -128,7 +128,8 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     )
     step_s = run.step_ns * 1e-9
     plant_model = linearize(rig.arm, pose.tolist())
-    phi, gamma = plant_model.discretize(step_s, rig.sim.integrator, rig.sim.substeps)
+    method = () if rig.sim.substeps == AUTO else (rig.sim.integrator, rig.sim.substeps)
+    phi, gamma = plant_model.discretize(step_s, *method)
     loop_ms = report.loop_ms
     plane = study or StudyConfig(x=AxisConfig(what="delay_ms", values=(0.0,)), y=AxisConfig(what="gain", values=(1.0,)))
     offset, ticks = plane.task.scenario().offset, round(plane.loop.duration_s / step_s)

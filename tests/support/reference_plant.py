@@ -1,0 +1,185 @@
+"""Event-driven reference of the arm: scipy's DOP853 with root finding for impacts and for stops that cease to push.
+
+Independent of the plant: equations (25)–(39) with the mass matrix, and the stops as a complementarity problem that is
+solved by trying each set of pushing stops.
+"""
+
+import itertools
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from hilrig_sim.arm.model import GRAVITY, ArmParameters
+
+RTOL, ATOL = 1e-10, 1e-12
+
+
+class ReferenceArm:
+    """One arm, advanced by steps with constant efforts."""
+
+    def __init__(self, arm: ArmParameters, payload: float = 0.0) -> None:
+        self.arm, self.payload = arm, payload
+        self.impacts: list[tuple[int, bool, float]] = []
+        """Joint 1 to 4, whether the stop is the upper one, and speed of each impact of the last step."""
+
+    def mass(self, theta2: float) -> np.ndarray:
+        """Mass matrix of joints 1 and 2."""
+        arm = self.arm
+        total = arm.masses[1] + arm.masses[2] + self.payload
+        c = total * np.cos(theta2) * arm.l2 * arm.l3
+        a11, a12, a22 = arm.l2**2 * (arm.masses[0] + total) + c, c + total * arm.l3**2, total * arm.l3**2
+        return np.array([[a11 + a12, a12], [a12, a22]])
+
+    def plane_force(self, q: np.ndarray, v: np.ndarray, effort: np.ndarray) -> np.ndarray:
+        """τ - k of joints 1 and 2."""
+        arm = self.arm
+        s = np.sin(q[1]) * (arm.masses[1] + arm.masses[2] + self.payload) * arm.l2 * arm.l3
+        k1 = -arm.external_torque_z - s * (2 * v[0] * v[1] + v[1] ** 2) + arm.friction[0] * v[0]
+        k2 = -arm.external_torque_z + s * v[0] ** 2 + arm.friction[1] * v[1]
+        return effort[:2] - np.array([k1, k2])
+
+    def step(
+        self, q: np.ndarray, v: np.ndarray, effort: np.ndarray, duration: float, upper3: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and velocity, (4,) each, after `duration`; `upper3`: d3 of the surface below the tool."""
+        self.impacts = []
+        q, v = np.array(q, dtype=float), np.array(v, dtype=float)
+        q[:2], v[:2] = self._plane(q[:2], v[:2], effort, duration)
+        arm = self.arm
+        mass3 = arm.masses[2] + self.payload
+        force3 = effort[2] - arm.external_force_z + GRAVITY * mass3
+        for joint, mass, force in ((2, mass3, force3), (3, arm.j4, effort[3] + arm.external_torque_z)):
+            upper = arm.upper[joint] if joint == 3 or upper3 is None else upper3
+            q[joint], v[joint] = self._linear(
+                joint, q[joint], v[joint], force / mass, arm.friction[joint] / mass, upper, duration
+            )
+        return q, v
+
+    def _linear(
+        self, joint: int, q: float, v: float, c: float, rate: float, upper: float, left: float
+    ) -> tuple[float, float]:
+        lower = self.arm.lower[joint]
+        while left > 0:
+            side = int(q >= upper) - int(q <= lower)
+            if side * v > 0:
+                self.impacts.append((joint + 1, side > 0, abs(v)))
+                v = 0.0
+            if side and v == 0 and side * c > 0:
+                return q, 0.0
+
+            def rise(_: float, y: np.ndarray) -> float:
+                return float(y[0] - upper)
+
+            def fall(_: float, y: np.ndarray) -> float:
+                return float(y[0] - lower)
+
+            def turn(_: float, y: np.ndarray) -> float:
+                return float(y[1])
+
+            for event, direction in ((rise, 1), (fall, -1), (turn, 0)):
+                event.terminal, event.direction = True, direction  # type: ignore[attr-defined]
+
+            def solve(duration: float, events: list[Any], start: tuple[float, float] = (q, v)) -> Any:
+                return solve_ivp(
+                    lambda _, y: [y[1], c - rate * y[1]],
+                    (0, duration),
+                    start,
+                    method="DOP853",
+                    rtol=RTOL,
+                    atol=ATOL,
+                    events=events,
+                )
+
+            # Up to a turning point and from it on, the position is monotonic, so no root of an event is missed.
+            duration = float(solve(left, [turn]).t[-1]) if v * c < 0 else left
+            run = solve(duration, [rise, fall])
+            q, v = run.y[:, -1]
+            if run.status == 1:
+                q = upper if run.t_events[0].size else lower
+            elif duration < left:
+                v = 0.0
+            left -= run.t[-1]
+        return q, v
+
+    def _plane(self, q: np.ndarray, v: np.ndarray, effort: np.ndarray, left: float) -> tuple[np.ndarray, np.ndarray]:
+        lower, upper = np.array(self.arm.lower[:2]), np.array(self.arm.upper[:2])
+        free = [False, False]
+        for _ in range(1000):
+            # The impacts of two joints in a corner follow each other ever faster: they end with both at rest.
+            for limit in (lower, upper):
+                rests = (np.abs(q - limit) < 1e-8) & (np.abs(v) < 1e-3)
+                q, v = np.where(rests, limit, q), np.where(rests, 0.0, v)
+            side = (q >= upper).astype(float) - (q <= lower)
+            for joint in np.flatnonzero(side * v > 1e-12):
+                self.impacts.append((int(joint) + 1, bool(side[joint] > 0), abs(float(v[joint]))))
+            v, _ = self._complementary(self.mass(q[1]), v, side)
+            if left <= 0:
+                return q, v
+            v[(side != 0) & (np.abs(v) < 1e-12)] = 0.0
+            resting = np.where((v == 0) & ~np.array(free), side, 0.0)
+            acceleration = np.linalg.solve(self.mass(q[1]), self.plane_force(q, v, effort))
+            _, held = self._complementary(self.mass(q[1]), acceleration, resting)
+            free = [False, False]
+
+            def acceleration_of(y: np.ndarray, fixed: tuple[int, ...]) -> np.ndarray:
+                m, f = self.mass(y[1]), self.plane_force(y[:2], y[2:], effort)
+                a = np.zeros(2)
+                rest = [joint for joint in (0, 1) if joint not in fixed]
+                if rest:
+                    a[rest] = np.linalg.solve(m[np.ix_(rest, rest)], f[rest])
+                return a
+
+            def reaction(y: np.ndarray, joint: int, held: tuple[int, ...] = held) -> float:
+                m, f = self.mass(y[1]), self.plane_force(y[:2], y[2:], effort)
+                return float(f[joint] - (m @ acceleration_of(y, held))[joint])
+
+            events = []
+            for joint in (0, 1):
+                if joint in held:
+                    sign = side[joint]
+                    event = lambda _, y, joint=joint, sign=sign: sign * reaction(y, joint)  # noqa: E731
+                    directions = [(event, -1, "release", joint, None)]
+                else:
+                    # A joint that starts at its stop must not be found there.
+                    high = lambda _, y, joint=joint: y[joint] - upper[joint] - 1e-12  # noqa: E731
+                    low = lambda _, y, joint=joint: y[joint] - lower[joint] + 1e-12  # noqa: E731
+                    directions = [(high, 1, "hit", joint, upper[joint]), (low, -1, "hit", joint, lower[joint])]
+                events += directions
+            for event, direction, *_ in events:
+                event.terminal, event.direction = True, direction
+            run = solve_ivp(
+                lambda _, y, held=held: np.concatenate([y[2:], acceleration_of(y, held)]),
+                (0, left),
+                np.concatenate([q, v]),
+                method="DOP853",
+                rtol=RTOL,
+                atol=ATOL,
+                events=[event for event, *_ in events],
+                max_step=0.0005 if np.minimum(q - lower, upper - q).min() < 0.3 else np.inf,
+            )
+            q, v = run.y[:2, -1].copy(), run.y[2:, -1].copy()
+            left = left - run.t[-1] if run.status == 1 else 0.0
+            for found, (_, _, kind, joint, limit) in zip(run.t_events, events, strict=True):
+                if found.size and kind == "hit":
+                    q[joint] = limit
+                elif found.size:
+                    free[joint] = True
+        raise AssertionError("the reference found no end of the step")
+
+    @staticmethod
+    def _complementary(mass: np.ndarray, rate: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+        """Return the rates where stops push inward only and no joint moves outward, and the joints that they push."""
+        contacts = [joint for joint in (0, 1) if side[joint]]
+        for number in range(len(contacts) + 1):
+            for chosen in itertools.combinations(contacts, number):
+                push = np.zeros(2)
+                if chosen:
+                    inverse = np.linalg.inv(mass)
+                    index = list(chosen)
+                    push[index] = np.linalg.solve(inverse[np.ix_(index, index)], -rate[index])
+                after = rate + np.linalg.solve(mass, push)
+                after[list(chosen)] = 0.0
+                if np.all(side * push <= 0) and np.all(side * after <= 1e-12):
+                    return after, chosen
+        raise AssertionError("no solution")

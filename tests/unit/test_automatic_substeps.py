@@ -1,0 +1,154 @@
+"""Automatic sub-steps compared with the event-driven reference: accuracy, impacts, and independence of the rigs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilrig_sim.accuracy import accuracy_warnings
+from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, StepParameters
+from hilrig_sim.arm.stability import ERROR_BOUND, MAX_SUBSTEPS
+from hilrig_sim.plant.hard_stops import first_arrival
+from hilrig_sim.plant.linear_joints import free_motion, move_between_stops
+from hilrig_sim.plant.plant import Plant
+from support.reference_plant import ReferenceArm
+
+ARM = ArmParameters()
+NOTHING_BELOW = SceneParameters(table_height=-1.0)
+FULL = 32.767
+RIGS = 20
+
+
+def rig(step_ns: int = 20_000_000, **sim: object) -> RigParameters:
+    return RigParameters(sim=StepParameters(step_ns=step_ns, **sim), scene=NOTHING_BELOW)  # type: ignore[arg-type]
+
+
+def random_efforts(random: np.random.Generator, count: int) -> np.ndarray:
+    signs = random.choice((-FULL, FULL), (4, count))
+    return np.where(random.random(count) < 0.5, signs, random.uniform(-FULL, FULL, (4, count)))
+
+
+@pytest.mark.parametrize(("step_ns", "steps"), [(20_000_000, 12), (5_000_000, 10), (1_000_000, 6)])
+def test_steps_and_impacts_equal_the_reference(step_ns: int, steps: int) -> None:
+    random = np.random.default_rng(step_ns)
+    plant, reference = Plant([rig(step_ns)] * RIGS), ReferenceArm(ARM)
+    impacts = 0
+    for step in range(20 + steps):
+        effort, position, velocity = random_efforts(random, RIGS), plant.position.copy(), plant.velocity.copy()
+        if step == 20 - 1 and step_ns < 20_000_000:
+            # Arms near their stops, so that many of them are hit within a short step.
+            plant.position[:2] = np.array([ARM.upper[:2]]).T - random.uniform(0, 0.02, (2, RIGS))
+        events = list(plant.step(effort, np.zeros(RIGS, dtype=np.bool_)))
+        if step < 20:
+            continue
+        for index in range(RIGS):
+            q, v = reference.step(position[:, index], velocity[:, index], effort[:, index], step_ns * 1e-9)
+            assert np.all(np.abs(plant.position[:, index] - q) < ERROR_BOUND)
+            speed = max(np.abs(velocity[:2, index]).max(), np.abs(v[:2]).max(), 0.01)
+            assert np.abs(plant.velocity[:2, index] - v[:2]).max() < 0.01 * speed
+            np.testing.assert_allclose(plant.velocity[2:, index], v[2:], rtol=1e-6, atol=1e-6)
+            found = sorted((hit.joint, hit.upper, hit.speed) for hit in events if hit.rig == index)
+            expected = sorted(hit for hit in reference.impacts if hit[2] > 1e-3)
+            assert [hit[:2] for hit in found if hit[2] > 1e-3] == [hit[:2] for hit in expected]
+            np.testing.assert_allclose(
+                [hit[2] for hit in found if hit[2] > 1e-3], [hit[2] for hit in expected], rtol=0.01, atol=0.01
+            )
+            impacts += len(expected)
+    assert impacts > 10
+
+
+def test_hours_of_random_torque_do_not_diverge() -> None:
+    # 500 rigs for 3 s; the benchmark makes ten hours.
+    random = np.random.default_rng(3)
+    plant = Plant([rig()] * 500)
+    for _ in range(150):
+        plant.step(random_efforts(random, 500), np.zeros(500, dtype=np.bool_))
+        assert np.abs(plant.velocity[:2]).max() < 40
+        assert plant.substeps.max() < MAX_SUBSTEPS
+        assert not plant.is_inaccurate()
+
+
+def test_slow_motion_needs_two_substeps_fast_motion_more() -> None:
+    random = np.random.default_rng(4)
+    plant = Plant([rig()] * 50)
+    for _ in range(100):
+        effort = random_efforts(random, 50)
+        effort[:, :25] *= 0.03
+        plant.step(effort, np.zeros(50, dtype=np.bool_))
+        assert np.all(plant.substeps[:25] == 2)
+    assert plant.substeps[25:].max() >= 3
+    assert np.all(plant.error[:2, :25] > 0)
+
+
+def test_arms_of_different_stiffness_are_independent() -> None:
+    arms = [ARM, replace(ARM, masses=(0.2, 0.2, 0.2)), replace(ARM, masses=(4.0, 4.0, 2.0)), ARM]
+    rigs = [replace(rig(), arm=arm) for arm in arms]
+    together, alone = Plant(rigs), [Plant([one]) for one in rigs]
+    assert len(set(together.substeps.tolist())) > 2
+    random = np.random.default_rng(5)
+    for _ in range(100):
+        effort = random_efforts(random, len(rigs))
+        together.step(effort, np.zeros(len(rigs), dtype=np.bool_))
+        for index, plant in enumerate(alone):
+            plant.step(effort[:, index : index + 1].copy(), np.zeros(1, dtype=np.bool_))
+            for mine, shared in (
+                (plant.position, together.position),
+                (plant.velocity, together.velocity),
+                (plant.error, together.error),
+                (plant.substeps[np.newaxis], together.substeps[np.newaxis]),
+            ):
+                np.testing.assert_array_equal(mine[:, 0], shared[:, index])
+
+
+def test_bound_of_substeps_ends_a_step_and_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hilrig_sim.plant.plane_solver.MAX_SUBSTEPS", 3)
+    light = replace(rig(), arm=replace(ARM, masses=(0.1, 0.05, 0.05), friction=(0.1, 0.1, 5.0, 0.05)))
+    plant, inaccurate = Plant([light] * 20), 0
+    random = np.random.default_rng(6)
+    with np.errstate(all="ignore"):
+        for _ in range(50):
+            plant.step(random_efforts(random, 20), np.zeros(20, dtype=np.bool_))
+            assert plant.substeps.max() <= 4
+            inaccurate += plant.is_inaccurate()
+    assert inaccurate
+
+
+def test_free_motion_equals_the_exponential_solution() -> None:
+    for rate in (0.0, 1e-6, 1e-3, 0.5, 40.0):
+        q, v = free_motion(*(np.array([value]) for value in (0.1, 2.0, -3.0, rate, 0.3)))
+        if rate < 1e-3:
+            assert q[0] == pytest.approx(0.1 + 2.0 * 0.3 - 1.5 * 0.09, abs=1e-4)
+            continue
+        decay, final = np.exp(-rate * 0.3), -3.0 / rate
+        assert v[0] == pytest.approx(final + (2.0 - final) * decay, rel=1e-9)
+        assert q[0] == pytest.approx(0.1 + final * 0.3 + (2.0 - final) * (1 - decay) / rate, rel=1e-9)
+
+
+def test_linear_joint_hits_a_stop_and_leaves_it_within_a_step() -> None:
+    # It rises for 40 ms, meets the stop after a part of that, and is pulled back from rest.
+    motion = move_between_stops(*(np.array([value]) for value in (0.0, 1.0, -25.0, 0.0, -1.0, 0.015, 0.06)))
+    arrival = (1.0 - np.sqrt(1.0 - 2 * 25.0 * 0.015)) / 25.0
+    assert motion.side[0] == 1.0
+    assert motion.speed[0] == pytest.approx(1.0 - 25.0 * arrival, rel=1e-9)
+    assert motion.position[0] == pytest.approx(0.015 - 12.5 * (0.06 - arrival) ** 2, rel=1e-9)
+    assert motion.velocity[0] == pytest.approx(-25.0 * (0.06 - arrival), rel=1e-9)
+
+
+def test_first_arrival_is_found_on_the_way_out_and_back() -> None:
+    # q = 0.1 + s - 2 s² rises to 0.225 at s = 1/4 and falls to -0.9.
+    start, end, rates = np.full(3, 0.1), np.full(3, -0.9), (np.full(3, 1.0), np.full(3, -3.0))
+    lower, upper = np.array([-5.0, -0.5, -5.0]), np.array([0.2, 5.0, 5.0])
+    found = first_arrival(start, end, *rates, lower, upper)
+    assert found[0] == pytest.approx((1 - np.sqrt(1 - 8 * 0.1)) / 4, rel=1e-6)
+    assert found[1] == pytest.approx((1 + np.sqrt(1 + 8 * 0.6)) / 4, rel=1e-6)
+    assert found[2] == np.inf
+
+
+def test_check_warns_of_arms_that_one_step_cannot_integrate() -> None:
+    def rigs(substeps: int | str) -> dict[str, RigParameters]:
+        return {name: rig(substeps=substeps) for name in ("a", "b")}
+
+    assert not list(accuracy_warnings(rigs("auto")))
+    (warning,) = accuracy_warnings(rigs(1))
+    assert warning.startswith("a and 1 more: at the largest torques ")
+    assert 'set sim.substeps = "auto"' in warning
