@@ -350,7 +350,8 @@ The specifications leave three points open. hilrig implements them as follows:
 - A request of wrong length gets exception 03: "the implied length is incorrect".
 - A value that is legal in Modbus but not for the rig (a watchdog timeout outside the bounds of the lab) gets exception
   04: in the specification, 03 is for a malformed request, not for the meaning of a value.
-- A write by a client that does not hold the lease gets exception 06. A write by a client with a read-only role gets
+- A write by a client whose controller does not hold the lease, or of a register that another open connection of the
+  controller writes, gets exception 06. A write by a client with a read-only role gets
   exception 01, as specified by MODBUS/TCP Security.
 
 ## Functions

@@ -20,7 +20,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_latency_prints_a_table(run: Path) -> None:
     result = hilrig("latency", run)
     assert result.returncode == 0, result.stderr
-    for expected in ("loop", "register wait", "tick wait", "p99.9", "valid for latency measurements"):
+    for expected in (
+        "loop",
+        "register wait",
+        "tick wait",
+        "p99.9",
+        " age ",
+        "control period 20.0 ms",
+        "valid for latency measurements",
+    ):
         assert expected in result.stdout
 
 

@@ -23,7 +23,7 @@ import pytest
 from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.io.run import Run, open_run
 from hilrig_schemas import Event, ModbusTraffic, TorqueCommand, topics
-from support.capture import Capture, Packet, require_capture, round_trips_ns
+from support.capture import Capture, Packet, require_capture, round_trips_ns, without_repeats
 from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
@@ -60,9 +60,7 @@ class Witness:
         self.acting: dict[int, int] = {}
         """By step: mark of the command that acts on it."""
         basis = served_ns = 0
-        for packet in packets:
-            if not packet.data:
-                continue
+        for packet in without_repeats(packets):
             length, function = packet.data[5] + 6, packet.data[7]
             assert length == len(packet.data), "a packet is one request or response"
             if packet.from_edge and function == 4:
@@ -76,20 +74,28 @@ class Witness:
                 [mark] = struct.unpack_from(">h", packet.data, 13 + 2 * 3)
                 self.writes.append(Write(mark, basis, served_ns, packet.wall_ns, 0))
 
-    def loops(self) -> dict[int, int]:
-        """By the step on which a command is known to act first: the step of its basis."""
+    def bases(self) -> dict[int, int]:
+        """By step that the client was served: step of the basis of the command that acts on it."""
         found: dict[int, int] = {}
         # Marks repeat after 100 commands, within which a command acts or was superseded.
-        bases: dict[int, int] = {}
+        written: dict[int, int] = {}
         writes = iter(self.writes)
         upcoming = next(writes, None)
         for step, mark in sorted(self.acting.items()):
             while upcoming is not None and upcoming.basis < step:
-                bases[upcoming.mark] = upcoming.basis
+                written[upcoming.mark] = upcoming.basis
                 upcoming = next(writes, None)
-            if self.acting.get(step - 1, mark) != mark:
-                found[step] = bases[mark]
+            # The first step may show the last command of the session before.
+            if mark in written:
+                found[step] = written[mark]
         return found
+
+    def loops(self) -> dict[int, int]:
+        """By the step on which a command is known to act first: the step of its basis."""
+        bases = self.bases()
+        return {
+            step: bases[step] for step in bases if self.acting.get(step - 1, self.acting[step]) != self.acting[step]
+        }
 
 
 @dataclass
@@ -185,11 +191,21 @@ def check_against_capture(session: Session) -> None:
     assert (edge_ns <= answered_ns + US).all()
     assert np.percentile(answered_ns - edge_ns, 95) < 2 * MS
 
+    sampled_ns = dict(zip(session.run.states["step"].tolist(), session.run.states["sampled_ns"].tolist(), strict=True))
+    # Age, at each step that the client was served.
+    assert session.report.ages is not None
+    ages_ns = {
+        int(row["step"]): int(row["age_ns"]) for block in session.report.ages.rows("step", "age_ns") for row in block
+    }
+    bases = witness.bases()
+    assert len(bases) > 25
+    for step, basis in bases.items():
+        assert ages_ns[step] == sampled_ns[step] - sampled_ns[basis]
+
     # Loop latency, of each step on which a new command was seen to act.
     loops = witness.loops()
     samples = session.report.table["step"], session.report.table["basis_step"], session.report.table["loop"]
     reported = {int(step): (int(basis), int(loop)) for step, basis, loop in zip(*samples, strict=True)}
-    sampled_ns = dict(zip(session.run.states["step"].tolist(), session.run.states["sampled_ns"].tolist(), strict=True))
     checked = 0
     for step, basis in loops.items():
         if step in reported:
@@ -201,7 +217,9 @@ def check_against_capture(session: Session) -> None:
 def check_network_bound(session: Session, low_ms: float) -> None:
     """Compare the smallest round-trip time of TCP with the packets; it is at least that of the link."""
     figures = [one for traffic in session.messages(topics.TRAFFIC) for one in traffic.connections]
-    assert all(one.retransmissions == 0 for one in figures)
+    packets = [packet for packet in session.witness.packets if packet.from_edge and packet.data]
+    repeated = len(packets) - len(without_repeats(packets))
+    assert all(one.retransmissions <= repeated for one in figures)
     bounds_us = [one.min_rtt_us for one in figures]
     smallest_us = min(round_trips_ns(session.witness.packets)) / 1e3
     assert bounds_us
@@ -235,9 +253,14 @@ def test_stalls_of_the_edge_are_time_of_the_edge(lab: RunningLab, stall_ms: floa
     assert (edge_ms > stall_ms / 2).sum() >= waiting / 3
     # The stop itself is in no time of the controller.
     assert np.percentile(controller_ms, 98) < stall_ms / 2
+    # Commands are held while the edge is stopped.
+    assert session.report.age_ms is not None
+    assert session.report.age_ms.max > stall_ms
+    assert "edge_stall" in {reason.code for reason in session.report.reasons}
     stalls = overruns(session)
-    assert sum(count for count, _ in stalls) == len(session.stalls)
-    assert all(stall_ms - 25 <= longest_ms < stall_ms + 40 for _, longest_ms in stalls)
+    # A loaded host may stall the edge once more.
+    assert len(session.stalls) <= sum(count for count, _ in stalls) <= len(session.stalls) + 2
+    assert stall_ms - 25 <= max(longest_ms for _, longest_ms in stalls) < stall_ms + 40
 
 
 @pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")

@@ -113,6 +113,17 @@ class Capture:
         return Packet(wall_ns, from_edge, destination if from_edge else source, end, acknowledged, payload)
 
 
+def without_repeats(packets: list[Packet]) -> list[Packet]:
+    """Return the segments with data without those that TCP sent again."""
+    seen: set[tuple[bool, int]] = set()
+    found: list[Packet] = []
+    for packet in packets:
+        if packet.data and (packet.from_edge, packet.end) not in seen:
+            seen.add((packet.from_edge, packet.end))
+            found.append(packet)
+    return found
+
+
 def round_trips_ns(packets: list[Packet]) -> list[int]:
     """Return the time from each segment of the edge until the client acknowledged it, ns."""
     waiting: list[Packet] = []

@@ -24,7 +24,7 @@ def main() -> None:
             position = struct.unpack_from(">h", reader.recv(64), 9)[0] / 100
             speed = 0.0 if before is None else (position - before) / 0.02
             before = position
-            torque = 300.0 if law == "constant" else 250 * max(-20.0, min(20.0, 30 - position)) - 40 * speed
+            torque = 300.0 if law == "constant" else 120 * (30 - position) - 40 * speed
             writer.sendall(struct.pack(">HHHBBHHB4h", 2, 0, 15, 1, 16, 0, 4, 8, round(torque), 0, -4905, 0))
             answer = writer.recv(64)
             assert not answer[7] & 0x80, answer.hex()

@@ -155,7 +155,9 @@ def without_basis(made: list[TimedMessage], first_s: float, last_s: float) -> No
             one.message.basis_step = one.message.loop_latency_ns = one.message.command_arrived_ns = 0
 
 
-@pytest.mark.parametrize(("first_s", "last_s"), [(0.0, 2.0), (5.0, 7.0)], ids=["at the start", "within the run"])
+@pytest.mark.parametrize(
+    ("first_s", "last_s"), [(0.0, 2.0), (5.0, 7.0), (17.92, 20.0)], ids=["at the start", "within the run", "at the end"]
+)
 def test_commands_without_basis_are_uncontrolled(tmp_path: Path, first_s: float, last_s: float) -> None:
     script = Script(seconds=20.0, poll_ms=10.0)
     made = make(script)

@@ -46,6 +46,17 @@ def test_reports_a_restarted_simulation_by_its_states(tmp_path: Path) -> None:
     assert reasons(measured(tmp_path, made))["restart"] == "the simulation was restarted during the session"
 
 
+def test_reports_a_recorder_started_during_the_session(tmp_path: Path) -> None:
+    metadata = {
+        "hilrig.session": {"session": SESSION, "rig": "rig1", "controller": CONTROLLER, "start_wall_ns": "1000"},
+        "hilrig.source": {"source": "sim/1", "incarnation": "900"},
+        "hilrig.source.2": {"source": "recorder/1", "incarnation": "1100"},
+        "hilrig.source.3": {"incarnation": "no number"},
+    }
+    report = measure(open_run(write(tmp_path / "run.mcap", make(SCRIPT), script=SCRIPT, metadata=metadata)))
+    assert reasons(report)["restart"] == "recorder/1 was started during the session"
+
+
 def test_restart_before_the_session_is_no_reason(tmp_path: Path) -> None:
     made = make(SCRIPT)
     for one in made:

@@ -213,21 +213,21 @@ def test_reason_of_each_refusal_is_known_in_advance(bench: Bench) -> None:
     """`authorize` has no effect: it can be asked before a client writes."""
     access, now_ns = bench.device._write_access, bench.clock.monotonic_ns()
     holder, other, observer = bench.connect(), bench.connect(host="10.0.0.2"), bench.connect(port=3, may_write=False)
-    assert access.authorize(holder, now_ns) is None
+    assert access.authorize(holder, 0, 4, now_ns) is None
     bench.write(holder, 0, 1)
     for client, reason, code in ((other, "10.0.0.1:1000 holds the lease", 6), (observer, "read-only", 1)):
         for _ in range(2):
-            refusal = access.authorize(client, now_ns)
+            refusal = access.authorize(client, 0, 4, now_ns)
             assert refusal is not None
             assert refusal.reason.startswith(reason)
             assert refusal.code == code
     bench.device.release("revoked")
-    refusal = access.authorize(holder, now_ns)
+    refusal = access.authorize(holder, 0, 4, now_ns)
     assert refusal is not None
     assert refusal.reason == "its lease was revoked; write again in 5.0 s"
     bench.write(other, 0, 1)
     bench.device.disconnect(other, "done")
-    refusal = access.authorize(bench.connect(host="10.0.0.3"), now_ns)
+    refusal = access.authorize(bench.connect(host="10.0.0.3"), 0, 4, now_ns)
     assert refusal is not None
     assert refusal.reason == "10.0.0.2 acquired the lease less than 1 s ago; write again in 1 s"
     assert [event for event in bench.kinds() if event == "LEASE_REFUSED"] == []
@@ -452,12 +452,90 @@ def test_lease_expires_without_requests_but_not_with_reads(bench: Bench) -> None
     for _ in range(8):
         bench.wait(1000)
         bench.read(holder, 0, 1)
-    assert bench.device.lease.holder is holder
+    assert bench.device.lease.holder is holder.controller
     bench.wait(4999)
-    assert bench.device.lease.holder is holder
+    assert bench.device.lease.holder is holder.controller
     bench.wait(1)
     assert bench.device.lease.holder is None
     assert "no request for 5 s" in bench.events[-1].text
+
+
+def test_connections_of_a_controller_write_different_things(bench: Bench) -> None:
+    torques, more_torques, magnet, stranger = (
+        bench.connect(),
+        bench.connect(port=2),
+        bench.connect(port=3),
+        bench.connect(host="10.0.0.2"),
+    )
+    bench.write(torques, 0, 1, 2)
+    bench.write(more_torques, 2, 3, 4)
+    bench.device.write_coil(magnet, MAGNET_COIL, True, bench.clock.monotonic_ns())
+    assert list(bench.commands[-1].effort) == [0.001, 0.002, 0.003, 0.004]
+    assert bench.commands[-1].magnet
+    assert bench.kinds() == ["SESSION_START", "LEASE_GRANTED"]
+    for client in (torques, magnet, bench.connect(port=4)):
+        assert bench.read(client, 6, 1, RegisterTable.INPUT_REGISTER) == [1]
+    assert bench.read(stranger, 6, 1, RegisterTable.INPUT_REGISTER) == [2]
+    # The lease is held until the last writing connection is closed.
+    for client in (torques, magnet):
+        bench.device.disconnect(client, "closed")
+    with pytest.raises(ModbusError):
+        bench.write(stranger, 0, 9)
+    bench.device.disconnect(more_torques, "closed")
+    bench.write(stranger, 0, 9)
+
+
+@pytest.mark.parametrize(("timeout_ms", "free_after_ms"), [(300, 300), (0, 5000)])
+def test_second_program_of_a_controller_is_refused(bench: Bench, timeout_ms: int, free_after_ms: int) -> None:
+    first, second = bench.connect(), bench.connect(port=2)
+    bench.device.watchdog.timeout_ns = timeout_ms * MS
+    bench.write(first, 0, 1, 2, 3, 4)
+    bench.device.watchdog.timeout_ns = timeout_ms * MS
+    with pytest.raises(ModbusError) as refusal:
+        bench.write(second, 3, 9)
+    assert refusal.value.code == 6
+    event = bench.events[-1]
+    assert event.text == (
+        "10.0.0.1:2: write to rig1 denied: two programs on 10.0.0.1 write torques, the other one is 10.0.0.1:1000: "
+        "stop one"
+    )
+    assert (event.controller_data.controller, event.controller_data.holder) == (second.address, first.address)
+    bench.clock.advance((free_after_ms - 1) * MS)
+    with pytest.raises(ModbusError):
+        bench.write(second, 3, 9)
+    bench.clock.advance(MS)
+    bench.write(second, 3, 9)
+    # The first one has lost this register, and still writes the others.
+    with pytest.raises(ModbusError):
+        bench.write(first, 0, 1, 2, 3, 4)
+    bench.write(first, 0, 1, 2, 3)
+
+
+def test_closed_connection_leaves_what_it_wrote(bench: Bench) -> None:
+    stays = bench.connect(port=2)
+    bench.device.write_coil(stays, MAGNET_COIL, True, bench.clock.monotonic_ns())
+    for port in range(10, 20):
+        assert one_shot(bench, port) == 0
+    assert bench.device.lease.holder is stays.controller
+
+
+def test_display_of_the_host_does_not_keep_the_lease(bench: Bench) -> None:
+    display, controller = bench.connect(port=2), bench.connect()
+    bench.write(controller, 0, 1)
+    for _ in range(5):
+        bench.wait(1000)
+        bench.read(display, 4, 4)
+    assert bench.device.lease.holder is None
+
+
+def test_revoked_lease_is_not_acquired_by_the_next_connection(bench: Bench) -> None:
+    holder, sibling = bench.connect(), bench.connect(port=2)
+    bench.write(holder, 0, 1)
+    assert bench.device.release("revoked by an operator") == holder.address
+    with pytest.raises(ModbusError):
+        bench.write(sibling, 0, 1)
+    # A program that is started afterwards is another one.
+    bench.write(bench.connect(port=3), 0, 1)
 
 
 def test_operator_can_revoke_the_lease(bench: Bench) -> None:
@@ -484,7 +562,7 @@ def test_revoked_holder_cannot_acquire_lease_during_cooldown(bench: Bench) -> No
     assert refusal.value.code == 6
     bench.wait(1)
     bench.write(holder, 0, 8)
-    assert bench.device.lease.holder is holder
+    assert bench.device.lease.holder is holder.controller
 
 
 def test_write_of_read_only_client_gets_01(bench: Bench) -> None:
@@ -679,7 +757,7 @@ def test_status_register_equals_the_discrete_inputs(bench: Bench) -> None:
 
 
 def test_lease_and_read_only_bits_depend_on_the_client(bench: Bench) -> None:
-    holder, other = bench.connect(), bench.connect(port=2, may_write=False)
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2", may_write=False)
     bench.write(holder, 0, 1)
     assert bench.read(holder, 6, 1, RegisterTable.INPUT_REGISTER) == [1]
     assert bench.read(other, 6, 1, RegisterTable.INPUT_REGISTER) == [2]
@@ -715,9 +793,13 @@ def test_latency_register_keeps_the_last_value(bench: Bench) -> None:
 def test_invalid_state_message_is_ignored(bench: Bench) -> None:
     client = bench.connect()
     before = bench.read(client, 4, 4)
-    for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
+    four = (1.0, 2.0, 0.1, 3.0)
+    negative = JointState(step=9, position=four, velocity=four, effort=four, loop_latency_ns=-(1 << 62))
+    for message in (JointState(step=9, position=(1, 2)), negative, None):
+        payload = b"\xff\xff\xff" if message is None else message.SerializeToString()
         bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
+    assert bench.rejected == ["state of rig1: not a valid state"] * 3
 
 
 def test_one_read_contains_one_step(bench: Bench) -> None:

@@ -25,7 +25,12 @@ class Model:
     echo: int = 0
     timeout_ms: int = WATCHDOG_MS
     magnet: bool = False
-    holder: Client | None = None
+    holder: str | None = None
+    """Host that holds the lease."""
+    writers: dict[int, tuple[Client, int]] = field(default_factory=dict)
+    """By register or coil: the open connection that wrote it last since the lease was acquired, and when."""
+    writing: set[Client] = field(default_factory=set)
+    """Open connections that wrote since the lease was acquired."""
     fed_ms: int | None = None
     tripped: bool = False
     last_request_ms: dict[int, int] = field(default_factory=dict)
@@ -37,29 +42,47 @@ class Model:
         """Do everything that is due at this millisecond, in the order of the device."""
         if self.fed_ms is not None and self.now_ms - self.fed_ms >= self.timeout_ms:
             self.torque, self.tripped, self.fed_ms = [0, 0, 0, 0], True, None
-        if self.holder is not None and self.now_ms - self.last_request_ms[id(self.holder)] >= LEASE_MS:
+        if self.holder is not None and all(
+            self.now_ms - self.last_request_ms[id(client)] >= LEASE_MS for client in self.writing
+        ):
             self.release()
         if self.session_host is not None and self.holder is None and self.now_ms - self.released_ms >= GRACE_MS:
             self.session_host = None
 
     def release(self) -> None:
         self.holder, self.released_ms = None, self.now_ms
+        self.writers.clear()
+        self.writing.clear()
         if not any(self.torque):
             self.fed_ms = None
 
-    def write(self, client: Client) -> bool:
-        """Return whether a valid write of this client is accepted."""
+    def disconnect(self, client: Client) -> None:
+        self.writers = {item: entry for item, entry in self.writers.items() if entry[0] is not client}
+        if client in self.writing:
+            self.writing.remove(client)
+            if not self.writing:
+                self.release()
+
+    def write(self, client: Client, *items: int) -> bool:
+        """Return whether a valid write of these registers and coils by this client is accepted."""
+        if self.holder not in (None, client.host):
+            return False
+        period_ms = self.timeout_ms or LEASE_MS
+        for item in items:
+            writer, written_ms = self.writers.get(item, (client, 0))
+            if writer is not client and self.now_ms - written_ms < period_ms:
+                return False
         if self.holder is None:
             if self.session_host not in (None, client.host):
                 if self.now_ms < self.host_change_ms:
                     return False
                 self.host_change_ms = self.now_ms + HOST_CHANGE_MS
-            self.holder = client
+            self.holder = client.host
             if self.session_host != client.host:
                 self.timeout_ms, self.echo = WATCHDOG_MS, 0
             self.session_host = client.host
-        if self.holder is not client:
-            return False
+        self.writing.add(client)
+        self.writers |= dict.fromkeys(items, (client, self.now_ms))
         self.fed_ms, self.tripped = self.now_ms, False
         return True
 
@@ -93,8 +116,7 @@ class DeviceMachine(RuleBasedStateMachine):
     def disconnect(self, data: st.DataObject) -> None:
         client = self.clients.pop(data.draw(st.integers(0, len(self.clients) - 1)))
         self.bench.device.disconnect(client, "connection closed by the client")
-        if self.model.holder is client:
-            self.model.release()
+        self.model.disconnect(client)
 
     @rule(data=st.data(), address=st.integers(0, 9), words=st.lists(WORD, min_size=1, max_size=5))
     @precondition(lambda self: self.clients)
@@ -105,7 +127,7 @@ class DeviceMachine(RuleBasedStateMachine):
         reply = self.ask(client, pdu)
         if address + count > 4:
             assert reply == b"\x90\x02"
-        elif self.model.write(client):
+        elif self.model.write(client, *range(address, address + count)):
             self.model.torque[address : address + count] = words
             assert reply == pdu[:5]
             assert list(self.bench.commands[-1].effort) == [_signed(word) / 1000 for word in self.model.torque]
@@ -119,7 +141,7 @@ class DeviceMachine(RuleBasedStateMachine):
         reply = self.ask(client, struct.pack(">BHHBHH", 16, 100, 2, 4, echo, timeout))
         if not 100 <= timeout <= 10_000:
             assert reply == b"\x90\x04"
-        elif self.model.write(client):
+        elif self.model.write(client, 100, 101):
             self.model.echo, self.model.timeout_ms = echo, timeout
             assert reply[0] == 16
         else:
@@ -131,7 +153,7 @@ class DeviceMachine(RuleBasedStateMachine):
         client = data.draw(st.sampled_from(self.clients))
         pdu = struct.pack(">BHH", 5, 0, 0xFF00 if on else 0)
         reply = self.ask(client, pdu)
-        if self.model.write(client):
+        if self.model.write(client, -1):
             self.model.magnet = on
             assert reply == pdu
         else:
@@ -143,7 +165,7 @@ class DeviceMachine(RuleBasedStateMachine):
         client = data.draw(st.sampled_from(self.clients))
         pdu = struct.pack(">BHHH", 22, register, mask, more)
         reply = self.ask(client, pdu)
-        if self.model.write(client):
+        if self.model.write(client, register):
             self.model.torque[register] = (self.model.torque[register] & mask) | (more & ~mask & 0xFFFF)
             assert reply == pdu
         else:
@@ -175,7 +197,7 @@ class DeviceMachine(RuleBasedStateMachine):
     @invariant()
     def device_equals_model(self) -> None:
         model, device = self.model, self.bench.device
-        assert device.lease.holder is model.holder
+        assert (device.lease.holder.name if device.lease.holder else None) == model.holder
         assert device.watchdog.tripped == model.tripped
         assert (device.session is None) == (model.session_host is None)
         reader = self.bench.device.connect("10.0.0.9", 9)

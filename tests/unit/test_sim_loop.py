@@ -192,15 +192,15 @@ def test_chattering_joint_is_reported_once_per_period() -> None:
     reported: list[Event] = []
     events = SimulationEvents(reported.append, ["rig1"], Plant([RigParameters()]))
     hit = PlantEvent(PlantEventKind.LIMIT_HIT, 0, joint=1, upper=True, speed=0.5)
-    for now_ms in (0, 100, 300, 520, 800):
+    for now_ms in (0, 400, 1200, 2080, 3200):
         events.report_plant_events([hit], now_ms, now_ms * 1_000_000, ["session"])
-    assert [event.step for event in reported] == [0, 300, 800]
+    assert [event.step for event in reported] == [0, 1200, 3200]
     assert [event.text for event in reported] == [
         "joint 1 hit its upper stop at 29 °/s",
         "joint 1 hit its upper stop at 29 °/s (2 times)",
         "joint 1 hit its upper stop at 29 °/s (2 times)",
     ]
-    events.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 801, 801_000_000, ["session"])
+    events.report_plant_events([replace(hit, upper=False), replace(hit, joint=2)], 3201, 3_201_000_000, ["session"])
     assert [event.text for event in reported[3:]] == [
         "joint 1 hit its lower stop at 29 °/s",
         "joint 2 hit its upper stop at 29 °/s",

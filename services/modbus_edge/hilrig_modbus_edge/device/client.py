@@ -29,6 +29,11 @@ class ConnectedController:
     served_before: ServedState | None = None
     """The one served before."""
 
+    @property
+    def last_request_ns(self) -> int:
+        """Time of the last request of its writing connections, ns, monotonic clock."""
+        return max((client.last_request_ns for client in self.clients if client.writes), default=0)
+
     def clear_served(self) -> None:
         """Clear the state that any of its connections was served; each connection keeps its own."""
         self.served = self.served_before = None
@@ -50,6 +55,8 @@ class Client:
     """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
     """Time of its last request, ns, monotonic clock."""
+    writes: bool = False
+    """Whether it has written since its controller acquired the lease."""
     lease_cooldown_until_ns: int = 0
     """It cannot acquire the lease before this time, because its lease was revoked; ns, monotonic clock."""
     served: ServedState | None = None

@@ -54,6 +54,7 @@ class CommandPublisher:
         self._writer: Client | None = None
         self._basis: ServedState | None = NO_STATE
         """None: the fields of the basis are set again."""
+        self._basis_on_other = False
         self._published_session: Session | None = None
         self._echo_published = 0
 
@@ -111,7 +112,10 @@ class CommandPublisher:
                     command.state_arrived_ns,
                     command.state_injected_ns,
                 ) = state
-            command.basis_on_other_connection = not client.was_served(basis)
+            # Nearly always the client itself was served it.
+            on_other = basis is not client.basis and not client.was_served(basis)
+            if on_other != self._basis_on_other:
+                command.basis_on_other_connection = self._basis_on_other = on_other
         command.write_arrived_ns = arrived_ns
         command.write_received_ns = received_ns
         self._set_effort_and_session()
@@ -134,7 +138,7 @@ class CommandPublisher:
         command.safe = not self.has_torque
         for field in _FIELDS_OF_A_WRITE:
             command.ClearField(field)
-        self._writer, self._basis = None, NO_STATE
+        self._writer, self._basis, self._basis_on_other = None, NO_STATE, False
         self._set_effort_and_session()
         self._sender.send(command)
 

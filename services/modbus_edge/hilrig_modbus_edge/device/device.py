@@ -21,6 +21,7 @@ from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.state_reader import StateReader
 from hilrig_modbus_edge.device.watchdog import WatchdogState
 from hilrig_modbus_edge.device.write_access import WriteAccess
+from hilrig_modbus_edge.device.writers import EXTENDED, MAGNET, RESET, TORQUES
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_modbus_edge.registers.image import StateImage
@@ -216,11 +217,12 @@ class Device:
 
         Raises:
             ModbusError: 02 a register does not exist or is read-only, 04 the watchdog timeout is outside the bounds
-                of the lab, 06 another client holds the lease, 01 the client is read-only.
+                of the lab, 06 another controller holds the lease or another connection writes the same, 01 the client
+                is read-only.
         """
         end = address + len(words) // 2
         if end <= POSITION_ADDRESS:
-            self._write_access.authorize_write(client, arrived_ns)
+            self._write_access.authorize_write(client, TORQUES + address, TORQUES + end, arrived_ns)
             self._commands.torque[2 * address : 2 * end] = words
             self._publish_write(client, arrived_ns, received_ns)
             return
@@ -230,7 +232,8 @@ class Device:
             at = 2 * (WATCHDOG_ADDRESS - address)
             timeout_ns = int.from_bytes(words[at : at + 2], "big") * MS
             self._write_access.check_timeout(timeout_ns)
-        self._write_access.authorize_write(client, arrived_ns)
+        extended = EXTENDED - ECHO_ADDRESS
+        self._write_access.authorize_write(client, extended + address, extended + end, arrived_ns)
         if address == ECHO_ADDRESS:
             self._commands.echo = int.from_bytes(words[:2], "big")
         if sets_timeout:
@@ -247,7 +250,8 @@ class Device:
         """
         if address not in (MAGNET_COIL, RESET_COIL):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        self._write_access.authorize_write(client, arrived_ns)
+        item = MAGNET if address == MAGNET_COIL else RESET
+        self._write_access.authorize_write(client, item, item + 1, arrived_ns)
         if address == RESET_COIL and not on:
             self._commands.publish_session()
             self._write_access.feed_watchdog(client, arrived_ns)
@@ -320,7 +324,7 @@ class Device:
     def _input_image(self, client: Client) -> bytes:
         state = self._serve_state(client)
         holder, session = self.lease.holder, self._session.current
-        lease = 0 if holder is None else 1 if holder is client else 2
+        lease = 0 if holder is None else 1 if holder is client.controller else 2
         return state.input_words(
             status=self._status(client),
             lease=lease,
@@ -337,7 +341,7 @@ class Device:
         holder = self.lease.holder
         if holder is not None:
             status |= Status.LEASE_HELD
-            if holder is client:
+            if holder is client.controller:
                 status |= Status.LEASE_IS_YOURS
         if self.watchdog.timeout_ns:
             status |= Status.WATCHDOG_ON

@@ -75,16 +75,16 @@ class LeaseEventReporter:
         if count:
             self._emit_acquired(client.address, count)
 
-    def lease_released(self, client: Client, reason: str, *, disconnected: bool) -> None:
-        """Report that the holder has no lease any more; `disconnected`: its connection was closed."""
+    def lease_released(self, address: str, reason: str, *, disconnected: bool) -> None:
+        """Report that the holder has no lease any more; `disconnected`: its last writing connection was closed."""
         if self._pending_acquire is not None:
             self._pending_acquire = None
             if disconnected:
                 return
-            self._emit_acquired(client.address)
+            self._emit_acquired(address)
         verb = "released" if disconnected else "lost"
-        text = f"{client.address} {verb} the lease of {self._rig}: {reason}"
-        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, client.address, reason=reason)
+        text = f"{address} {verb} the lease of {self._rig}: {reason}"
+        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, address, reason=reason)
 
     def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
         """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""

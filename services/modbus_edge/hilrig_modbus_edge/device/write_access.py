@@ -1,8 +1,9 @@
 """Write access to a rig: lease, watchdog and session.
 
-The first client that writes acquires the lease. A write of the lease holder is accepted, and feeds the watchdog unless
-the emulated network drops it. The lease expires a timeout after the holder's last request of any kind. A session starts
-with a lease and ends a grace time after it. Time is passed in or read from the given clock.
+The first controller that writes acquires the lease, for all its connections. Its writes are accepted, and feed the
+watchdog unless the emulated network drops them. The lease expires a timeout after the last request of any kind of its
+writing connections. A session starts with a lease and ends a grace time after it. Time is passed in or read from the
+given clock.
 """
 
 import random
@@ -12,7 +13,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.command_scheduler import TimerHandle
-from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.device.client import Client, ConnectedController
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, StallReporter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
@@ -20,6 +21,7 @@ from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
+from hilrig_modbus_edge.device.writers import EXTENDED, MAGNET, Writers
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_runtime.process.session_id import session_id
 from hilrig_runtime.timing.clock import Clock
@@ -36,13 +38,16 @@ class Refusal(NamedTuple):
     reason: str
     """Human-readable."""
     code: ExcCodes
+    holder: str = ""
+    """Address of the connection for which it is refused; empty: none."""
 
 
 class Holder(Protocol):
-    """A client that can hold a lease; compared by identity."""
+    """A controller that can hold a lease; compared by identity."""
 
-    last_request_ns: int
-    """Time of its last request, ns, monotonic clock."""
+    @property
+    def last_request_ns(self) -> int:
+        """Time of its last request, ns, monotonic clock."""
 
 
 HolderT = TypeVar("HolderT", bound=Holder)
@@ -55,11 +60,11 @@ class Lease(Generic[HolderT]):
         self.timeout_ns = timeout_ns
         self.holder: HolderT | None = None
 
-    def acquire(self, client: HolderT) -> bool:
-        """Give the lease to `client` if it is free; return whether `client` holds it now."""
+    def acquire(self, controller: HolderT) -> bool:
+        """Give the lease to `controller` if it is free; return whether `controller` holds it now."""
         if self.holder is None:
-            self.holder = client
-        return self.holder is client
+            self.holder = controller
+        return self.holder is controller
 
     def release(self) -> HolderT | None:
         """Release the lease and return the previous holder."""
@@ -72,7 +77,7 @@ class Lease(Generic[HolderT]):
 
 
 class WriteAccess:
-    """Decides which client may write to a rig, and stops the rig when the writes stop."""
+    """Decides which connection may write to a rig, and stops the rig when the writes stop."""
 
     def __init__(
         self,
@@ -87,7 +92,7 @@ class WriteAccess:
         clients: AbstractSet[Client],
         rng: random.Random | None,
     ) -> None:
-        self.lease: Lease[Client] = Lease(settings.lease_ns)
+        self.lease: Lease[ConnectedController] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
         self._session = session
         self._clients = clients
@@ -102,31 +107,40 @@ class WriteAccess:
         self._rng = random.SystemRandom() if rng is None else rng
         self._lease_events = LeaseEventReporter(rig, events)
         self.stalls = StallReporter(events)
+        self._writers = Writers()
         self._session_count = 0
         self._last_writer = ""
+        """Address of the newest writing connection."""
         self._controller_change_ns = 0
         """Earliest time at which another controller may end a session, ns, monotonic clock."""
         self._watchdog_timer: TimerHandle | None = None
 
-    def authorize_write(self, client: Client, now_ns: int) -> None:
-        """Authorize a valid write; ns, monotonic clock.
+    def authorize_write(self, client: Client, begin: int, end: int, now_ns: int) -> None:
+        """Authorize a valid write of the items of `Writers` from `begin` to before `end`; ns, monotonic clock.
 
         Raises:
-            ModbusError: 06 another client holds the lease, 01 the client is read-only.
+            ModbusError: 06 another controller holds the lease, or another connection of this one writes the same; 01
+                the client is read-only.
         """
-        if self.lease.holder is client:
+        if self._writers.rewrite(client, begin, end, now_ns):
             return
-        refusal = self.authorize(client, now_ns)
+        refusal = self.authorize(client, begin, end, now_ns)
         if refusal is not None:
-            self._lease_events.lease_denied(client, refusal.reason, self._holder, now_ns)
+            self._lease_events.lease_denied(client, refusal.reason, refusal.holder, now_ns)
             raise ModbusError(refusal.code)
-        self._acquire_lease(client, now_ns)
+        if self.lease.holder is None:
+            self._acquire_lease(client, now_ns)
+        self._writers.record(client, begin, end, now_ns)
+        client.writes = True
+        self._last_writer = client.address
 
-    def authorize(self, client: Client, now_ns: int) -> Refusal | None:
+    def authorize(self, client: Client, begin: int, end: int, now_ns: int) -> Refusal | None:
         """Return why a client may not write to the rig now; None: it may. The only place of these reasons.
 
         Args:
             client: connection that writes; its controller is that of `controller_of`.
+            begin: first item of `Writers` that it writes.
+            end: item after the last one.
             now_ns: time, ns, monotonic clock.
         """
         if not client.may_write:
@@ -137,10 +151,19 @@ class WriteAccess:
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
             return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
-        if self.lease.holder not in (None, client):
+        if self.lease.holder not in (None, client.controller):
             return Refusal(
                 f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release",
                 ExcCodes.DEVICE_BUSY,
+                self._holder,
+            )
+        other = self._writers.other(client, begin, end, now_ns - (self.watchdog.timeout_ns or self.lease.timeout_ns))
+        if other is not None:
+            written = "torques" if begin < MAGNET else "the same coil" if begin < EXTENDED else "the same register"
+            return Refusal(
+                f"two programs on {client.controller.name} write {written}, the other one is {other.address}: stop one",
+                ExcCodes.DEVICE_BUSY,
+                other.address,
             )
         session = self._session.current
         if session is not None and session.controller is not client.controller and now_ns < self._controller_change_ns:
@@ -181,8 +204,9 @@ class WriteAccess:
         self._schedule_check()
 
     def on_disconnect(self, client: Client, reason: str) -> None:
-        """Release the lease of a closed connection; its torque stays applied until the watchdog trips."""
-        if self.lease.holder is client:
+        """Release the lease if no connection that wrote is left; its torque stays applied until the watchdog trips."""
+        self._writers.remove(client)
+        if client.writes and not any(other.writes for other in client.controller.clients):
             self._release_lease(reason, disconnected=True)
 
     def check(self, now_ns: int) -> None:
@@ -201,15 +225,15 @@ class WriteAccess:
     def release(self, reason: str) -> str:
         """Revoke the lease, on request of an operator; return the previous holder, empty: none.
 
-        For the lease timeout that connection cannot acquire it again. Otherwise its next write would do so before any
-        other client could.
+        For the lease timeout the open connections of that controller cannot acquire it again. Otherwise their next
+        write would do so before any other client could.
         """
-        holder = self.lease.holder
-        if holder is None:
-            return ""
-        holder.lease_cooldown_until_ns = self._monotonic_ns() + self._settings.lease_ns
-        self._release_lease(reason)
-        return holder.address
+        controller, address = self.lease.holder, self._holder
+        if controller is not None:
+            for client in controller.clients:
+                client.lease_cooldown_until_ns = self._monotonic_ns() + self._settings.lease_ns
+            self._release_lease(reason)
+        return address
 
     def stop(self, reason: str) -> None:
         """Set the torque to zero, release the lease and end the session, because the edge stops."""
@@ -235,30 +259,31 @@ class WriteAccess:
 
     @property
     def _holder(self) -> str:
-        """Address of the lease holder; empty: none."""
-        holder = self.lease.holder
-        return "" if holder is None else holder.address
+        """Address of the newest writing connection of the lease holder; empty: none."""
+        return "" if self.lease.holder is None else self._last_writer
 
     def _acquire_lease(self, client: Client, now_ns: int) -> None:
         session = self._session.current
         if session is not None and session.controller is not client.controller:
             self._controller_change_ns = now_ns + CONTROLLER_CHANGE_PERIOD_NS
             self._end_session(f"{client.address} acquired the lease")
-        self.lease.acquire(client)
-        self._last_writer = client.address
+        self.lease.acquire(client.controller)
         self._start_or_continue_session(client)
         self._lease_events.lease_acquired(client, now_ns)
 
     def _release_lease(self, reason: str, *, disconnected: bool = False) -> None:
-        holder = self.lease.release()
-        if holder is None:
+        controller = self.lease.release()
+        if controller is None:
             return
+        self._writers.clear()
+        for client in controller.clients:
+            client.writes = False
         if self._session.current is not None:
             self._session.current.released_ns = self._monotonic_ns()
         if not self._commands.has_torque:
             # There is no torque to stop.
             self.watchdog.disarm()
-        self._lease_events.lease_released(holder, reason, disconnected=disconnected)
+        self._lease_events.lease_released(self._last_writer, reason, disconnected=disconnected)
 
     def _start_or_continue_session(self, client: Client) -> None:
         if self._session.current is not None:
@@ -305,9 +330,9 @@ class WriteAccess:
         if holder is None:
             cause = f"{self._last_writer} no longer holds the lease"
         elif now_ns - holder.last_request_ns >= self.watchdog.timeout_ns:
-            cause = f"{holder.address} sends no requests"
+            cause = f"{self._last_writer} sends no requests"
         else:
-            cause = f"{holder.address} reads but does not write"
+            cause = f"{self._last_writer} reads but does not write"
         text = (
             f"watchdog of {self._rig} tripped: no write for {silent_ns // MS} ms, torque set to zero: {cause}; "
             "the next write re-arms it"

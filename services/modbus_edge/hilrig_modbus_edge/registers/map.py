@@ -82,8 +82,8 @@ class Status(IntEnum):
 
     SIMULATION_ALIVE = 0, "the newest state is less than 1 s old"
     SESSION_OPEN = 1, "a session is open and is recorded"
-    LEASE_HELD = 2, "a client holds the lease"
-    LEASE_IS_YOURS = 3, "this connection holds the lease"
+    LEASE_HELD = 2, "a controller holds the lease"
+    LEASE_IS_YOURS = 3, "the controller of this connection holds the lease"
     WATCHDOG_ON = 4, "the watchdog timeout is not 0"
     WATCHDOG_TRIPPED = 5, "the watchdog has tripped and set the torques to zero; the next write clears it"
     SIMULATION_SAFE = 6, "the simulation applies no torque, because it receives no commands"
@@ -131,7 +131,7 @@ MAP: Final = (
     Register(_INPUT, 2, _UINT16, "status", "status bits, same as discrete inputs 1-16 (bit 0 is input 1)"),
     Register(_INPUT, 3, _UINT32, "step", "step of the simulation, low 32 bits"),
     Register(_INPUT, 5, _UINT32, "loop_latency", "last measured loop latency", "µs"),
-    Register(_INPUT, 7, _UINT16, "lease", "lease: 0 free, 1 this connection holds it, 2 another client holds it"),
+    Register(_INPUT, 7, _UINT16, "lease", "lease: 0 free, 1 the controller of this connection holds it, 2 another one"),
     Register(_INPUT, 8, _UINT16, "watchdog", "watchdog: 0 off, 1 waiting for a write, 2 armed, 3 tripped"),
     Register(_INPUT, 9, _UINT16, "watchdog_timeout", "active watchdog timeout", "ms"),
     Register(_INPUT, 10, _UINT16, "session", "number of the open session, counted since the edge started; 0: none"),

@@ -161,11 +161,9 @@ class SocketTransport(asyncio.Transport):
         self._loop = loop
         self._selector = loop.direct
         self._socket = connected
-        self._receive: Callable[[Any], int] = connected.recv_into
+        self._receive_into = connected.recv_into
+        self._receive_message_into = connected.recvmsg_into if _has_receive_timestamps(connected) else None
         self._ancillary: list[tuple[int, int, bytes]] = []
-        if _has_receive_timestamps(connected):
-            self._receive_message = connected.recvmsg_into
-            self._receive = self._receive_with_timestamp
         self._send = connected.send
         self._protocol: asyncio.BufferedProtocol | None = None
         self._send_buffer = bytearray()
@@ -243,16 +241,13 @@ class SocketTransport(asyncio.Transport):
             return 0
         seconds, nanoseconds = _TIMESPEC.unpack_from(self._ancillary[0][2])
         wall_ns = seconds * 1_000_000_000 + nanoseconds
-        for _ in range(2):
-            received_ns: int = wall_ns - time_ns() + monotonic_ns()
-            if earliest_ns <= received_ns <= latest_ns:
-                return received_ns
-            # The process was preempted between the two clocks, which happens rarely, or the wall clock was stepped.
-        return 0
-
-    def _receive_with_timestamp(self, buffer: Any) -> int:
-        count, self._ancillary, _, _ = self._receive_message((buffer,), _ANCILLARY_BYTES)
-        return count
+        received_ns: int = wall_ns - time_ns() + monotonic_ns()
+        if not earliest_ns <= received_ns <= latest_ns:
+            # Once more: the process may have been preempted between the two clocks.
+            received_ns = wall_ns - time_ns() + monotonic_ns()
+            if not earliest_ns <= received_ns <= latest_ns:
+                return 0
+        return received_ns
 
     # -- events of the socket
 
@@ -288,7 +283,10 @@ class SocketTransport(asyncio.Transport):
 
     def _read(self) -> None:
         try:
-            count = self._receive(self._get_buffer(-1))
+            if self._receive_message_into is None:
+                count = self._receive_into(self._get_buffer(-1))
+            else:
+                count, self._ancillary, _, _ = self._receive_message_into((self._get_buffer(-1),), _ANCILLARY_BYTES)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:

@@ -35,8 +35,9 @@ AGE_DTYPE: Final = np.dtype(
         ("effect_ns", "<i8"),
     ]
 )
-"""One row per step of a session; times on the clock of the simulation. `age_ns`: age, or `NO_AGE` or `UNKNOWN`;
-`basis_step`: step of the basis of the acting command, 0: none; `effect_ns`: tick at which that command took effect."""
+"""One row per step of a session; times on the clock of the simulation. `command_seq`: number of the acting command, 0:
+none; `basis_step`: step of its basis, 0: none; `age_ns`: age, or `NO_AGE` or `UNKNOWN`; `effect_ns`: tick at which the
+command took effect."""
 OLD_STEPS: Final = (1, 2, 5)
 """Ages, steps, for which the share of older steps is reported."""
 MAX_PERIOD_RATIO: Final = 3.0
@@ -87,6 +88,7 @@ class AgeTracker:
             rows[name] = np.concatenate((self._last_row[name], rows[name]))[effect]
         rows["age_ns"] = np.where(basis_ns > 0, states["sampled_ns"] - basis_ns, basis_ns)
         rows["age_ns"][states["safe"]] = NO_AGE
+        rows["command_seq"][states["safe"]] = 0
         self._basis_ns = int(basis_ns[-1])
         self._last_state, self._last_row = states[-1:].copy(), rows[-1:].copy()
         return rows
@@ -117,8 +119,8 @@ class AgeTable:
         self._run = run
         self._table = DiskTable(AGE_DTYPE)
         self._tracker = AgeTracker()
-        self._first_seq: int | None = None
-        """Number of the first command that the controller of the session wrote."""
+        self._written: tuple[int, int] | None = None
+        """Numbers of the first and the last command that the controller of the session wrote."""
         self._last_written_ns = self._lease_lost_ns = 0
         """Times of the last command and of the last loss of the lease, wall clock of the edge."""
         self._session_ended = False
@@ -133,8 +135,8 @@ class AgeTable:
                 self._session_ended = True
         written = block.commands[(block.commands["write_arrived_ns"] > 0) & self._in_session(block.commands)]
         if len(written):
-            if self._first_seq is None:
-                self._first_seq = int(written["seq"].min())
+            first, last = int(written["seq"].min()), int(written["seq"].max())
+            self._written = (first, last) if self._written is None else (min(first, self._written[0]), last)
             self._last_written_ns = int(written["wall_ns"][-1])
         if len(block.states):
             self._table.add(self._tracker.add(block.states)[self._in_use(block.states)])
@@ -151,21 +153,16 @@ class AgeTable:
 
     def finish(self) -> None:
         """Find the first and the last step of the controller."""
-        position, last = 0, np.zeros(1, AGE_DTYPE)
-        begun = False
+        position, last, begun = 0, np.zeros(1, AGE_DTYPE), False
+        first_seq, last_seq = self._written or (1, 0)
         for rows in self._table.blocks(*(AGE_DTYPE.names or ())):
-            aged = rows["age_ns"] > 0
-            begins = aged | (
-                (rows["age_ns"] == NO_AGE) & (rows["command_seq"] >= self._first_seq)
-                if self._first_seq is not None
-                else np.False_
-            )
-            if not begun and begins.any():
-                begun, self._begin = True, position + int(np.argmax(begins))
-            if aged.any():
-                at = int(np.flatnonzero(aged)[-1])
-                # Without the trailing steps of the watchdog's zero torque.
-                self._end, last = position + at + 1, rows[at : at + 1].copy()
+            # Not the zero torque of the edge's watchdog, whose number is higher at the end.
+            written = (rows["command_seq"] >= first_seq) & (rows["command_seq"] <= last_seq)
+            used = np.flatnonzero((rows["age_ns"] > 0) | (written & (rows["age_ns"] == NO_AGE)))
+            if len(used):
+                if not begun:
+                    begun, self._begin = True, position + int(used[0])
+                self._end, last = position + int(used[-1]) + 1, rows[used[-1] :][:1].copy()
             position += len(rows)
         silent_ns = self._silent_ns()
         if silent_ns is None or not self._end:

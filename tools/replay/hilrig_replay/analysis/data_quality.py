@@ -294,9 +294,7 @@ class DataQuality:
     def _disturbed(self, edge_stalls: Stalls) -> Iterator[Reason]:
         """Reasons why the services did not run undisturbed."""
         run = self._run
-        for service, count in self._restarted().items():
-            text = f"{service} was restarted during the session"
-            yield Reason("restart", text if count == 1 else f"{text} ({count} times)")
+        yield from self._restarted()
         # The recorder counts the events of all services.
         overruns = max(self.stalls.count, (run.number("summary", "overruns") or 0) - self._edge_overruns)
         if overruns:
@@ -317,20 +315,28 @@ class DataQuality:
             text = f"{_count(self._inaccurate_steps, 'step')} with an integration error above 0.1° or 0.1 mm"
             yield Reason("integration_error", f"{text}, up to {largest:.2f} {unit} (joint {joint + 1})")
 
-    def _restarted(self) -> dict[str, int]:
-        """Number of restarts during the session by service."""
+    def _restarted(self) -> Iterator[Reason]:
+        """Reasons for the services that were started during the session."""
         run = self._run
-        start_wall_ns = run.number("session", "start_wall_ns") or 0
-        # The incarnation of a service is the wall clock at its start.
-        started = [
-            source["source"]
-            for name, source in run.metadata.items()
-            if name.startswith("hilrig.source") and start_wall_ns and int(source["incarnation"]) > start_wall_ns
-        ]
-        found = {source: started.count(source) for source in dict.fromkeys(started)}
-        if self._restarts and not any(source.startswith("sim/") for source in found):
-            found["the simulation"] = self._restarts
-        return found
+        session_ns = run.number("session", "start_wall_ns") or 0
+        incarnations: dict[str, list[int]] = {}
+        for name, source in run.metadata.items():
+            if name.startswith("hilrig.source"):
+                # The incarnation of a service is the wall clock at its start.
+                started_ns = run.number(name.removeprefix("hilrig."), "incarnation") or 0
+                incarnations.setdefault(source.get("source", ""), []).append(started_ns)
+        restarts = {
+            name: (sum(started_ns > session_ns for started_ns in found), len(found))
+            for name, found in incarnations.items()
+            if session_ns
+        }
+        if self._restarts and not any(count for name, (count, _) in restarts.items() if name.startswith("sim/")):
+            restarts["the simulation"] = (self._restarts, self._restarts + 1)
+        for name, (count, total) in restarts.items():
+            if count:
+                verb = "restarted" if total > 1 else "started"
+                times = f" ({count} times)" if count > 1 else ""
+                yield Reason("restart", f"{name} was {verb} during the session{times}")
 
     def _omitted(self, loop_ms: Statistics, age: LoopAge) -> Iterator[Reason]:
         """Reasons why the samples do not represent the run."""

@@ -64,7 +64,7 @@ class RunEntry:
     lost_transport: int = 0
     lost_recorder: int = 0
     lost_file: int = 0
-    """Number of messages that were lost by damage of the file."""
+    """Number of messages that the file counts, but does not contain."""
     overruns: int = 0
     missed_steps: int = 0
     clock_steps: int = 0
@@ -264,7 +264,7 @@ def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
     if statistics is None:
         return replace(blank, error="no summary section with statistics: run `hilrig recover` to add it")
     session, trailer = (_metadata(reader, metadata_index.get(name)) for name in ("hilrig.session", "hilrig.summary"))
-    written = int(trailer.get("messages", 0)) if "hilrig.recovered" in metadata_index else 0
+    written = int(trailer.get("messages", 0))
     entry = _with_session(blank, session)
     first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
     extent = Extent(first_ns or entry.start_wall_ns, (last_ns - first_ns) / 1e9)

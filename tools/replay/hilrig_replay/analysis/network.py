@@ -27,9 +27,9 @@ class NetworkShare:
         """The bounds as text."""
         parts = []
         if self.min_ms is not None:
-            parts.append(f"network ≥ {self.min_ms:.1f} ms")
+            parts.append(f"network ≥ {_text_ms(self.min_ms)}")
         if self.controller_max_ms is not None:
-            parts.append(f"controller ≤ {self.controller_max_ms:.1f} ms")
+            parts.append(f"controller ≤ {_text_ms(self.controller_max_ms)}")
         if self.retransmissions:
             parts.append(f"{self.retransmissions} TCP retransmission{'s' * (self.retransmissions > 1)}")
         return ", ".join(parts)
@@ -51,3 +51,7 @@ def network_share(evidence: Evidence) -> NetworkShare | None:
     by_connection = [figures[figures["controller"] == code] for code in np.unique(figures["controller"])]
     retransmissions = sum(int(rows["retransmissions"].max()) for rows in by_connection)
     return NetworkShare(min_ms, controller_max_ms, retransmissions)
+
+
+def _text_ms(value_ms: float) -> str:
+    return f"{value_ms:.1f} ms" if value_ms >= 1 else f"{value_ms:.2f} ms"

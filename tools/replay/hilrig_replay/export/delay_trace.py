@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from hilrig_replay.analysis.data_quality import OPEN_LOOP
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.analysis.stages import CONTROLLER, INJECTED
 from hilrig_replay.io.records import Records
@@ -25,8 +26,8 @@ def delay_trace(run: Run) -> TraceDelay:
     """Delays of a run in chronological order, ms.
 
     Raises:
-        InputError: the run has gaps (lost messages, a pause of 10 s or more), inconsistent time stamps, or fewer than
-            100 samples.
+        InputError: the run is an open loop, or has gaps (lost messages, a pause of 10 s or more), inconsistent time
+            stamps, or fewer than 100 samples.
     """
     effective = 0
 
@@ -35,6 +36,8 @@ def delay_trace(run: Run) -> TraceDelay:
         effective += int((block.states["basis_step"] != 0).sum())
 
     report = measure(run, count)
+    if OPEN_LOOP in report.reasons:
+        raise InputError(f"{run.path}: unusable as a delay trace: {OPEN_LOOP.text}")
     # A lost command shows both as a gap in the sequence numbers and as a state without a sample.
     missing = max(report.lost.total, effective - report.samples)
     if missing:

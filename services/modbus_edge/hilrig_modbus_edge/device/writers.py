@@ -1,0 +1,54 @@
+"""Writing connections of a rig: each torque register and coil has one at a time, among those of one controller.
+
+The connections of a controller may write different things, for example one the torques and another the magnet. Two
+that write the same are two programs that disturb each other. Time is passed in.
+"""
+
+from typing import Final
+
+from hilrig_modbus_edge.device.client import Client
+
+TORQUES: Final = 0
+"""Number of the first of the four torque registers."""
+MAGNET: Final = 4
+RESET: Final = 5
+EXTENDED: Final = 6
+"""Number of the first of the two registers of the extended map."""
+_COUNT: Final = 8
+
+
+class Writers:
+    """The connection that wrote each item last; items are numbered, and written in ranges."""
+
+    def __init__(self) -> None:
+        self._clients: list[Client | None] = [None] * _COUNT
+        self._written_ns = [0] * _COUNT
+
+    def rewrite(self, client: Client, begin: int, end: int, now_ns: int) -> bool:
+        """Record a write of items that `client` wrote last; return False if another one, or none, wrote one of them."""
+        count = end - begin
+        if self._clients[begin:end].count(client) != count:
+            return False
+        self._written_ns[begin:end] = [now_ns] * count
+        return True
+
+    def record(self, client: Client, begin: int, end: int, now_ns: int) -> None:
+        """Record a write of items; ns, monotonic clock."""
+        self._clients[begin:end] = [client] * (end - begin)
+        self._written_ns[begin:end] = [now_ns] * (end - begin)
+
+    def other(self, client: Client, begin: int, end: int, since_ns: int) -> Client | None:
+        """Return another open connection that wrote one of the items since a time (ns, monotonic clock); None: none."""
+        for item in range(begin, end):
+            writer = self._clients[item]
+            if writer is not None and writer is not client and self._written_ns[item] > since_ns:
+                return writer
+        return None
+
+    def remove(self, client: Client) -> None:
+        """Remove a closed connection."""
+        self._clients = [None if writer is client else writer for writer in self._clients]
+
+    def clear(self) -> None:
+        """Remove all connections, because the lease was released."""
+        self._clients = [None] * _COUNT
