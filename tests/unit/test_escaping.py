@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from hilrig_cli.terminal import Console
+from hilrig_cli.terminal import TerminalConsole
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export.export import export_tables
 from hilrig_replay.io.run import open_run
@@ -87,7 +87,7 @@ def test_printable_escapes_control_and_undecodable_characters() -> None:
 
 def test_console_escapes_text_and_keeps_its_own_styles() -> None:
     out = io.StringIO()
-    console = Console(file=out, force_terminal=True, color_system="standard", width=80)
+    console = TerminalConsole(file=out, force_terminal=True, color_system="standard", width=80)
     console.print("\x1b]0;x\x07 [red]text[/red]", style="bold", highlight=False)
     assert "\x1b]" not in out.getvalue()
     assert "\\x1b]0;x" in out.getvalue()

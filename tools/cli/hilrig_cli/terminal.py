@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console as RichConsole
+from rich.console import Console
 from rich.segment import Segment
 
 from hilrig_runtime.escaping import printable
 
 
-class Console(RichConsole):
+class TerminalConsole(Console):
     """A console that escapes control characters in everything it prints, and does not interpret markup by default."""
 
     def __init__(self, **options: Any) -> None:

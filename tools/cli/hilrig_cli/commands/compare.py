@@ -79,7 +79,7 @@ def _print(comparison: "Comparison") -> None:
 
     from rich.table import Table
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
     reference = comparison.summaries[0]
     title = f"Against {reference.session}, aligned by {comparison.aligned_by}"
@@ -107,7 +107,7 @@ def _print(comparison: "Comparison") -> None:
         ("Δ age p99, ms", [one.age_p99_ms for one in each]),
     ):
         table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
-    console = Console()
+    console = TerminalConsole()
     console.print(table)
     for summary, origin in zip(comparison.summaries, comparison.origins, strict=True):
         if (note := FALLBACK_TEXTS.get(origin.by)) and origin.by != comparison.aligned_by:

@@ -29,9 +29,9 @@ def demo(
 
     from hilrig_cli.commands.latency import print_report
     from hilrig_cli.local.demo import review, run_demo
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
-    console = Console(stderr=True, quiet=as_json)
+    console = TerminalConsole(stderr=True, quiet=as_json)
 
     def log(line: str) -> None:
         console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)

@@ -119,7 +119,7 @@ def _print_table(results: "list[CheckResult]") -> None:
     from rich.table import Table
 
     from hilrig_cli.doctor import Level
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
     colors = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "bold red"}
     table = Table()
@@ -128,7 +128,7 @@ def _print_table(results: "list[CheckResult]") -> None:
     for result in results:
         fix = f"\n[dim]fix: {escape(result.fix)}[/dim]" if result.fix else ""
         table.add_row(f"[{colors[result.level]}]{result.level.value}[/]", result.check, escape(result.text) + fix)
-    console = Console(markup=True)
+    console = TerminalConsole(markup=True)
     console.print(table)
     errors = sum(result.level is Level.ERROR for result in results)
     warnings = sum(result.level is Level.WARNING for result in results)

@@ -20,7 +20,7 @@ def figures(
     """
     from rich.table import Table
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_sim.validation.paper_figures import compute, draw
 
     found = compute(step_ms)
@@ -28,7 +28,7 @@ def figures(
     if as_json:
         print(json.dumps(found.as_dict() | {"files": [str(path) for path in files]}))
     else:
-        console = Console()
+        console = TerminalConsole()
         title = "Experiment (44) of the paper"
         columns = ("quantity", "expected", "computed", "agrees")
         table = Table(*columns, title=title, title_justify="left", title_style="bold")

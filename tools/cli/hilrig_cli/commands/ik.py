@@ -22,7 +22,6 @@ def ik(
 
     Exit code 1: the pose cannot be reached.
     """
-    from rich.console import Console
     from rich.table import Table
 
     from hilrig_runtime.config.lab import LabConfig, load_lab
@@ -50,6 +49,6 @@ def ik(
         for theta1, theta2, d3, theta4 in solutions:
             side = "straight" if abs(theta2) < 1e-9 else "left" if theta2 < 0 else "right"
             table.add_row(side, *(f"{value:.2f}" for value in (theta1, theta2, d3, theta4)))
-        Console().print(table)
+        TerminalConsole().print(table)
     if reason:
         raise typer.Exit(1)

@@ -86,11 +86,11 @@ def print_report(report: "LatencyReport") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.stages import LOOP_STAGES
 
-    console = Console()
+    console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
     # Without lines between the columns the table fits a terminal of 80 characters.
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -127,9 +127,9 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
-    console = Console()
+    console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("run", overflow="fold")

@@ -29,7 +29,7 @@ def registers(
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
     from rich.table import Table
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
     table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "meaning")
     for row in rows:
@@ -38,4 +38,4 @@ def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
             "controller" if row["writable"] else "rig",
             str(row["text"]),
         )
-    Console().print(table)
+    TerminalConsole().print(table)

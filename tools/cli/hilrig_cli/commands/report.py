@@ -36,7 +36,7 @@ def report(
     """
     from rich.progress import Progress
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.grading.task_loading import load_task
     from hilrig_replay.io.output_file import check_output, output_file
     from hilrig_replay.io.paths import find_recordings
@@ -47,7 +47,7 @@ def report(
     inputs = paths if task is None else [*paths, task]
     check_output(out, inputs)
     graded_by = None if task is None else load_task(task)
-    console = Console(stderr=True)
+    console = TerminalConsole(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
         result = build_report(

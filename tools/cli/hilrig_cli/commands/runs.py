@@ -132,9 +132,9 @@ def _measured(
         return measure(entries, None)
     from rich.progress import Progress
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=TerminalConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("reading recordings", total=len(entries))
         return measure(entries, lambda done: progress.update(task, completed=done))
 
@@ -161,14 +161,14 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
     from rich.table import Table
     from rich.text import Text
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
     from hilrig_runtime.escaping import printable
 
     if not entries:
         print(printable(f"no matching recordings in {folder}" if read else f"no recordings in {folder}"))
         return
-    console = Console() if sys.stdout.isatty() else Console(width=200)
+    console = TerminalConsole() if sys.stdout.isatty() else TerminalConsole(width=200)
     wide = console.width >= WIDE_TERMINAL_COLUMNS
     table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
     table.add_column("recording", min_width=20)
@@ -200,7 +200,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
         )
     console.print(table)
     if total > len(entries):
-        Console(stderr=True).print(f"{total - len(entries)} more; --limit 0 shows all")
+        TerminalConsole(stderr=True).print(f"{total - len(entries)} more; --limit 0 shows all")
 
 
 def _lost(entry: "RunEntry") -> int:

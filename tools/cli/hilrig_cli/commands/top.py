@@ -56,12 +56,12 @@ def top(
     """
     from rich.live import Live
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    console = Console()
+    console = TerminalConsole()
     with LabWatch(lab) as watch:
         watch.wait()
         if as_json or once or not sys.stdout.isatty():

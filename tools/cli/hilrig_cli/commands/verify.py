@@ -32,7 +32,7 @@ def verify(
     """
     from rich.text import Text
 
-    from hilrig_cli.terminal import Console
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
     from hilrig_replay.io.isolation import isolated
@@ -40,7 +40,7 @@ def verify(
     from hilrig_runtime.errors import HilrigError
     from hilrig_runtime.escaping import printable
 
-    console = Console()
+    console = TerminalConsole()
     verifications, unreadable = [], []
     paths = find_recordings(runs)
     for path in paths:
