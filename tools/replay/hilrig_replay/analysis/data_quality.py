@@ -93,6 +93,8 @@ class Stalls:
             return f"once, {self.longest_ns / 1e6:.0f} ms"
         if self.shortest_ns >= 0.75 * self.longest_ns:
             return f"{self.count} times, {self.longest_ns / 1e6:.0f} ms each"
+        if self.shortest_ns:
+            return f"{self.count} times, {self.shortest_ns / 1e6:.0f} to {self.longest_ns / 1e6:.0f} ms"
         return f"{self.count} times, longest {self.longest_ns / 1e6:.0f} ms"
 
 
