@@ -192,6 +192,23 @@ def test_reports_large_integration_errors(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.parametrize(("reads", "codes"), [(1, ["few_reads"]), (20, [])])
+def test_reports_a_controller_that_writes_without_reading(tmp_path: Path, reads: int, codes: list[str]) -> None:
+    made = make(SCRIPT)
+    states = {one.message.step: one.message for one in made if isinstance(one.message, JointState)}
+    last_step = max(states)
+    for one in made:
+        message = one.message
+        if isinstance(message, TorqueCommand | JointState) and message.basis_step:
+            message.basis_step = 1 + (message.basis_step * reads // (last_step + 1)) * (last_step // reads)
+        if isinstance(message, JointState) and message.basis_step:
+            message.loop_latency_ns = message.sampled_ns - states[message.basis_step].sampled_ns
+    found = reasons(measured(tmp_path, made))
+    assert list(found) == codes
+    if codes:
+        assert found["few_reads"].endswith(" commands are based on 1 state: the controller writes without reading")
+
+
 def on_other_connection(made: list[TimedMessage], share: float = 1.0) -> list[TimedMessage]:
     for one in made:
         if isinstance(one.message, TorqueCommand):
