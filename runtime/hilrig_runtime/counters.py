@@ -23,12 +23,24 @@ class Counters:
     connections: int = 0
     requests: int = 0
     malformed: int = 0
+    """Malformed messages of the bus and closed Modbus connections."""
     refused: int = 0
     recordings: int = 0
     bytes_written: int = 0
     alert: str = ""
     latenesses_ns: list[int] = field(default_factory=list)
     """Lateness of each tick since the last report, ns."""
+
+    rejections: int = 0
+    """Malformed messages since the last log message about them."""
+    rejected: str = ""
+    """The last malformed message: where it came from and its defect."""
+
+    def reject(self, key: str, defect: object) -> None:
+        """Count a received message that is dropped because it is malformed or contradicts its key."""
+        self.malformed += 1
+        self.rejections += 1
+        self.rejected = f"{key}: {defect}"
 
     def count_tick(self, tick: Tick, period_ns: int) -> None:
         """Count one tick of the service's loop."""

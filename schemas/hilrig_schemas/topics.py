@@ -10,9 +10,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from hilrig_schemas import (
     ControlReply,
@@ -31,6 +31,7 @@ from hilrig_schemas import (
     ServiceInfo,
     TorqueCommand,
 )
+from hilrig_schemas.bounds import check_bounds
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -68,9 +69,12 @@ class Topic(Generic[MessageT]):
         """Decode one message.
 
         Raises:
-            google.protobuf.message.DecodeError: the payload is not a valid message of this type.
+            google.protobuf.message.DecodeError: the payload is not a valid message of this type, or a value is out of
+                its bounds.
         """
-        return self.message.FromString(payload)
+        message = self.message.FromString(payload)
+        check_bounds(message)
+        return message
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,19 @@ class RigTopic(Topic[MessageT]):
         """Return the key of a rig; `rig` may be `*` for all rigs of the lab."""
         return f"{ROOT}/{lab}/{rig}/{self.name}"
 
+    def decode_from(self, key: str, payload: bytes) -> MessageT:
+        """Decode a message that was received on `key`, which identifies its rig.
+
+        Raises:
+            google.protobuf.message.DecodeError: as `decode`, or the message is of another rig than its key.
+        """
+        message: Any = self.decode(payload)
+        rig = key.split("/")[2]
+        # An event of a service has its name in place of the rig.
+        if message.rig != ("" if rig in SERVICES else rig):
+            raise DecodeError(f"message of rig {message.rig!r}")
+        return message  # type: ignore[no-any-return]
+
 
 @dataclass(frozen=True, slots=True)
 class ServiceTopic(Topic[MessageT]):
@@ -89,6 +106,18 @@ class ServiceTopic(Topic[MessageT]):
     def key(self, lab: str, service: str, instance: str) -> str:
         """Return the key of a service; `service` and `instance` may be `*` for all."""
         return f"{ROOT}/{lab}/{self.name}/{service}/{instance}"
+
+    def decode_from(self, key: str, payload: bytes) -> MessageT:
+        """Decode a message that was received on `key`, which identifies its service.
+
+        Raises:
+            google.protobuf.message.DecodeError: as `decode`, or the message is of another service than its key.
+        """
+        message: Any = self.decode(payload)
+        source = f"{message.service}/{message.instance}"
+        if source != source_of_key(key):
+            raise DecodeError(f"message of {source!r}")
+        return message  # type: ignore[no-any-return]
 
 
 STATE: Final = RigTopic("state", JointState, Traffic.CONTROL, channel="/state")
@@ -125,9 +154,9 @@ def alive_key(lab: str, service: str, instance: str) -> str:
     return f"{ROOT}/{lab}/{ALIVE}/{service}/{instance}"
 
 
-def source_of_alive_key(key: str) -> str:
-    """Return the service of a liveliness token, "<service>/<instance>"."""
-    return "/".join(key.split("/")[-2:])
+def source_of_key(key: str) -> str:
+    """Return the service of the key of a service topic or liveliness token, "<service>/<instance>"."""
+    return "/".join(key.rsplit("/", 2)[1:])
 
 
 def all_topics() -> Iterator[Topic[Message]]:

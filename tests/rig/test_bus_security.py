@@ -35,7 +35,11 @@ SERVICE = {"sim": "sim", "east": "edge", "west": "edge", "recorder": "recorder"}
 SENT = [
     *(f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("state", "command", "event", "traffic")),
     *(f"{service}/event" for service in ("sim", "edge", "recorder")),
-    *(f"{topic}/{service}/1" for topic in ("log", "health") for service in ("sim", "edge", "recorder")),
+    *(
+        f"{topic}/{source}"
+        for topic in ("log", "health")
+        for source in ("sim/1", "edge/east", "edge/west", "recorder/1")
+    ),
     "states/sim/1",
     "commands/edge/east",
     "commands/edge/west",
@@ -50,8 +54,8 @@ def _of_edge(name: str, rig: str) -> set[str]:
 
 MAY_SEND: dict[str, set[str]] = {
     "sim": {"rig1/state", "rig2/state", "states/sim/1", "log/sim/1", "health/sim/1", *_EVENTS},
-    "east": {*_of_edge("east", "rig1"), "edge/event", "log/edge/1", "health/edge/1"},
-    "west": {*_of_edge("west", "rig2"), "edge/event", "log/edge/1", "health/edge/1"},
+    "east": {*_of_edge("east", "rig1"), "edge/event", "log/edge/east", "health/edge/east"},
+    "west": {*_of_edge("west", "rig2"), "edge/event", "log/edge/west", "health/edge/west"},
     "recorder": {"log/recorder/1", "health/recorder/1", *_EVENTS},
     "operator": set(),
     "viewer": set(),
@@ -70,8 +74,9 @@ MAY_READ: dict[str, set[str]] = {
 }
 _CONFIGS = {"rig1/config", "rig2/config"}
 _EDGE_QUERIES = {f"{rig}/{topic}" for rig in ("rig1", "rig2") for topic in ("lease", "impairment")}
-_SERVICE_INFOS = {"service_info/sim/1", "service_info/edge/1", "service_info/recorder/1"}
-_CONTROLS = {"control/sim/1", "control/edge/1", "control/recorder/1"}
+_SOURCES = ("sim/1", "edge/east", "edge/west", "recorder/1")
+_SERVICE_INFOS = {f"service_info/{source}" for source in _SOURCES}
+_CONTROLS = {f"control/{source}" for source in _SOURCES}
 QUERIED = sorted(_CONFIGS | _EDGE_QUERIES | _SERVICE_INFOS | _CONTROLS)
 MAY_QUERY: dict[str, set[str]] = {
     "sim": _SERVICE_INFOS,
@@ -84,8 +89,8 @@ MAY_QUERY: dict[str, set[str]] = {
 }
 MAY_ANSWER: dict[str, set[str]] = {
     "sim": {*_CONFIGS, "service_info/sim/1", "control/sim/1"},
-    "east": {"rig1/lease", "rig1/impairment", "service_info/edge/1", "control/edge/1"},
-    "west": {"rig2/lease", "rig2/impairment", "service_info/edge/1", "control/edge/1"},
+    "east": {"rig1/lease", "rig1/impairment", "service_info/edge/east", "control/edge/east"},
+    "west": {"rig2/lease", "rig2/impairment", "service_info/edge/west", "control/edge/west"},
     "recorder": {"service_info/recorder/1", "control/recorder/1"},
     "operator": set(),
     "viewer": set(),
@@ -98,9 +103,9 @@ MAY_BE_QUERIED = MAY_ANSWER | {
     "recorder": _SERVICE_INFOS | _CONTROLS,
 }
 FLOWS = {"ingress", "egress"}
-TOKENS = ["alive/sim/1", "alive/edge/1", "alive/recorder/1"]
+TOKENS = [f"alive/{source}" for source in _SOURCES]
 MAY_DECLARE: dict[str, set[str]] = {
-    name: {f"alive/{SERVICE[name]}/1"} if name in SERVICE else set() for name in MAY_SEND
+    name: {f"alive/{SERVICE[name]}/{name if name in EDGES else '1'}"} if name in SERVICE else set() for name in MAY_SEND
 }
 
 
@@ -292,17 +297,16 @@ def _answered(server: zenoh.Session, querier: zenoh.Session, expected: set[str])
 
 def tokens_seen(sessions: Sessions) -> set[str]:
     tokens = [sessions.client.liveliness().declare_token(key(name)) for name in TOKENS]
-    reference_token = sessions.reference.liveliness().declare_token(
-        key(f"alive/{sessions.reference_key.partition('/')[0]}/1")
-    )
+    reference = "alive/edge/east" if sessions.reference_key == "edge/event" else "alive/recorder/1"
+    reference_token = sessions.reference.liveliness().declare_token(key(reference))
     shown: set[str] = set()
 
     def query_tokens() -> bool:
         replies = sessions.tested.liveliness().get(key("alive/**"), timeout=0.3)
         shown.update(str(reply.ok.key_expr).removeprefix("hil/lab/") for reply in replies if reply.ok is not None)
-        return MAY_DECLARE[sessions.name] | {f"alive/{sessions.reference_key.partition('/')[0]}/1"} <= shown
+        return MAY_DECLARE[sessions.name] | {reference} <= shown
 
     eventually(query_tokens)
     for token in (*tokens, reference_token):
         token.undeclare()
-    return shown - {f"alive/{sessions.reference_key.partition('/')[0]}/1"}
+    return shown - {reference}

@@ -54,6 +54,7 @@ class Bench:
         self.timers: list[Timer] = []
         self.arrive: Callable[[TimestampedPayload], None] | None = None
         self.arrival: TimestampedPayload | None = None
+        self.rejected: list[str] = []
         values = replace(DeviceSettings.of(EDGE, ImpairmentConfig()), **settings)
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
         self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
@@ -74,6 +75,9 @@ class Bench:
     def get(self, rig: str) -> TimestampedPayload | None:
         assert rig == "rig1"
         return self.arrival
+
+    def reject(self, key: str, defect: object) -> None:
+        self.rejected.append(f"{key}: {defect}")
 
     def emit(self, event: Event) -> None:
         self.events.append(event)

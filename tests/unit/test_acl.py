@@ -41,6 +41,16 @@ def test_edge_commands_only_its_rigs() -> None:
     assert {key for key in granted("west", "ingress", "put") if key.endswith("/command")} == {"hil/lab/rig3/command"}
 
 
+@pytest.mark.parametrize(
+    ("flow", "message"),
+    [("ingress", "put"), ("ingress", "declare_queryable"), ("ingress", "reply"), ("ingress", "liveliness_token")],
+)
+def test_edge_uses_keys_of_its_instance_only(flow: str, message: str) -> None:
+    of_edges = [key for key in granted("east", flow, message) if "/edge/" in key.removeprefix("hil/lab/edge/")]
+    assert of_edges
+    assert all("/edge/east" in key for key in of_edges), of_edges
+
+
 def test_single_edge_commands_all_rigs() -> None:
     assert "hil/lab/*/command" in granted("edge", "ingress", "put", BusTlsConfig())
 

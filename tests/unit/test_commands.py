@@ -112,7 +112,7 @@ def test_malformed_message_is_counted_and_ignored() -> None:
     tick(latch, command(), 0)
     tick(latch, TimestampedPayload(b"\xff\xff\xff", MS), 20 * MS)
     tick(latch, command(seq=9, effort=[1.0]), 40 * MS)
-    assert latch.malformed == 2
+    assert latch.counters.malformed == 2
     assert (latch.seq, latch.effort) == (1, (1.0, 2.0, 3.0, 4.0))
 
 
@@ -153,7 +153,7 @@ def test_repetition_or_malformed_message_supersedes_nothing() -> None:
         latch.latch(later, 20 * MS)
         assert latch.is_new
         assert (latch.seq, latch.basis_step, latch.arrived_ns) == (1, 5, 15 * MS)
-    assert latch.malformed == 1
+    assert latch.counters.malformed == 1
 
 
 def test_reset_of_superseded_command_is_executed_once() -> None:

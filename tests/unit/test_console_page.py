@@ -40,7 +40,7 @@ def lab_message() -> dict[str, Set[str]]:
 
 def event_row() -> Set[str]:
     buffer = EventBuffer(0)
-    buffer.add(Event(text="text").SerializeToString())
+    buffer.add("hil/lab/sim/event", Event(text="text").SerializeToString())
     row: dict[str, object] = json.loads(buffer.entries()[0][1])
     return row.keys()
 
@@ -113,7 +113,7 @@ def test_constants_of_the_page_equal_those_of_python(name: str, value: int) -> N
 
 def test_page_listens_to_each_kind_of_message() -> None:
     model = ViewModel("lab", ("rig1",), start=0)
-    model.events.add(Event(text="text").SerializeToString())
+    model.events.add("hil/lab/sim/event", Event(text="text").SerializeToString())
     text, _ = model.frame(0.0, {}).updates(ClientState())
     assert set(re.findall(r'on\("(\w+)", ', SCRIPT)) == set(re.findall(r"^event: (\w+)$", text, re.MULTILINE))
 

@@ -146,8 +146,9 @@ def test_silent_rig_expires_and_invalid_batch_is_ignored() -> None:
 def test_events_are_numbered_and_old_ones_evicted() -> None:
     log = EventBuffer(1000)
     for number in range(MAX_EVENTS + 5):
-        log.add(Event(rig="rig1", kind=Event.LIMIT_HIT, severity=Event.WARNING, text=f"{number}").SerializeToString())
-    log.add(b"\xff no event")
+        event = Event(rig="rig1", kind=Event.LIMIT_HIT, severity=Event.WARNING, text=f"{number}")
+        log.add("hil/lab/rig1/event", event.SerializeToString())
+    log.add("hil/lab/rig1/event", b"\xff no event")
     kept = log.entries()
     assert len(kept) == MAX_EVENTS
     assert [number for number, _ in kept] == list(range(1006, 1006 + MAX_EVENTS))
@@ -159,7 +160,7 @@ def test_unknown_event_kind_is_shown_as_number() -> None:
     log = EventBuffer(0)
     event = Event(text="x" * 10_000)
     event.kind = 99  # type: ignore[assignment]
-    log.add(event.SerializeToString())
+    log.add("hil/lab/sim/event", event.SerializeToString())
     shown = json.loads(log.entries()[0][1])
     assert (shown["kind"], len(shown["text"])) == ("99", 500)
 

@@ -793,9 +793,13 @@ def test_latency_register_keeps_the_last_value(bench: Bench) -> None:
 def test_invalid_state_message_is_ignored(bench: Bench) -> None:
     client = bench.connect()
     before = bench.read(client, 4, 4)
-    for payload in (b"\xff\xff\xff", JointState(step=9, position=(1, 2)).SerializeToString()):
+    four = (1.0, 2.0, 0.1, 3.0)
+    negative = JointState(step=9, position=four, velocity=four, effort=four, loop_latency_ns=-(1 << 62))
+    for message in (JointState(step=9, position=(1, 2)), negative, None):
+        payload = b"\xff\xff\xff" if message is None else message.SerializeToString()
         bench.arrival = TimestampedPayload(payload, bench.clock.monotonic_ns())
         assert bench.read(client, 4, 4) == before
+    assert bench.rejected == ["state of rig1: not a valid state"] * 3
 
 
 def test_one_read_contains_one_step(bench: Bench) -> None:

@@ -5,13 +5,14 @@ import threading
 import pytest
 
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
+from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.discovery import ClockOffset, conflict, list_services, worst_offset
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Health, ServiceInfo
-from hilrig_schemas.topics import HEALTH, alive_key
+from hilrig_schemas.topics import HEALTH, SERVICE_INFO, alive_key
 from support.waiting import eventually
 
 LAB = parse_lab("[rigs]\ncount = 6\n")
@@ -47,8 +48,17 @@ def test_one_of_two_equally_old_services_keeps_running() -> None:
 def test_largest_clock_offset_is_reported() -> None:
     near, far = info("sim"), info("recorder")
     near.wall_ns, far.wall_ns = 1_010, 400
-    assert worst_offset([near, far], 1, 1_000, 1_020) == ClockOffset("recorder/1", -610, 10)
-    assert worst_offset([near], near.incarnation, 1_000, 1_020) == ClockOffset()
+    assert worst_offset([(near, 20), (far, 20)], 1, 1_000) == ClockOffset("recorder/1", -610, 10)
+    assert worst_offset([(near, 20)], near.incarnation, 1_000) == ClockOffset()
+
+
+def test_late_reply_does_not_hide_an_offset() -> None:
+    # The reply of the simulation took 3 s, of which its clock read the middle: no offset beyond its uncertainty.
+    late, ahead = info("sim"), info("recorder")
+    late.wall_ns, ahead.wall_ns = 2_500_000_000, 80_000_000
+    offset = worst_offset([(late, 3_000_000_000), (ahead, 2_000_000)], 1, 0)
+    assert offset == ClockOffset("recorder/1", 79_000_000, 1_000_000)
+    assert worst_offset([(late, 3_000_000_000)], 1, 0).certain_ns == 0
 
 
 def service(hub: MemoryHub, instance: str, rigs: tuple[str, ...], wall_ns: int) -> Service:
@@ -80,7 +90,12 @@ def test_older_service_that_is_linked_late_is_found() -> None:
     bus.settle_timeout_s = 2.0
     later = Service("edge", LAB, bus, instance="2", rigs=("rig1",), clock=ManualClock(wall_ns=2_000))
     elders: list[Service] = []
-    timer = threading.Timer(0.15, lambda: elders.append(service(hub, "1", ("rig1",), 1_000)))
+
+    def link_elder() -> None:
+        elders.append(service(hub, "1", ("rig1",), 1_000))
+        elders[0].ready()
+
+    timer = threading.Timer(0.15, link_elder)
     timer.start()
     with later, pytest.raises(OperationError, match=r"edge/1 on .* already serves rig1"):
         later.ready()
@@ -100,6 +115,56 @@ def test_younger_service_stops_after_healed_partition() -> None:
                 younger.check()
             assert not elder.stopping.is_set()
             elder.check()
+
+
+def answer(hub: MemoryHub, key: str, reply: ServiceInfo, token: str) -> None:
+    """Answer as another service on `key`, with a liveliness token of `token`."""
+    bus = MemoryBus(hub)
+    bus.declare_queryable(key, lambda _: reply.SerializeToString())
+    bus.declare_token(alive_key(LAB.name, *token.split("/")))
+
+
+def test_reply_that_contradicts_its_key_is_dropped() -> None:
+    hub = MemoryHub()
+    forged = info("edge", "1", age=99)
+    answer(hub, SERVICE_INFO.key(LAB.name, "edge", "west"), forged, "edge/west")
+    with service(hub, "1", ("rig1",), 2_000) as victim:
+        victim.ready()
+        assert not victim.stopping.is_set()
+        assert victim.counters.malformed >= 1
+        assert "edge/west: message of 'edge/1'" in victim.counters.rejected
+    assert list_services(MemoryBus(hub), LAB.name) == []
+
+
+def test_conflict_needs_a_liveliness_token() -> None:
+    hub = MemoryHub()
+    answer(hub, SERVICE_INFO.key(LAB.name, "edge", "2"), info("edge", "2", age=99), "edge/3")
+    with service(hub, "1", ("rig1",), 2_000) as running:
+        running.ready()
+        assert not running.stopping.is_set()
+
+
+def test_claimed_rigs_of_another_certificate_are_ignored() -> None:
+    hub = MemoryHub()
+    lab = LAB.model_copy(update={"bus": BusConfig(tls=BusTlsConfig(edges={"east": ("rig1",), "west": ("rig3",)}))})
+    answer(hub, SERVICE_INFO.key(LAB.name, "edge", "west"), info("edge", "west", age=99), "edge/west")
+    with Service("edge", lab, MemoryBus(hub), instance="east", rigs=("rig1",), clock=ManualClock(wall_ns=2_000)) as own:
+        own.ready()
+        assert not own.stopping.is_set()
+        assert own.counters.malformed >= 1
+
+
+def test_wall_clock_at_a_limit_of_int64_is_dropped() -> None:
+    # A health report can't contain its difference to this clock.
+    hub = MemoryHub()
+    bad = info("sim", "1")
+    bad.wall_ns = -(1 << 63)
+    answer(hub, SERVICE_INFO.key(LAB.name, "sim", "1"), bad, "sim/1")
+    with service(hub, "1", ("rig1",), 2_000) as running:
+        running.ready()
+        running.health.report(0)
+        assert running.counters.malformed >= 1
+        assert running.health.clock_offset().peer == ""
 
 
 def test_health_report_contains_clock_offset() -> None:

@@ -5,19 +5,27 @@ import threading
 from test_sessions import TrackerBench
 
 from hilrig_recorder.ingest.queue import IngestQueue, ReceivedBatch
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import encode_batch
 from hilrig_runtime.timing.clock import ManualClock
-from hilrig_schemas import OpenSession
-from hilrig_schemas.topics import STATE
+from hilrig_schemas import LogBatch, OpenSession
+from hilrig_schemas.topics import LOG, STATE
 from support.log_streams import LAB, SECOND, FakeSource
 
 KEY = STATE.key(LAB, "rig1")
 
 
+SIM_LOG = LOG.key(LAB, "sim", "1")
+
+
+def put(queue: IngestQueue, batch: LogBatch) -> None:
+    queue.put(LOG.key(LAB, *batch.source.split("/")), batch.SerializeToString())
+
+
 def put_states(queue: IngestQueue, source: FakeSource, count: int) -> None:
     for _ in range(count):
         source.state("rig1", 1)
-        queue.put("key", source.batch().SerializeToString())
+        put(queue, source.batch())
 
 
 def get_all(queue: IngestQueue) -> list[ReceivedBatch]:
@@ -29,7 +37,7 @@ def get_all(queue: IngestQueue) -> list[ReceivedBatch]:
 
 def test_batches_keep_order_and_arrival_time() -> None:
     clock = ManualClock()
-    queue = IngestQueue(100, clock)
+    queue = IngestQueue(100, clock, Counters())
     source = FakeSource()
     stamps = []
     for _ in range(3):
@@ -44,7 +52,7 @@ def test_batches_keep_order_and_arrival_time() -> None:
 
 
 def test_full_queue_drops_and_counts_messages() -> None:
-    queue = IngestQueue(5, ManualClock())
+    queue = IngestQueue(5, ManualClock(), Counters())
     source = FakeSource()
     put_states(queue, source, 12)
     assert (queue.depth, queue.dropped) == (5, 7)
@@ -56,7 +64,7 @@ def test_full_queue_drops_and_counts_messages() -> None:
 
 
 def test_overflow_markers_are_in_order_of_the_drops() -> None:
-    queue = IngestQueue(2, ManualClock())
+    queue = IngestQueue(2, ManualClock(), Counters())
     source = FakeSource()
     put_states(queue, source, 3)
     assert queue.get(0) is not None
@@ -68,7 +76,7 @@ def test_overflow_markers_are_in_order_of_the_drops() -> None:
 def test_dropped_messages_are_recorder_losses() -> None:
     bench = TrackerBench()
     bench.start()
-    queue = IngestQueue(4, ManualClock(bench.now, bench.wall))
+    queue = IngestQueue(4, ManualClock(bench.now, bench.wall), Counters())
     source = bench.sim
     put_states(queue, source, 3)
     source.state("rig1", 1)
@@ -85,12 +93,12 @@ def test_dropped_messages_are_recorder_losses() -> None:
 
 
 def test_events_and_announcements_of_dropped_batches_are_kept() -> None:
-    queue = IngestQueue(1, ManualClock())
+    queue = IngestQueue(1, ManualClock(), Counters())
     edge = FakeSource("edge/1")
     put_states(queue, edge, 2)
     edge.start("rig1", "s1", 5)
     edge.state("rig1", 6)
-    queue.put("key", edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]).SerializeToString())
+    put(queue, edge.batch(sessions=[OpenSession(rig="rig1", session="s1")]))
     marker = get_all(queue)[-1]
     assert list(marker.batch.keys) == ["hil/lab/rig1/event"]
     assert [session.session for session in marker.batch.sessions] == ["s1"]
@@ -98,23 +106,23 @@ def test_events_and_announcements_of_dropped_batches_are_kept() -> None:
 
 
 def test_empty_queue_accepts_a_batch_of_any_size() -> None:
-    queue = IngestQueue(3, ManualClock())
+    queue = IngestQueue(3, ManualClock(), Counters())
     source = FakeSource()
     for number in range(10):
         source.state(f"rig{number}", 1)
-    queue.put("key", source.batch().SerializeToString())
+    put(queue, source.batch())
     assert [len(arrival.batch.keys) for arrival in get_all(queue)] == [10]
 
 
 def test_malformed_batches_are_counted_and_ignored() -> None:
-    queue = IngestQueue(3, ManualClock())
-    queue.put("key", b"\xff\xff\xff")
+    queue = IngestQueue(3, ManualClock(), Counters())
+    queue.put(SIM_LOG, b"\xff\xff\xff")
     uneven = FakeSource()
     uneven.state("rig1", 1)
     batch = uneven.batch()
     batch.keys.append("hil/lab/rig2/state")
-    queue.put("key", batch.SerializeToString())
-    assert (queue.malformed, queue.get(0)) == (2, None)
+    put(queue, batch)
+    assert (queue.counters.malformed, queue.get(0)) == (2, None)
 
 
 def test_batch_with_an_overwritten_end_is_not_recorded() -> None:
@@ -125,18 +133,18 @@ def test_batch_with_an_overwritten_end_is_not_recorded() -> None:
     # Bytes that a closing zenoh session writes after a truncated batch: a length and frames of its own.
     following = bytes.fromhex("c009a5b7f08c3b31009e21088585025f0200") * len(sent)
     for length in range(1, len(sent)):
-        queue = IngestQueue(10, ManualClock())
-        queue.put("key", sent[:length] + following[: len(sent) - length])
-        queue.put("key", sent[:length])
-        assert (queue.malformed, queue.get(0)) == (2, None), f"{length} bytes are as they were sent"
-    queue = IngestQueue(10, ManualClock())
-    queue.put("key", sent)
-    queue.put("key", b"")
-    assert (queue.malformed, queue.depth) == (1, 3)
+        queue = IngestQueue(10, ManualClock(), Counters())
+        queue.put(SIM_LOG, sent[:length] + following[: len(sent) - length])
+        queue.put(SIM_LOG, sent[:length])
+        assert (queue.counters.malformed, queue.get(0)) == (2, None), f"{length} bytes are as they were sent"
+    queue = IngestQueue(10, ManualClock(), Counters())
+    queue.put(SIM_LOG, sent)
+    queue.put(SIM_LOG, b"")
+    assert (queue.counters.malformed, queue.depth) == (1, 3)
 
 
 def test_queue_of_a_blocked_recorder_is_bounded() -> None:
-    queue = IngestQueue(10, ManualClock())
+    queue = IngestQueue(10, ManualClock(), Counters())
     one, two = FakeSource("sim/1"), FakeSource("edge/1")
     for _ in range(2_000):
         put_states(queue, one, 1)
@@ -147,7 +155,7 @@ def test_queue_of_a_blocked_recorder_is_bounded() -> None:
 
 
 def test_concurrent_put_and_get_keep_order_and_counts() -> None:
-    queue = IngestQueue(50, ManualClock())
+    queue = IngestQueue(50, ManualClock(), Counters())
     source = FakeSource()
     payloads = []
     for _ in range(3_000):
@@ -156,7 +164,7 @@ def test_concurrent_put_and_get_keep_order_and_counts() -> None:
 
     def put_all() -> None:
         for payload in payloads:
-            queue.put("key", payload)
+            queue.put(SIM_LOG, payload)
 
     thread = threading.Thread(target=put_all)
     thread.start()

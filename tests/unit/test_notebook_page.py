@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import hilrig_replay
+import hilrig_sim
 from support.recordings import Script, make, write
 
 PAGE = Path(__file__).parents[2] / "docs" / "notebook.md"
@@ -19,7 +20,7 @@ def test_runs_all_code_blocks_of_the_page(
     write(tmp_path / "run.mcap", make(script), script=script, lab_toml=task)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     names: dict[str, object] = {}
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
@@ -32,6 +33,7 @@ def test_runs_all_code_blocks_of_the_page(
         "valid for latency measurements: False",
         "% of the task, ",
         "J of mechanical energy into the arm",
+        "is too far: 700.0 mm from joint 1",
     ):
         assert words in printed, words
 
@@ -41,3 +43,8 @@ def test_public_names_are_those_of_the_page() -> None:
     assert {module for module, _ in lines} == {"hilrig_replay"}
     assert sorted(name.strip() for _, names in lines for name in names.split(",")) == sorted(hilrig_replay.__all__)
     assert all(hasattr(hilrig_replay, name) for name in hilrig_replay.__all__)
+
+
+def test_public_names_of_the_simulation_are_those_of_the_page() -> None:
+    lines = re.findall(r"^from hilrig_sim import (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(name for line in lines for name in line.split(", ")) == sorted(hilrig_sim.__all__)

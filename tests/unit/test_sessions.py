@@ -2,16 +2,28 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
+from google.protobuf.message import DecodeError
 
 from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import Recording
-from hilrig_recorder.ingest.sessions import BLOCK_PERIOD_NS, DRAIN_MAX_NS, OWNER_TIMEOUT_NS, SessionTracker
+from hilrig_recorder.ingest.sessions import (
+    BLOCK_PERIOD_NS,
+    DRAIN_MAX_NS,
+    MAX_RECORDINGS_PER_RIG,
+    MAX_RIGS,
+    OWNER_TIMEOUT_NS,
+    SessionTracker,
+)
+from hilrig_recorder.ingest.sources import MAX_PUBLISHERS
 from hilrig_recorder.mcap_format.records import decode_message_head
-from hilrig_runtime.messaging.recording_stream import put_entries
+from hilrig_runtime.counters import Counters
+from hilrig_runtime.messaging.recording_stream import decode_batch, encode_batch, put_entries
 from hilrig_schemas import Event, LogBatch, OpenSession
-from hilrig_schemas.topics import EVENT, STATE
+from hilrig_schemas.topics import COMMAND, EVENT, STATE
+from hilrig_schemas.v1.event_pb2 import PartData
 from support.log_streams import LAB, MS, SECOND, FakeSource, Sent
 
 MESSAGE_HEADER_BYTES = 31
@@ -85,9 +97,17 @@ class FakeStore:
 class TrackerBench:
     """A session tracker with a fake store, fake publishers and a manual clock."""
 
-    def __init__(self, preroll_s: float = 2.0, rigs: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        preroll_s: float = 2.0,
+        rigs: Sequence[str] | None = None,
+        may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
+    ) -> None:
         self.store = FakeStore()
-        self.tracker = SessionTracker(LAB, preroll_s, self.store, lambda rig: rigs is None or rig in rigs)
+        self.counters = Counters()
+        self.tracker = SessionTracker(
+            LAB, preroll_s, self.store, lambda rig: rigs is None or rig in rigs, may_serve, self.counters
+        )
         self.store.flush = self.tracker.flush
         self.now = 100 * SECOND
         self.offset = WALL
@@ -542,6 +562,101 @@ def test_invalid_session_and_rig_names_are_rejected(session: str, rig: str) -> N
     bench.accept(bench.edge.batch())
     assert bench.store.files == []
     assert len(bench.store.rejected) == 1
+
+
+def one_message(publish_ns: int = WALL, sequence: int = 1, **batch_fields: Any) -> LogBatch:
+    batch = LogBatch(**{"source": "edge/west", "incarnation": 1, "sequence": 1, **batch_fields})
+    put_entries(batch, [(EVENT.key(LAB, "rig2"), sequence, publish_ns, Event(rig="rig2").SerializeToString())])
+    return batch
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        one_message(publish_ns=-1),
+        one_message(publish_ns=-(1 << 63)),
+        one_message(sequence=1 << 63),
+        one_message(sequence=(1 << 64) - 1),
+        one_message(incarnation=(1 << 64) - 1),
+        LogBatch(source="edge/west", incarnation=1, sequence=1 << 63),
+        one_message(sessions=[OpenSession(rig="rig2", session="s", start_wall_ns=-(1 << 63))]),
+        one_message(sessions=[OpenSession(rig="rig2", session=f"s{number}") for number in range(5_000)]),
+        one_message(sessions=[OpenSession(rig="rig2", session="s" * 5_000)]),
+    ],
+)
+def test_batch_with_a_value_out_of_bounds_is_refused(batch: LogBatch) -> None:
+    with pytest.raises(DecodeError):
+        decode_batch(encode_batch(batch))
+    assert decode_batch(encode_batch(one_message())).source == "edge/west"
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        Event(rig="rig1", session="s", kind=Event.SESSION_START, wall_ns=-(1 << 63)),
+        Event(rig="rig1", session="s", kind=Event.SESSION_START, step=(1 << 64) - 1),
+        Event(rig="rig2", session="s", kind=Event.SESSION_START),
+        Event(rig="rig1", session="s", kind=Event.PART_PICKED, part_data=PartData(x=float("nan"))),
+        Event(rig="rig1", session="s", kind=Event.SESSION_START, source="s" * 5_000),
+    ],
+)
+def test_invalid_event_is_dropped_and_counted(event: Event) -> None:
+    bench = TrackerBench()
+    bench.edge.put(EVENT, "rig1", event, bench.wall)
+    bench.accept(bench.edge.batch())
+    assert (bench.store.files, bench.counters.malformed) == ([], 1)
+
+
+def test_gap_of_an_invented_number_is_not_a_loss() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(3)
+    bench.edge._sequences[COMMAND.key(LAB, "rig1")] = 1 << 47
+    bench.edge.command("rig1", bench.wall)
+    bench.edge._sequences[COMMAND.key(LAB, "rig1")] = 1 << 40
+    bench.edge.command("rig1", bench.wall)
+    bench.accept(bench.edge.batch())
+    assert bench.tracker.lost_transport == bench.file.recording.counters.lost_transport
+    assert bench.counters.malformed == 2
+    assert bench.tracker.lost_transport < 1 << 33
+
+
+def test_rigs_and_sessions_of_another_certificate_are_dropped() -> None:
+    bench = TrackerBench(may_serve=lambda source, rig: (source, rig) != ("edge/west", "rig1"))
+    west = FakeSource("edge/west")
+    west.start("rig1", "forged", bench.wall)
+    west.command("rig1", bench.wall)
+    bench.accept(west.batch(sessions=[OpenSession(rig="rig1", session="announced")]))
+    assert bench.store.files == []
+    assert bench.counters.malformed >= 2
+    west.start("rig2", "own", bench.wall)
+    bench.accept(west.batch())
+    assert [file.recording.session for file in bench.store.files] == ["own"]
+
+
+def test_session_is_ended_by_its_owner_only() -> None:
+    bench = TrackerBench()
+    bench.start()
+    other = FakeSource("edge/west")
+    other.end("rig1", "s1", bench.wall)
+    bench.accept(other.batch())
+    assert bench.file.recording.end_wall_ns is None
+    assert bench.counters.malformed == 1
+
+
+def test_sessions_rigs_and_publishers_are_bounded() -> None:
+    bench = TrackerBench()
+    sessions = [OpenSession(rig="rig1", session=f"s{number}") for number in range(3_000)]
+    bench.accept(bench.edge.batch(sessions=sessions))
+    assert len(bench.store.files) == MAX_RECORDINGS_PER_RIG
+    for number in range(MAX_RIGS + 100):
+        bench.sim.state(f"forged{number}", bench.wall)
+    bench.accept(bench.sim.batch())
+    assert len(bench.tracker._rigs) == MAX_RIGS
+    for number in range(MAX_PUBLISHERS + 50):
+        bench.accept(LogBatch(source="edge/9", incarnation=number + 1, sequence=1))
+        bench.wait(MS)
+    assert len(bench.tracker._publishers._publishers) <= MAX_PUBLISHERS + 2
 
 
 def test_unknown_input_is_reported_once() -> None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from hilrig_cli.main import app
 from hilrig_runtime.errors import InputError
 from hilrig_study.plots import Marker, plane_figure, traces
+from hilrig_study.results import settled_interval
 from hilrig_study.study_config import StudyConfig, load_study
 from hilrig_study.sweep import all_cells, cell_at, run_cells, sweep
 from support.rrd_files import RrdFile
@@ -255,6 +256,7 @@ def test_command_writes_all_result_files(tmp_path: Path) -> None:
     summary = json.loads(done.stdout)
     assert summary["runs"] == 6
     assert json.loads((out / "study.json").read_text()) == summary
+    assert summary["controllers"][0]["settled_interval"] is None
     table = pyarrow.parquet.read_table(out / "runs.parquet")
     assert table.num_rows == 6
     # The page documents exactly the columns of the table.
@@ -264,6 +266,25 @@ def test_command_writes_all_result_files(tmp_path: Path) -> None:
     assert (out / "plane-1.png").stat().st_size > 10_000
     assert (out / "plane-1.svg").read_text().startswith("<?xml")
     assert RrdFile(out / "study.rrd").rows("/trace/A/error/θ1") == 150
+
+
+def test_growing_error_is_not_settled(tmp_path: Path) -> None:
+    # The loop grows by 0.2 % a step: after 10 s the error is still less than half of the offset.
+    text = SMALL.replace("duration_s = 3", "duration_s = 10").replace("[0, 40, 150]", "[81]")
+    study = load(tmp_path, text.replace("[0.3, 0.9]", "[0.6, 0.65]"))
+    found = sweep(study, tmp_path, lambda _: None, workers=1)
+    assert found.radius[1] == pytest.approx(1.002, abs=0.002)
+    assert np.isnan(found.results["failed_s"]).all()
+    assert found.results["settled"].tolist() == [True, False]
+
+
+def test_settled_share_of_random_runs_has_an_interval(tmp_path: Path) -> None:
+    study = load(tmp_path, "runs = 4" + SMALL.replace("delay_ms", "jitter_ms"))
+    found = sweep(study, tmp_path, lambda _: None, workers=1, theory=False)
+    low, high = settled_interval(study, found, 0) or (1.0, 0.0)
+    share = found.results["settled"].mean()
+    assert low <= share <= high
+    assert high - low > 0.1
 
 
 def test_command_accepts_controller_file(tmp_path: Path) -> None:

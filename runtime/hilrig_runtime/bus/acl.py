@@ -53,11 +53,13 @@ class BusIdentity:
     name: str
     role: str
     rigs: tuple[str, ...] = ("*",)
+    instance: str = "*"
+    """The instance whose keys it may use; `*`: all of its role, which share one certificate."""
 
 
 def identities(tls: BusTlsConfig) -> list[BusIdentity]:
     """Return all accepted identities except the router."""
-    edges = [BusIdentity(name, "edge", rigs) for name, rigs in tls.edges.items()] or [BusIdentity("edge", "edge")]
+    edges = [BusIdentity(name, "edge", rigs, name) for name, rigs in tls.edges.items()] or [BusIdentity("edge", "edge")]
     return [BusIdentity("sim", "sim"), *edges, *(BusIdentity(role, role) for role in ("recorder", *TOOL_ROLES))]
 
 
@@ -78,7 +80,7 @@ def _rules_of(identity: BusIdentity, lab: str) -> Iterable[dict[str, Any]]:
     recorded = [key for key in (*published, *subscribed) if f"/{topics.LOG.name}/" in key]
     # Caches, heartbeats and tokens of recording streams are under a verbatim chunk, which `**` does not match.
     caches = [f"{key}/@adv/**" for key in recorded]
-    tokens = [alive_key(lab, identity.role, "*")] if identity.role in SERVICES else []
+    tokens = [alive_key(lab, identity.role, identity.instance)] if identity.role in SERVICES else []
     everything = [f"{ROOT}/{lab}/**", f"{ROOT}/{lab}/**/@adv/**"]
 
     def rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Iterable[dict[str, Any]]:
@@ -127,9 +129,7 @@ def _keys(identity: BusIdentity, lab: str) -> tuple[list[str], list[str], list[s
     for topic in SERVICE_TOPICS:
         rule, query = RULES[topic.name], topic.traffic is Traffic.QUERY
         if identity.role in rule.publishers:
-            # The key of a batch identifies its edge: an edge with its own rigs has its own key.
-            own_key = topic is topics.COMMANDS and identity.rigs != ("*",)
-            (served if query else published).append(topic.key(lab, identity.role, identity.name if own_key else "*"))
+            (served if query else published).append(topic.key(lab, identity.role, identity.instance))
         if identity.role in rule.subscribers:
             (queried if query else subscribed).append(topic.key(lab, "*", "*"))
     return published, served, subscribed, queried

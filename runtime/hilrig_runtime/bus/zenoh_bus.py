@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
@@ -142,9 +143,11 @@ class ZenohBus(Bus):
     def query(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Reply]:
         """See `Bus.query`."""
         replies = []
+        sent_ns = time.monotonic_ns()
         for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
             if reply.ok is not None:
-                replies.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+                round_trip_ns = time.monotonic_ns() - sent_ns
+                replies.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), round_trip_ns=round_trip_ns))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes().decode(errors="replace")
                 # zenoh reports a query without a reply as an error of its own.

@@ -51,6 +51,12 @@ class BusConfig(Section):
         """Host name or address in the endpoint of the router."""
         return self.router.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
 
+    def may_serve(self, source: str, rig: str) -> bool:
+        """Return whether a service, "<service>/<instance>", may publish for a rig according to its certificate."""
+        service, _, instance = source.partition("/")
+        edges = {} if self.tls is None else self.tls.edges
+        return service != "edge" or not edges or rig in edges.get(instance, ())
+
     @model_validator(mode="after")
     def _router_and_tls_agree(self) -> "BusConfig":
         if self.topology == "router" and self.router.startswith("tls/") != (self.tls is not None):

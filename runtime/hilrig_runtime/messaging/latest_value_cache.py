@@ -22,6 +22,9 @@ class TimestampedPayload(NamedTuple):
     """Delay that was injected after the arrival, ns."""
 
 
+MAX_RIGS: Final = 4096
+"""Maximum number of rigs; if a publisher invents more, those with the oldest messages are evicted."""
+
 # Built by tuple.__new__: the class's own constructor is interpreted code and takes three times as long.
 _timestamped: Final[Callable[[tuple[bytes, int, int]], TimestampedPayload]] = partial(tuple.__new__, TimestampedPayload)
 
@@ -47,13 +50,13 @@ class LatestValueCache:
         arrived_ns = self._monotonic_ns()
         try:
             batch = RigBatch.FromString(payload)
-        except DecodeError:
-            self._counters.malformed += 1
+        except DecodeError as error:
+            self.reject(key, error)
             return
         # Copied to lists at once: iterating over repeated fields takes longer than everything else here.
         rigs, messages = batch.rigs[:], batch.messages[:]
-        if len(rigs) != len(messages):
-            self._counters.malformed += 1
+        if len(rigs) != len(messages) or len(rigs) > MAX_RIGS:
+            self.reject(key, f"{len(messages)} messages of {len(rigs)} rigs")
             return
         values = zip(rigs, map(_timestamped, zip(messages, repeat(arrived_ns), repeat(0), strict=False)), strict=True)
         if self._permitted:
@@ -62,3 +65,10 @@ class LatestValueCache:
         else:
             self._by_rig.update(values)
         self._counters.received += len(messages)
+        if len(self._by_rig) > MAX_RIGS:
+            newest = sorted(self._by_rig.items(), key=lambda item: -item[1].arrived_ns)[: MAX_RIGS // 2]
+            self._by_rig = dict(newest)
+
+    def reject(self, key: str, defect: object) -> None:
+        """Count a malformed batch or message; its receiver drops it."""
+        self._counters.reject(key, defect)

@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Publisher
 from hilrig_schemas import LogBatch, OpenSession
+from hilrig_schemas.bounds import MAX_INTEGER, MAX_ITEMS, MAX_SEQUENCE, check_bounds
 
 FLUSH_PERIOD_NS: Final = 20_000_000
 SESSIONS_PERIOD_NS: Final = 500_000_000
@@ -65,7 +66,7 @@ def decode_batch(payload: bytes) -> LogBatch:
     """Decode a batch.
 
     Raises:
-        DecodeError: not a batch, or corrupted in transport.
+        DecodeError: not a batch, corrupted in transport, or with a value out of its bounds.
     """
     batch = LogBatch.FromString(payload)
     if batch.HasField("checksum"):
@@ -74,6 +75,16 @@ def decode_batch(payload: bytes) -> LogBatch:
             raise DecodeError("the checksum of the batch is wrong")
     if not batch.source:
         raise DecodeError("the batch has no source")
+    # Whole columns: no step for each message.
+    keys, sequences, times = batch.keys, batch.sequences[:], batch.publish_wall_ns[:]
+    if not len(keys) == len(sequences) == len(times) == len(batch.payloads):
+        raise DecodeError("the columns of the batch have different lengths")
+    if sequences and (max(sequences) > MAX_SEQUENCE or min(times) < 0 or max(times) > MAX_INTEGER):
+        raise DecodeError("a sequence number or time of the batch is out of its bounds")
+    if batch.incarnation > MAX_INTEGER or batch.sequence > MAX_SEQUENCE or len(batch.sessions) > MAX_ITEMS:
+        raise DecodeError("a number of the batch is out of its bounds")
+    for session in batch.sessions:
+        check_bounds(session)
     return batch
 
 

@@ -11,7 +11,7 @@ import logging
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -21,11 +21,12 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Bus, Handle
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError, list_names
 from hilrig_runtime.process.liveliness import PeerDownTracker
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import ServiceInfo
-from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_alive_key
+from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_key
 
 RECHECK_PERIOD_NS: Final = 10_000_000_000
 RETRY_INTERVAL_S: Final = 0.1
@@ -44,7 +45,12 @@ class ClockOffset:
     """The service, "<service>/<instance>"; empty: no service replied."""
     offset_ns: int = 0
     uncertainty_ns: int = 0
-    """Half of the round-trip time of the query."""
+    """Half of the round-trip time of its reply."""
+
+    @property
+    def certain_ns(self) -> int:
+        """Part of the offset that the uncertainty does not explain, ns; not negative."""
+        return max(0, abs(self.offset_ns) - self.uncertainty_ns)
 
 
 def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
@@ -65,33 +71,46 @@ def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
     return ""
 
 
-def worst_offset(others: Iterable[ServiceInfo], own_incarnation: int, sent_ns: int, received_ns: int) -> ClockOffset:
-    """Return the largest clock offset; query sent at `sent_ns`, last reply received at `received_ns`, wall clock."""
-    middle_ns, half_ns = (sent_ns + received_ns) // 2, (received_ns - sent_ns) // 2
+def worst_offset(others: Iterable[tuple[ServiceInfo, int]], own_incarnation: int, sent_ns: int) -> ClockOffset:
+    """Return the largest clock offset, less its uncertainty.
+
+    Args:
+        others: the services that replied, each with the round-trip time of its reply, ns.
+        own_incarnation: the service itself, which also replies.
+        sent_ns: when the query was sent, wall clock.
+    """
+    # A reply that is late because the query waits for a stopped service would otherwise look like an offset.
     offsets = [
-        ClockOffset(f"{other.service}/{other.instance}", other.wall_ns - middle_ns, half_ns)
-        for other in others
+        ClockOffset(f"{other.service}/{other.instance}", other.wall_ns - sent_ns - half_ns, half_ns)
+        for other, half_ns in ((other, round_trip_ns // 2) for other, round_trip_ns in others)
         if other.incarnation != own_incarnation
     ]
-    return max(offsets, key=lambda offset: abs(offset.offset_ns), default=ClockOffset())
+    return max(offsets, key=lambda offset: offset.certain_ns, default=ClockOffset())
 
 
 def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = QUERY_TIMEOUT_S) -> list[ServiceInfo]:
     """Query the running services of a lab; sorted by service and instance."""
-    found = []
+    found = [info for info, _ in query_services(bus, lab, service, Counters(), timeout_s)]
+    return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
+
+
+def query_services(
+    bus: Bus, lab: str, service: str, counters: Counters, timeout_s: float
+) -> Iterator[tuple[ServiceInfo, int]]:
+    """Query the running services of a lab; yield each with the round-trip time of its reply, ns."""
     for reply in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
         try:
             if not reply.error:
-                found.append(ServiceInfo.FromString(reply.payload))
-        except DecodeError:
-            continue
-    return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
+                yield SERVICE_INFO.decode_from(reply.key, reply.payload), reply.round_trip_ns
+        except DecodeError as error:
+            counters.reject(reply.key, error)
 
 
 class PeerRegistry:
     """Announces one service, and detects conflicting instances and lost peers.
 
     `rigs` returns the name and address of each of its rigs; `on_conflict` gets the reason why the service must stop.
+    `may_serve` returns whether a service may serve a rig according to its certificate: other claims are ignored.
     """
 
     def __init__(
@@ -102,6 +121,8 @@ class PeerRegistry:
         rigs: Callable[[], Sequence[tuple[str, str]]],
         clock: Clock,
         on_conflict: Callable[[str], None],
+        counters: Counters,
+        may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
     ) -> None:
         self.clock_offset = ClockOffset()
         self._bus = bus
@@ -112,6 +133,8 @@ class PeerRegistry:
         self._rigs = rigs
         self._clock = clock
         self._on_conflict = on_conflict
+        self._counters = counters
+        self._may_serve = may_serve
         self._claimed = False
         self._closing = False
         self._peers_down = PeerDownTracker()
@@ -133,9 +156,7 @@ class PeerRegistry:
         self._claimed = True
         watched = alive_key(self._lab, "*", "*")
         self._declared.append(
-            self._bus.subscribe_liveliness(
-                watched, lambda key, alive: self._changes.put((source_of_alive_key(key), alive))
-            )
+            self._bus.subscribe_liveliness(watched, lambda key, alive: self._changes.put((source_of_key(key), alive)))
         )
         threading.Thread(target=self._watch, name="discovery", daemon=True).start()
 
@@ -176,9 +197,23 @@ class PeerRegistry:
 
     def _find_conflict(self) -> str:
         sent_ns = self._clock.wall_ns()
-        others = list_services(self._bus, self._lab, timeout_s=CLAIM_TIMEOUT_S)
-        self.clock_offset = worst_offset(others, self._own.incarnation, sent_ns, self._clock.wall_ns())
-        return conflict(self._info(), others)
+        replies = list(query_services(self._bus, self._lab, "*", self._counters, CLAIM_TIMEOUT_S))
+        self.clock_offset = worst_offset(replies, self._own.incarnation, sent_ns)
+        others = [other for other, _ in replies]
+        for other in others:
+            allowed = [rig for rig in other.rigs if self._may_serve(f"{other.service}/{other.instance}", rig)]
+            if len(allowed) < len(other.rigs):
+                self._counters.reject(
+                    SERVICE_INFO.key(self._lab, other.service, other.instance), "rigs that its certificate excludes"
+                )
+            other.rigs[:] = allowed
+        reason = conflict(self._info(), others)
+        if not reason:
+            return ""
+        # A service that works has a token. A reply without one is of a service that is starting or ending.
+        alive = self._bus.get_liveliness(alive_key(self._lab, self._own.service, "*"))
+        alive_names = {source_of_key(key) for key in alive}
+        return conflict(self._info(), [o for o in others if f"{o.service}/{o.instance}" in alive_names])
 
     def _watch(self) -> None:
         monotonic_ns = self._clock.monotonic_ns

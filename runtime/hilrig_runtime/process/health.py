@@ -1,5 +1,6 @@
 """Publishes a health report of a service once a second."""
 
+import logging
 import os
 import platform
 import sys
@@ -17,6 +18,10 @@ from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
+REJECTED_LOG_PERIOD_NS: Final = 10_000_000_000
+"""Shortest time between two log messages about malformed messages, ns."""
+
+logger = logging.getLogger(__name__)
 
 
 class HealthReporter:
@@ -40,6 +45,7 @@ class HealthReporter:
         self._start_ns = clock.monotonic_ns()
         self._last_ns = self._start_ns
         self._last = (0, 0)
+        self._rejected_due_ns = self._start_ns
 
     def report_if_due(self, now_ns: int) -> None:
         """Publish a report if the last one is a second old; `now_ns`: monotonic clock."""
@@ -70,12 +76,24 @@ class HealthReporter:
             rig_reports=self.rig_reports(),
         )
         for name in _COPIED:
-            setattr(health, name, getattr(counters, name))
+            value = getattr(counters, name)
+            # A sum of counts that a peer invented must not end this service.
+            setattr(health, name, value if isinstance(value, str) else min(value, _MAX_COUNT))
         self._last = (counters.received, counters.published)
         self._last_ns = now_ns
         self._publisher.put(health.SerializeToString())
+        self._log_rejected(now_ns)
+
+    def _log_rejected(self, now_ns: int) -> None:
+        """Log the number of malformed messages since the last log message, and the last one."""
+        counters = self.counters
+        if counters.rejections and now_ns >= self._rejected_due_ns:
+            self._rejected_due_ns = now_ns + REJECTED_LOG_PERIOD_NS
+            count, counters.rejections = counters.rejections, 0
+            logger.warning("malformed messages dropped: %d; the last one: %.300s", count, counters.rejected)
 
 
+_MAX_COUNT: Final = (1 << 62) - 1
 _COPIED: Final = tuple(name for name in Counters.__slots__ if name in Health.DESCRIPTOR.fields_by_name)
 
 

@@ -71,7 +71,9 @@ class Service(Handle):
         info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
         self.addresses: Callable[[str], str] = lambda _: ""
         """Returns the address of a rig for the service info; set by the edge."""
-        self._registry = PeerRegistry(bus, lab.name, info, self._rigs_reached, clock, self.fail)
+        self._registry = PeerRegistry(
+            bus, lab.name, info, self._rigs_reached, clock, self.fail, self.counters, lab.bus.may_serve
+        )
         self._closing.callback(self._registry.close)
         self.health.clock_offset = lambda: self._registry.clock_offset
 

@@ -87,7 +87,7 @@ class Recorder:
         """Processes control requests and the results of other threads on the recorder's thread."""
         self._config_due_ns: dict[str, int] = {}
         self._config_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
-        self._queue = IngestQueue(config.queue_entries, service.clock)
+        self._queue = IngestQueue(config.queue_entries, service.clock, service.counters)
         self._sync_worker = SyncWorker(
             service.clock,
             on_sync_error=lambda writer, error: self._executor.post(lambda: self._store.fail(writer, error)),
@@ -105,7 +105,9 @@ class Recorder:
             on_failed=self._on_failed,
         )
         partition = RigPartition([rig.name for rig in lab.rigs], [rig.name for rig in service.rigs])
-        self._sessions = SessionTracker(lab.name, config.preroll_s, self._store, partition.contains)
+        self._sessions = SessionTracker(
+            lab.name, config.preroll_s, self._store, partition.contains, lab.bus.may_serve, service.counters
+        )
         self._manual_sessions = ManualSessions(
             lambda rig: (
                 partition.contains_configured(rig) or (partition.contains(rig) and self._sessions.has_received(rig))
@@ -185,7 +187,6 @@ class Recorder:
         counters.received = queue.received
         counters.queue_depth, counters.queue_capacity = queue.depth, queue.capacity
         counters.lost_transport, counters.lost_recorder = sessions.lost_transport, queue.dropped
-        counters.malformed = queue.malformed
         counters.recordings = len(sessions.recordings)
         counters.rigs = len({recording.rig for recording in sessions.recordings})
         counters.bytes_written = self._store.bytes_written
@@ -240,7 +241,7 @@ class Recorder:
             key = CONFIG.key(self._service.lab.name, rig)
             for reply in self._service.bus.query(key, timeout_s=_CONFIG_TIMEOUT_S):
                 if not reply.error:
-                    config = CONFIG.decode(reply.payload)
+                    config = CONFIG.decode_from(reply.key, reply.payload)
         except (DecodeError, OperationError) as error:
             logger.warning("%s: configuration can't be read: %s", rig, error)
         finally:

@@ -5,13 +5,16 @@ one; a repetition only shows that the edge is alive.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, NamedTuple
 
 from google.protobuf.message import DecodeError
 
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import TorqueCommand
+from hilrig_schemas.bounds import MAX_INTEGER, MAX_SESSION_ID
 from hilrig_sim.arm.model import LARGEST_EFFORT
 
 ZERO_EFFORT: Final = (0.0, 0.0, 0.0, 0.0)
@@ -51,6 +54,10 @@ class _Command(NamedTuple):
     resets: int
 
 
+# Built by tuple.__new__: the class's own constructor is interpreted code.
+_command: Final = partial(tuple.__new__, _Command)
+
+
 @dataclass(slots=True)
 class CommandLatch:
     """Latches the commands of one rig; the attributes describe the command that is applied from the latest tick on."""
@@ -83,8 +90,8 @@ class CommandLatch:
     """A reset is requested for this tick."""
     silent_ns: int = 0
     """Time without a message before `command_lost` or `command_resumed`, ns."""
-    malformed: int = 0
-    """Number of malformed messages."""
+    counters: Counters = field(default_factory=Counters)
+    """Count malformed messages."""
     received: TimestampedPayload | None = None
     """The latched message."""
     _last_received_ns: int = 0
@@ -120,7 +127,7 @@ class CommandLatch:
     def _apply(self, received: TimestampedPayload, now_ns: int) -> None:
         command = _decode(received.payload)
         if command is None:
-            self.malformed += 1
+            self.counters.reject("command", "not a valid command")
             return
         was_silent_ns = now_ns - self._last_received_ns
         self._last_received_ns = received.arrived_ns
@@ -150,17 +157,20 @@ def _decode(payload: bytes) -> _Command | None:
     except DecodeError:
         return None
     # Copied into a list: reading the numbers of a repeated field one by one takes twice as long.
-    effort = message.effort[:]
-    if len(effort) != 4:
+    effort, session = message.effort[:], message.session
+    # The session and the number are copied into each state. Every value of the other fields is valid.
+    if len(effort) != 4 or len(session) > MAX_SESSION_ID or message.seq > MAX_INTEGER:
         return None
-    return _Command(
-        message.seq,
-        message.session,
-        _bounded(*effort),
-        message.magnet,
-        message.basis_incarnation,
-        message.basis_step,
-        message.resets,
+    return _command(
+        (
+            message.seq,
+            session,
+            _bounded(*effort),
+            message.magnet,
+            message.basis_incarnation,
+            message.basis_step,
+            message.resets,
+        )
     )
 
 

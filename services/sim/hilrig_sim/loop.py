@@ -162,7 +162,9 @@ class Simulation:
         return RigStateEncoder(index, name, parameters, self._service.incarnation, plant)
 
     def _new_latch(self) -> CommandLatch:
-        return CommandLatch(self._service.incarnation, self._service.lab.sim.command_timeout_ns)
+        return CommandLatch(
+            self._service.incarnation, self._service.lab.sim.command_timeout_ns, counters=self._counters
+        )
 
     def _update_motion(self) -> None:
         """Encode the motion at the start of the next step now, so that its tick has less work."""

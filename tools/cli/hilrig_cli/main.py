@@ -17,6 +17,7 @@ from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
 from hilrig_cli.commands.export import export
 from hilrig_cli.commands.figures import figures
+from hilrig_cli.commands.ik import ik
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
 from hilrig_cli.commands.latency import latency
@@ -47,7 +48,7 @@ app = typer.Typer(
 )
 
 PANELS = {
-    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, certs),
+    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs),
     "Run a single service": (sim, edge, recorder, router),
     "Analyze recordings": (runs, latency, replay, compare, study, report, verify, figures, recover, play, export),
 }
@@ -55,7 +56,9 @@ PANELS = {
 
 for _panel, _commands in PANELS.items():
     for _command in _commands:
-        app.command(rich_help_panel=_panel)(_command)
+        # A negative coordinate is no option.
+        _settings = {"ignore_unknown_options": True} if _command is ik else None
+        app.command(rich_help_panel=_panel, context_settings=_settings)(_command)
 app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
 app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
 

@@ -26,10 +26,10 @@ class EventBuffer:
         self.last = start
         self._events: deque[tuple[int, str]] = deque(maxlen=MAX_EVENTS)
 
-    def add(self, payload: bytes) -> None:
-        """Add an encoded event; an invalid message is ignored."""
+    def add(self, key: str, payload: bytes) -> None:
+        """Add an encoded event; a message that is invalid or contradicts its key is ignored."""
         try:
-            event = EVENT.decode(payload)
+            event = EVENT.decode_from(key, payload)
         except DecodeError:
             return
         self.last += 1

@@ -14,9 +14,10 @@ from hilrig_console.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
 from hilrig_monitoring.lab_view import SILENT_AFTER_S
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, RigBatch, RigConfig
+from hilrig_schemas.topics import STATE
 from hilrig_sim.arm.model import ArmParameters, RigParameters
 
-_STATE: Final = JointState.FromString
+_STATE: Final = STATE.decode
 _MAX_LENGTH_VARIATION: Final = 32
 """Largest difference in length between states with the same parts, bytes."""
 

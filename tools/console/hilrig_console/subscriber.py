@@ -126,25 +126,23 @@ class LabSubscriber:
                 self._model.poses.configure(rig, config)
 
     def _on_health(self, key: str, payload: bytes) -> None:
-        del key
         try:
-            health = HEALTH.decode(payload)
+            health = HEALTH.decode_from(key, payload)
         except DecodeError:
             return
         with self._model.lock:
             self._model.view.update(health, time.monotonic())
 
     def _on_event(self, key: str, payload: bytes) -> None:
-        del key
         with self._model.lock:
-            self._model.events.add(payload)
+            self._model.events.add(key, payload)
 
 
 def _config(bus: Bus, lab: str, rig: str) -> RigConfig | None:
     for reply in bus.query(CONFIG.key(lab, rig), timeout_s=0.5):
         if reply.payload and not reply.error:
             try:
-                return CONFIG.decode(reply.payload)
+                return CONFIG.decode_from(reply.key, reply.payload)
             except DecodeError:
                 continue
     return None

@@ -48,9 +48,9 @@ class LabWatch(Handle):
                     f"no service of lab {self.lab.name!r} found: is it running (hilrig up), with this lab.toml?"
                 )
 
-    def _on_health(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+    def _on_health(self, key: str, payload: bytes) -> None:
         try:
-            health = HEALTH.decode(payload)
+            health = HEALTH.decode_from(key, payload)
         except DecodeError:
             return
         with self.lock:

@@ -28,7 +28,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("queue_entries", "gauge", "Entries in the service's queue.", "queue_depth", 1),
     ("connections", "gauge", "Modbus connections open.", "connections", 1),
     ("requests_total", "counter", "Modbus requests answered, also with an exception.", "requests", 1),
-    ("malformed_total", "counter", "Connections closed because of malformed frames.", "malformed", 1),
+    ("malformed_total", "counter", "Malformed messages and connections with malformed frames.", "malformed", 1),
     ("refused_total", "counter", "Connections and writes refused.", "refused", 1),
     ("recordings", "gauge", "Open recordings.", "recordings", 1),
     ("written_bytes_total", "counter", "Bytes written to recordings.", "bytes_written", 1),

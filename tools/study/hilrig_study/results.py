@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 from pydantic_core import to_jsonable_python
+from scipy.stats import binomtest
 
 from hilrig_replay.io.output_file import output_file
 from hilrig_sim.arm.joints import JOINT_NAMES
@@ -32,6 +33,15 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
     return pa.table(columns)
 
 
+def settled_interval(study: StudyConfig, swept: SweepResult, controller: int) -> tuple[float, float] | None:
+    """Return the 95 % interval (Wilson) of the settled share of a controller; None: no run has random values."""
+    rows = swept.cells["controller"] == controller
+    if study.runs == 1 or not (swept.cells["run"][rows] > 0).any():
+        return None
+    found = binomtest(int(swept.results["settled"][rows].sum()), int(rows.sum())).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
+
+
 def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
     """Return the study, the machine, and outcome and theory per controller and gain, as JSON values."""
     controllers = []
@@ -45,6 +55,7 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
                 "name": controller.name,
                 "runs": int((swept.cells["controller"] == number).sum()),
                 "settled_share": float(settled.mean()),
+                "settled_interval": settled_interval(study, swept, number),
                 "theory": theory,
             }
         )

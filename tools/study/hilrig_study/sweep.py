@@ -24,6 +24,7 @@ from hilrig_study.simulation.simulated_loop import Outcome, simulate
 from hilrig_study.simulation.timing import LoopTiming, Timeline, poll_count, timeline
 from hilrig_study.study_config import AxisConfig, StudyConfig
 from hilrig_study.theory.gain_theory import GainTheory, gain_theory
+from hilrig_study.theory.margins import STABLE_RADIUS
 from hilrig_study.theory.mean_square import CHAIN_TICKS, stable_until
 
 Floats = NDArray[np.float64]
@@ -245,6 +246,8 @@ def sweep(
             rows = constant & (cells["controller"] == controller) & (cells["gain"] == gain)
             rows &= (cells["step_ms"] == step_ms) & (cells["poll_ms"] == poll_ms)
             radius[rows] = [result[1][delay] for delay in cells["delay_ms"][rows].tolist()]
+    # A loop that grows slowly can look settled at the end of a short run.
+    results["settled"] &= ~(radius >= STABLE_RADIUS)
     return SweepResult(cells, results, radius, tuple(found), time.perf_counter() - start_s)
 
 

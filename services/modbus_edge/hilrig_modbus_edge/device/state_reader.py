@@ -3,7 +3,7 @@
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.impairment.delay_line import DelayedStates, ImpairmentSamples
 from hilrig_modbus_edge.registers.image import StateImage
-from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
 from hilrig_runtime.timing.clock import Clock
 
 
@@ -18,6 +18,7 @@ class StateReader:
         self._monotonic_ns = clock.monotonic_ns
         self._output = output
         self._states = states
+        self._received: TimestampedPayload | None = None
 
     def refresh(self) -> StateImage:
         """Update the register image to the newest state, and return the image."""
@@ -25,8 +26,10 @@ class StateReader:
         if self.delayed is not None:
             state = self.delayed.newest(self._monotonic_ns())
         image = self.image
-        if state is not image.arrival and state is not None:
-            image.update(state)
+        if state is not self._received and state is not None:
+            self._received = state
+            if not image.update(state):
+                self._states.reject(f"state of {self._rig}", "not a valid state")
         return image
 
     def set_impairment(self, samples: ImpairmentSamples | None) -> None:

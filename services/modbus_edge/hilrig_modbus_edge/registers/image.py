@@ -44,25 +44,27 @@ class StateImage:
         self._latency_us = 0
         self._floats: Sequence[float] = ()
 
-    def update(self, arrival: TimestampedPayload) -> None:
-        """Compute the image of a received state; an invalid message is ignored."""
+    def update(self, arrival: TimestampedPayload) -> bool:
+        """Compute the image of a received state; False: the message is invalid and ignored."""
         try:
             message = JointState.FromString(arrival.payload)
         except DecodeError:
-            return
+            return False
         # Copied into a list: reading the numbers of a repeated field one by one takes twice as long.
         position = message.position[:]
-        if not len(position) == len(message.velocity) == len(message.effort) == 4:
-            return
+        latency_ns = message.loop_latency_ns
+        if not len(position) == len(message.velocity) == len(message.effort) == 4 or latency_ns < 0:
+            return False
         self.arrival = arrival
         self._message = message
         self.arrived_ns = arrival.arrived_ns
         self.step = message.step
         self.basis = message.incarnation, self.step, arrival.arrived_ns, arrival.injected_ns
         self.position_words, self._saturated = codec.words_of_position(position)
-        if message.loop_latency_ns:
-            self._latency_us = min(message.loop_latency_ns // 1000, 0xFFFFFFFF)
+        if latency_ns:
+            self._latency_us = min(latency_ns // 1000, 0xFFFFFFFF)
         self._floats = ()
+        return True
 
     def status(self, now_ns: int) -> int:
         """Return the status bits that depend on the simulation; ns, monotonic clock."""

@@ -12,10 +12,11 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import Entry, decode_batch, entries_of, put_entries
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import LogBatch
-from hilrig_schemas.topics import EVENT
+from hilrig_schemas.topics import EVENT, source_of_key
 
 _EVENT_SUFFIX: Final = f"/{EVENT.name}"
 MAX_EVENTS_PER_OVERFLOW: Final = 10_000
@@ -48,14 +49,14 @@ class ReceivedBatch:
 class IngestQueue:
     """The queue; the bus thread calls `put`, the recorder's thread calls `get`."""
 
-    def __init__(self, capacity: int, clock: Clock) -> None:
+    def __init__(self, capacity: int, clock: Clock, counters: Counters) -> None:
         self.capacity = capacity
         self.received = 0
         """Messages received, including dropped ones."""
         self.dropped = 0
         """Messages dropped because the queue was full."""
-        self.malformed = 0
-        """Batches that could not be decoded, or whose checksum is wrong."""
+        self.counters = counters
+        """Count batches that can't be decoded, whose checksum is wrong, or that contradict their key."""
         self._wall_ns = clock.wall_ns
         self._queue: SimpleQueue[ReceivedBatch] = SimpleQueue()
         self._removed = 0
@@ -69,18 +70,17 @@ class IngestQueue:
         """Messages in the queue."""
         return self._added - self._removed
 
-    def put(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+    def put(self, key: str, payload: bytes) -> None:
         """Enqueue a batch from the bus; never blocks."""
         wall_ns = self._wall_ns()
         try:
             batch = decode_batch(payload)
-        except DecodeError:
-            self.malformed += 1
+            if batch.source != source_of_key(key):
+                raise DecodeError(f"batch of {batch.source!r}")
+        except DecodeError as error:
+            self.counters.reject(key, error)
             return
         count = len(batch.keys)
-        if not count == len(batch.sequences) == len(batch.publish_wall_ns) == len(batch.payloads):
-            self.malformed += 1
-            return
         with self._lock:
             self.received += count
             # An empty queue accepts a batch of any size, so that a small capacity does not exclude a large lab.

@@ -16,6 +16,7 @@ from hilrig_recorder.ingest.preroll import PreRollBuffer
 from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import SECOND_NS, Recording, RecordingStore
 from hilrig_recorder.ingest.sources import (
+    MAX_GAP,
     SETTLE_TIME_NS,
     WALL_CLOCK_STEP_THRESHOLD_NS,
     KeyStream,
@@ -24,9 +25,10 @@ from hilrig_recorder.ingest.sources import (
 )
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.records import encode_message
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_schemas import Event, LogBatch
-from hilrig_schemas.topics import is_name, parse_rig_key
+from hilrig_schemas.topics import EVENT, SERVICES, is_name, parse_rig_key
 
 BLOCK_PERIOD_NS: Final = 8 * SECOND_NS // 10
 """Maximum time until a received message is written. With batching, tick and sync, messages are safe within 1 s."""
@@ -40,8 +42,16 @@ OWNER_TIMEOUT_NS: Final = 30 * SECOND_NS
 """A session ends when its owner is silent for this time."""
 RETRY_PERIOD_NS: Final = 10 * SECOND_NS
 """Time until a session that could not be recorded is tried again."""
-MAX_REJECTIONS: Final = 1000
+MAX_REJECTIONS: Final = 100
 """Maximum number of different rejected inputs that are reported."""
+MAX_RIGS: Final = 4096
+"""Maximum number of rigs with buffered messages."""
+MAX_KEYS: Final = 4 * MAX_RIGS
+"""Maximum number of keys of one publisher."""
+MAX_RECORDINGS_PER_RIG: Final = 16
+"""Maximum number of open files of one rig: its sessions, and those that ended in the last `DRAIN_MAX_NS`."""
+MAX_ENDED_SESSIONS: Final = 4096
+"""Maximum number of ended sessions that are remembered."""
 _BLOCK_PHASES: Final = 10
 _ENDED_SESSION_MEMORY_NS: Final = 120 * SECOND_NS
 _SESSION_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
@@ -55,6 +65,8 @@ class SessionTracker:
         preroll_s: length of the pre-roll, s.
         store: storage of the recordings.
         is_assigned: whether this recorder records a rig; messages of other rigs are ignored.
+        may_serve: whether a service may publish for a rig; its other messages are dropped.
+        counters: count dropped messages.
     """
 
     def __init__(
@@ -63,9 +75,13 @@ class SessionTracker:
         preroll_s: float,
         store: RecordingStore,
         is_assigned: Callable[[str], bool] = lambda _: True,
+        may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
+        counters: Counters | None = None,
     ) -> None:
         self._lab = lab
         self._is_assigned = is_assigned
+        self._may_serve = may_serve
+        self._counters = counters or Counters()
         self._preroll_ns = round(preroll_s * SECOND_NS)
         self._store = store
         self._rigs: dict[str, PreRollBuffer] = {}
@@ -105,17 +121,28 @@ class SessionTracker:
                 missing = stream.missing_before(sequence)
                 if missing < 0:
                     continue
+                if missing > MAX_GAP:
+                    self._counters.reject(key, f"sequence number {sequence} after {stream.expected - 1}")
+                    continue
                 if missing:
                     self._record_loss(publisher, stream, missing, 0)
-            stream.expected = sequence + 1
             channel_id = stream.channel_id
-            stream.pending.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
+            event = None
             if channel_id == EVENT_CHANNEL:
-                self._handle_event(publisher, payload, publish_ns, now_ns)
+                try:
+                    event = EVENT.decode_from(key, payload)
+                except DecodeError as error:
+                    self._reject(f"{publisher.name}: event on {key}: {error}")
+                    continue
+            stream.expected = sequence + 1
+            stream.pending.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
+            if event is not None:
+                self._handle_event(publisher, event, publish_ns, now_ns)
         for key, dropped in received.dropped.items():
             stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is not None:
                 missing = dropped.last_sequence + 1 - stream.expected if stream.expected else dropped.count
+                missing = min(missing, MAX_GAP)
                 stream.expected = dropped.last_sequence + 1
                 self._record_loss(publisher, stream, max(0, missing - dropped.count), dropped.count)
         if batch.sessions or batch.complete_sessions:
@@ -132,7 +159,7 @@ class SessionTracker:
         return publisher
 
     def _add_stream(self, publisher: PublisherState, key: str, now_ns: int) -> KeyStream | None:
-        if key in publisher.streams:
+        if key in publisher.streams or len(publisher.streams) >= MAX_KEYS:
             return None
         publisher.streams[key] = None
         try:
@@ -144,9 +171,15 @@ class SessionTracker:
         if channel_id is None or parsed.lab != self._lab or not is_name(parsed.rig):
             self._reject(f"{publisher.name}: key {key} is not a recorded topic of lab {self._lab}")
             return None
+        if not self._may_serve(publisher.name, parsed.rig) and parsed.rig not in SERVICES:
+            self._reject(f"{publisher.name}: its certificate excludes rig {parsed.rig!r}")
+            return None
         if not self._is_assigned(parsed.rig):
             return None
         rig = self._rig(parsed.rig, now_ns)
+        if rig is None:
+            self._reject(f"{publisher.name}: more than {MAX_RIGS} rigs")
+            return None
         stream = KeyStream(key, rig.name, channel_id, 1 if publisher.restarted else 0, rig.pending)
         publisher.streams[key] = stream
         if channel_id != EVENT_CHANNEL:
@@ -157,14 +190,20 @@ class SessionTracker:
                 self._store.record_source(recording, publisher.name, publisher.incarnation)
         return stream
 
-    def _rig(self, name: str, now_ns: int) -> PreRollBuffer:
+    def _rig(self, name: str, now_ns: int) -> PreRollBuffer | None:
+        """The buffer of a rig; None: there are too many rigs."""
         rig = self._rigs.get(name)
-        if rig is None:
+        if rig is None and len(self._rigs) < MAX_RIGS:
             # The block times of the rigs are staggered, so that a large lab does not write all blocks at once. The
             # first block is written soon: after a restart it contains cached messages, which may not stay available.
             phase_ns = BLOCK_PERIOD_NS * (len(self._rigs) % _BLOCK_PHASES) // _BLOCK_PHASES
             rig = self._rigs[name] = PreRollBuffer(name, now_ns + phase_ns - BLOCK_PERIOD_NS)
         return rig
+
+    def _block(self, session: str, until_ns: int) -> None:
+        self._blocked_until[session] = until_ns
+        if len(self._blocked_until) > MAX_ENDED_SESSIONS:
+            del self._blocked_until[next(iter(self._blocked_until))]
 
     def _record_loss(self, publisher: PublisherState, stream: KeyStream, transport: int, recorder: int) -> None:
         self.lost_transport += transport
@@ -175,6 +214,7 @@ class SessionTracker:
             self._store.record_loss(recording, publisher.name, stream.key, transport, recorder)
 
     def _reject(self, message: str) -> None:
+        self._counters.reject("recording stream", message)
         # Each message is reported once.
         if message not in self._rejected and len(self._rejected) < MAX_REJECTIONS:
             self._rejected.add(message)
@@ -189,17 +229,15 @@ class SessionTracker:
 
     # -- sessions ---------------------------------------------------------------------------------------------------
 
-    def _handle_event(self, publisher: PublisherState, payload: bytes, publish_ns: int, now_ns: int) -> None:
-        try:
-            event = Event.FromString(payload)
-        except DecodeError:
-            self._reject(f"{publisher.name}: event can't be decoded")
-            return
+    def _handle_event(self, publisher: PublisherState, event: Event, publish_ns: int, now_ns: int) -> None:
         if event.kind == Event.SESSION_START:
             self._open(publisher.name, event.rig, event.session, event.session_data.controller, event.wall_ns, now_ns)
         elif event.kind == Event.SESSION_END:
-            self._blocked_until[event.session] = now_ns + _ENDED_SESSION_MEMORY_NS
             recording = self._recordings.get(event.session)
+            if recording is not None and recording.owner != publisher.name:
+                self._counters.reject(f"event of {publisher.name}", f"end of a session of {recording.owner}")
+                return
+            self._block(event.session, now_ns + _ENDED_SESSION_MEMORY_NS)
             if recording is not None:
                 self._end(recording, event.session_data.reason or "ended", publish_ns, now_ns)
         elif event.kind == Event.OVERRUN:
@@ -233,10 +271,16 @@ class SessionTracker:
         if not _SESSION_ID.fullmatch(session) or not is_name(rig_name):
             self._reject(f"{owner}: session {session!r} of rig {rig_name!r} has an invalid name")
             return
+        if not self._may_serve(owner, rig_name):
+            self._counters.reject(f"session of {owner}", f"its certificate excludes rig {rig_name!r}")
+            return
         rig = self._rig(rig_name, now_ns)
+        if rig is None or len(rig.recordings) >= MAX_RECORDINGS_PER_RIG:
+            self._reject(f"{owner}: more sessions than {MAX_RECORDINGS_PER_RIG} of a rig, or too many rigs")
+            return
         recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns, self._store)
         if not self._store.open(recording):
-            self._blocked_until[session] = now_ns + RETRY_PERIOD_NS
+            self._block(session, now_ns + RETRY_PERIOD_NS)
             return
         self._recordings[session] = recording
         for publisher in rig.publishers.values():
@@ -331,5 +375,5 @@ class SessionTracker:
     def _close(self, recording: Recording, end: str, reason: str) -> None:
         self._rigs[recording.rig].flush_block(self._wall_ns)
         self.drop(recording)
-        self._blocked_until[recording.session] = recording.ended_ns + _ENDED_SESSION_MEMORY_NS
+        self._block(recording.session, recording.ended_ns + _ENDED_SESSION_MEMORY_NS)
         self._store.close(recording, end, reason)

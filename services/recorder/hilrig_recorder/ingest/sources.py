@@ -10,6 +10,10 @@ WALL_CLOCK_STEP_THRESHOLD_NS: Final = 50_000_000
 """A larger change of the difference between a wall clock and a monotonic clock is a clock step."""
 SETTLE_TIME_NS: Final = 15_000_000_000
 """Time after the first batch of a new publisher in which it may deliver older, cached batches."""
+MAX_GAP: Final = (1 << 32) - 1
+"""Maximum number of messages that one gap may state, three years of one rig; a larger one is an invalid number."""
+MAX_PUBLISHERS: Final = 1024
+"""Maximum number of publishers; if one invents incarnations, the publisher that is silent for longest is evicted."""
 PUBLISHER_TIMEOUT_NS: Final = 120_000_000_000
 """A publisher that is silent for this time is evicted."""
 
@@ -63,7 +67,7 @@ class PublisherState:
         batch = received.batch
         missing = 0
         if self._next_batch:
-            missing = max(0, batch.sequence - self._next_batch - (received.batch_count - 1))
+            missing = min(max(0, batch.sequence - self._next_batch - (received.batch_count - 1)), MAX_GAP)
         self._next_batch = max(self._next_batch, batch.sequence + 1)
         self.last_ns = now_ns
         stepped = bool(batch.keys) and self._clock_stepped(batch.publish_wall_ns[-1], now_ns)
@@ -94,6 +98,10 @@ class PublisherTracker:
         publisher = self._publishers.get(identity)
         if publisher is None:
             restarted = any(name == identity[0] for name, _ in self._publishers)
+            if len(self._publishers) >= MAX_PUBLISHERS:
+                # Evicted at the next tick.
+                oldest = min(self._publishers.values(), key=lambda each: each.last_ns)
+                oldest.last_ns = -PUBLISHER_TIMEOUT_NS
             publisher = self._publishers[identity] = PublisherState(*identity, first_ns=now_ns, restarted=restarted)
         return publisher
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from threading import Lock, Thread
 from typing import Final
 
+from google.protobuf.message import DecodeError
+
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
@@ -14,7 +16,7 @@ from hilrig_runtime.process.control import release_series
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Health
-from hilrig_schemas.topics import HEALTH, SERVICES, alive_key, source_of_alive_key
+from hilrig_schemas.topics import HEALTH, SERVICES, alive_key, source_of_key
 
 COLLECT_TIMEOUT_S: Final = 2.5
 """Time to collect health reports; each service publishes one a second."""
@@ -63,13 +65,15 @@ def collect(
     snapshot, lock = BusSnapshot(), Lock()
 
     def on_health(key: str, payload: bytes) -> None:
-        del key
-        health = HEALTH.decode(payload)
+        try:
+            health = HEALTH.decode_from(key, payload)
+        except DecodeError:
+            return
         with lock:
             snapshot.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
 
     def on_alive(key: str, alive: bool) -> None:
-        name = source_of_alive_key(key)
+        name = source_of_key(key)
         with lock:
             (snapshot.alive.add if alive else snapshot.alive.discard)(name)
 

@@ -35,8 +35,8 @@ class Statistics:
     std: float
 
     def cells(self) -> list[str]:
-        """The values as text, in the order of `STATISTICS_TITLES`."""
-        return [f"{value:.3f}" for value in astuple(self)]
+        """The values as text, whole from 1,000 on so that they fit a terminal, in the order of `STATISTICS_TITLES`."""
+        return [f"{value:.3f}" if abs(value) < 1_000 else f"{value:.0f}" for value in astuple(self)]
 
     @classmethod
     def of(cls, values_ns: NDArray[np.int64] | Blocks) -> "Statistics":

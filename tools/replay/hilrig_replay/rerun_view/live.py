@@ -20,7 +20,7 @@ from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.clock import Clock
-from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, STATE, TRAFFIC, parse_rig_key
+from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, RECORDED, STATE, TRAFFIC, parse_rig_key
 
 VIEWER_PERIOD_S: Final = 0.04
 """Period at which received messages are drawn into a viewer, s."""
@@ -95,6 +95,7 @@ class Follower:
         for _ in range(count):
             topic, payload, arrived_ns = self._pending.popleft()
             try:
+                RECORDED[topic].decode(payload)
                 self._decoder.add(topic, payload, 0, arrived_ns)
             except DecodeError:
                 self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
@@ -128,7 +129,7 @@ class Follower:
     def _query_geometry(self) -> RigGeometry | None:
         for answer in self._bus.query(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
             if answer.payload and not answer.error:
-                config = CONFIG.decode(answer.payload)
+                config = CONFIG.decode_from(answer.key, answer.payload)
                 return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)
         return None
 

@@ -28,6 +28,10 @@ EFFORT_COST: Final = 1e-2
 """Cost of (1 N·m)² or (1 N)² of effort relative to the holding effort."""
 TAIL_FRACTION: Final = 0.2
 """Final fraction of the run in which the arm must be at rest to count as settled."""
+DECAY_FRACTION: Final = 0.3
+"""The error of a constant set point must be smaller in this final fraction of the run than in the one before it."""
+LIMIT_CYCLE_SHARE: Final = 0.5
+"""Error that need not decay, as a share of that of cost 1: the registers cause limit cycles of up to 0.2°."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,8 @@ class Outcome:
     failed_s: Floats
     """Time at which an error exceeded the limit, s; NaN: never, (N,)."""
     settled: Bools
-    """Whether the run did not fail and its final error is at most half of the size of the motion, (N,)."""
+    """Whether the run did not fail, its final error is at most half of the size of the motion, and the error of a
+    constant set point decays, (N,)."""
     positions: Floats
     """Positions at each tick, unquantized, (T, 4, N); of recorded runs only."""
     efforts: Floats
@@ -120,6 +125,8 @@ def simulate(
     failed_s, failed = np.full(runs, np.nan), np.zeros(runs, dtype=np.bool_)
     sum_error, sum_tail, sum_effort = np.zeros((4, runs)), np.zeros((4, runs)), np.zeros(runs)
     tail_from = ticks - max(1, round(TAIL_FRACTION * ticks))
+    windows = [ticks - 2 * round(DECAY_FRACTION * ticks), ticks - round(DECAY_FRACTION * ticks), ticks]
+    sum_windows = np.zeros((2, 4, runs))
     controller.reset(runs)
     polls.reset()
     is_constant = scenario.frequency_hz == 0
@@ -142,6 +149,8 @@ def simulate(
         sum_error += squared
         if tick >= tail_from:
             sum_tail += squared
+        if tick >= windows[0]:
+            sum_windows[int(tick >= windows[1])] += squared
         sum_effort += np.add.reduce((effort - rest) ** 2, axis=0)
         seen[:, tick] = quantization.position(position) if quantize else position
         positions[tick], efforts[tick] = position[:, kept], effort[:, kept]
@@ -171,6 +180,10 @@ def simulate(
     size = np.maximum(np.abs(np.array(scenario.offset)), np.abs(np.array(scenario.amplitude)))[:, np.newaxis]
     tail_rms = np.sqrt(sum_tail / (ticks - tail_from))
     at_rest = np.all(tail_rms <= 0.5 * np.maximum(size, 0.1 * ERROR_SCALE), axis=0)
+    if is_constant:
+        before, after = sum_windows
+        limit_cycle = (LIMIT_CYCLE_SHARE * ERROR_SCALE) ** 2 * (windows[2] - windows[1])
+        at_rest &= np.all((after < before) | (after <= limit_cycle), axis=0)
     return Outcome(
         cost=np.where(failed, np.inf, cost),
         error_rms=np.sqrt(sum_error / span),
