@@ -24,6 +24,7 @@ def ik(
     """
     from rich.table import Table
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.lab import LabConfig, load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_sim.arm.joints import JOINT_SCALE
