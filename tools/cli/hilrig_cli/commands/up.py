@@ -27,8 +27,10 @@ def up(
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_sim.parameters import lab_parameters
 
     lab = load_lab(config)
+    lab_parameters(lab, str(config or "defaults"))
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
 
     processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
