@@ -172,7 +172,7 @@ def test_reports_a_stall_of_the_edge_by_the_request_log(tmp_path: Path) -> None:
     [
         (Stalls(1, 90 * MS), "once, 90 ms"),
         (Stalls(12, 200 * MS, shortest_ns=190 * MS), "12 times, 200 ms each"),
-        (Stalls(2, 200 * MS, shortest_ns=60 * MS), "2 times, longest 200 ms"),
+        (Stalls(2, 200 * MS, shortest_ns=60 * MS), "2 times, 60 to 200 ms"),
         (Stalls(2, 200 * MS), "2 times, longest 200 ms"),
     ],
 )
@@ -190,6 +190,23 @@ def test_reports_large_integration_errors(tmp_path: Path) -> None:
     assert reasons(measured(tmp_path, made)) == {
         "integration_error": "2 steps with an integration error above 0.1° or 0.1 mm, up to 0.25 mm (joint 3)"
     }
+
+
+@pytest.mark.parametrize(("reads", "codes"), [(1, ["few_reads"]), (20, [])])
+def test_reports_a_controller_that_writes_without_reading(tmp_path: Path, reads: int, codes: list[str]) -> None:
+    made = make(SCRIPT)
+    states = {one.message.step: one.message for one in made if isinstance(one.message, JointState)}
+    last_step = max(states)
+    for one in made:
+        message = one.message
+        if isinstance(message, TorqueCommand | JointState) and message.basis_step:
+            message.basis_step = 1 + (message.basis_step * reads // (last_step + 1)) * (last_step // reads)
+        if isinstance(message, JointState) and message.basis_step:
+            message.loop_latency_ns = message.sampled_ns - states[message.basis_step].sampled_ns
+    found = reasons(measured(tmp_path, made))
+    assert list(found) == codes
+    if codes:
+        assert found["few_reads"].endswith(" commands are based on 1 state: the controller writes without reading")
 
 
 def on_other_connection(made: list[TimedMessage], share: float = 1.0) -> list[TimedMessage]:

@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Final
 
 from hilrig_runtime.errors import HilrigError, OperationError
+from hilrig_runtime.escaping import printable
 
 CLOSE_TIMEOUT_S: Final = 2.0
 """Time after which a process that has not closed is ended, s."""
@@ -124,7 +125,7 @@ def _run_and_report(main: Callable[[], int | None]) -> int:
             sys.stdout.flush()
     except HilrigError as error:
         for line in str(error).splitlines():
-            print(f"hilrig: error: {line}", file=sys.stderr)
+            print(f"hilrig: error: {printable(line)}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130
@@ -148,7 +149,7 @@ def _run_and_report(main: Callable[[], int | None]) -> int:
             raise
         _drop_output()
         target = error.filename or "standard output"
-        print(f"hilrig: error: {target}: can't be written: {error.strerror}", file=sys.stderr)
+        print(f"hilrig: error: {printable(str(target))}: can't be written: {error.strerror}", file=sys.stderr)
         return OperationError.exit_code
 
 

@@ -8,7 +8,6 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
-from html import escape
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final
@@ -25,6 +24,7 @@ from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_console.view_model import ClientState, Frame
 from hilrig_runtime.errors import HilrigError, InputError
+from hilrig_runtime.escaping import as_html
 
 FRAME_PERIOD_S: Final = 0.2
 """Period of the frames, s."""
@@ -151,5 +151,7 @@ async def _error_response(request: Request, error: HilrigError) -> Response:
     """Return an error page with the message of the error."""
     del request
     status = HTTPStatus.NOT_FOUND if isinstance(error, InputError) else HTTPStatus.SERVICE_UNAVAILABLE
-    text = f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>hilrig</title><p>{escape(str(error))}</p></html>\n"
+    text = (
+        f"<!DOCTYPE html><html lang=en><meta charset=utf-8><title>hilrig</title><p>{as_html(str(error))}</p></html>\n"
+    )
     return HTMLResponse(text, status)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.plots.output import save_figure
 from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
+from hilrig_runtime.escaping import plot_text
 from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_study.study_config import AxisConfig, PointConfig, StudyConfig
 from hilrig_study.sweep import SweepResult, cell_at, run_cells
@@ -141,9 +142,10 @@ def plane_figure(
                 label=label,
             )
     axes.set(xlim=_ends(study.x), ylim=_ends(study.y))
-    axes.set_xlabel(study.x.label, color=TEXT_COLOR)
-    axes.set_ylabel(study.y.label, color=TEXT_COLOR)
-    axes.set_title(f"{study.title}: {study.controllers[number].name}", fontsize=10, loc="left", color=TEXT_COLOR)
+    axes.set_xlabel(plot_text(study.x.label), color=TEXT_COLOR)
+    axes.set_ylabel(plot_text(study.y.label), color=TEXT_COLOR)
+    title = plot_text(f"{study.title}: {study.controllers[number].name}")
+    axes.set_title(title, fontsize=10, loc="left", color=TEXT_COLOR)
     axes.scatter([], [], marker="s", c=FAILED_COLOR, label="a run failed")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4 if shown else 2, fontsize=8, facecolor="#cfcfcf")

@@ -142,10 +142,10 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
     finished = is_complete(view)
     if finished and _is_intact(view, source, should_continue):
         return recovery
-    if path.exists():
-        raise InputError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
     temporary_path = recovering_path(path)
     try:
+        if path.exists():
+            raise InputError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
         temporary_path.unlink(missing_ok=True)
         _Copier(view, recovery, finished).write(path, temporary_path, should_continue)
     except OSError as error:

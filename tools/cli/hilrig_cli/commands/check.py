@@ -21,9 +21,9 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Validate a lab's configuration file: report every error, and print the rigs with their addresses."""
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.grading.task_loading import validate_task
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
@@ -57,6 +57,6 @@ def check(
         allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
         table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
-    Console().print(table)
+    TerminalConsole().print(table)
     for warning in accuracy_warnings(rigs):
         print(f"warning: {warning}", file=sys.stderr)

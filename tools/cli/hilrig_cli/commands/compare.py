@@ -44,6 +44,7 @@ def compare(
     from hilrig_replay.plots.comparison_plot import save_comparison_plot
     from hilrig_replay.rerun_view.view import save_rrd
     from hilrig_runtime.errors import HilrigError, InputError
+    from hilrig_runtime.escaping import printable
 
     opened, unreadable = [], []
     for path in runs:
@@ -68,7 +69,7 @@ def compare(
     else:
         _print(comparison)
         for reason in comparison.left_out:
-            print(f"skipped: {reason}", file=sys.stderr)
+            print(f"skipped: {printable(reason)}", file=sys.stderr)
     if comparison.left_out:
         raise typer.Exit(1)
 
@@ -76,8 +77,9 @@ def compare(
 def _print(comparison: "Comparison") -> None:
     from math import degrees
 
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import TerminalConsole
 
     reference = comparison.summaries[0]
     title = f"Against {reference.session}, aligned by {comparison.aligned_by}"
@@ -105,8 +107,8 @@ def _print(comparison: "Comparison") -> None:
         ("Δ age p99, ms", [one.age_p99_ms for one in each]),
     ):
         table.add_row(name, *("–" if value is None else f"{value:+.3f}" for value in values))
-    console = Console()
+    console = TerminalConsole()
     console.print(table)
     for summary, origin in zip(comparison.summaries, comparison.origins, strict=True):
         if (note := FALLBACK_TEXTS.get(origin.by)) and origin.by != comparison.aligned_by:
-            console.print(f"{summary.session}: {note}", highlight=False, markup=False)
+            console.print(f"{summary.session}: {note}", highlight=False)

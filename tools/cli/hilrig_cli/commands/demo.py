@@ -25,13 +25,13 @@ def demo(
     had no time to place are listed. Exit code 1: the loop never closed, the recording could not be verified, or a part
     that the controller reported as placed is not in the tray.
     """
-    from rich.console import Console
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_cli.commands.latency import print_report
     from hilrig_cli.local.demo import review, run_demo
+    from hilrig_cli.terminal import TerminalConsole
 
-    console = Console(stderr=True, quiet=as_json)
+    console = TerminalConsole(stderr=True, quiet=as_json)
 
     def log(line: str) -> None:
         console.print(f"hilrig: {line}", highlight=False, soft_wrap=True)

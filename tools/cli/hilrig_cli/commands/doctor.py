@@ -115,11 +115,11 @@ def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[Check
 
 
 def _print_table(results: "list[CheckResult]") -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from hilrig_cli.doctor import Level
+    from hilrig_cli.terminal import TerminalConsole
 
     colors = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "bold red"}
     table = Table()
@@ -128,7 +128,7 @@ def _print_table(results: "list[CheckResult]") -> None:
     for result in results:
         fix = f"\n[dim]fix: {escape(result.fix)}[/dim]" if result.fix else ""
         table.add_row(f"[{colors[result.level]}]{result.level.value}[/]", result.check, escape(result.text) + fix)
-    console = Console()
+    console = TerminalConsole(markup=True)
     console.print(table)
     errors = sum(result.level is Level.ERROR for result in results)
     warnings = sum(result.level is Level.WARNING for result in results)

@@ -23,6 +23,7 @@ def export(
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.escaping import printable
 
     if foxglove is None and csv is None and parquet is None:
         raise InputError("no output given: add --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
@@ -34,4 +35,4 @@ def export(
         for folder, kind in ((csv, "csv"), (parquet, "parquet")):
             if folder is not None:
                 written += export_tables(opened, folder, kind)
-    sys.stdout.writelines(f"{path}\n" for path in written)
+    sys.stdout.writelines(f"{printable(str(path))}\n" for path in written)

@@ -18,9 +18,9 @@ def figures(
 
     Exit code 1: a number differs from the expected one at the paper's step of 20 ms.
     """
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_sim.validation.paper_figures import compute, draw
 
     found = compute(step_ms)
@@ -28,7 +28,7 @@ def figures(
     if as_json:
         print(json.dumps(found.as_dict() | {"files": [str(path) for path in files]}))
     else:
-        console = Console()
+        console = TerminalConsole()
         title = "Experiment (44) of the paper"
         columns = ("quantity", "expected", "computed", "agrees")
         table = Table(*columns, title=title, title_justify="left", title_style="bold")

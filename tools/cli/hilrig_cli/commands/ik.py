@@ -22,9 +22,9 @@ def ik(
 
     Exit code 1: the pose cannot be reached.
     """
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.lab import LabConfig, load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_sim.arm.joints import JOINT_SCALE
@@ -50,6 +50,6 @@ def ik(
         for theta1, theta2, d3, theta4 in solutions:
             side = "straight" if abs(theta2) < 1e-9 else "left" if theta2 < 0 else "right"
             table.add_row(side, *(f"{value:.2f}" for value in (theta1, theta2, d3, theta4)))
-        Console().print(table)
+        TerminalConsole().print(table)
     if reason:
         raise typer.Exit(1)

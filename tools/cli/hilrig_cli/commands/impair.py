@@ -105,9 +105,9 @@ def _row(status: "ImpairmentStatus") -> dict[str, object]:
 
 def _print_table(statuses: "list[ImpairmentStatus]") -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.impairment import LinkImpairments
 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -121,4 +121,4 @@ def _print_table(statuses: "list[ImpairmentStatus]") -> None:
         table.add_row(status.rig, "state", links.state.describe(), *map(str, states))
         origin = f"({status.source}, seed {status.seed})"
         table.add_row(origin, "command", links.command.describe(), *map(str, commands), end_section=True)
-    Console().print(table)
+    TerminalConsole().print(table)

@@ -40,23 +40,24 @@ def jitter(
 
 
 def _measure(step_ms: float, seconds: float, loaded: bool) -> "TimingResult":
-    from rich.console import Console
     from rich.progress import Progress
 
     from hilrig_cli.bench.jitter import measure_timing
+    from hilrig_cli.terminal import TerminalConsole
 
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+    with Progress(console=TerminalConsole(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         task = progress.add_task("with load" if loaded else "measuring", total=1.0)
         return measure_timing(step_ms, seconds, loaded, log, lambda share: progress.update(task, completed=share))
 
 
 def _print_table(result: "TimingResult") -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console()
+    from hilrig_cli.terminal import TerminalConsole
+
+    console = TerminalConsole()
     condition = "with CPU load" if result.loaded else "without load"
     title = f"Step {result.step_ms:g} ms for {result.seconds:g} s, {condition}: {result.ticks} ticks"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))

@@ -40,6 +40,7 @@ def latency(
     from hilrig_replay.io.paths import display_names, find_recordings
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import HilrigError, InputError
+    from hilrig_runtime.escaping import printable
 
     paths = find_recordings(runs)
     if plot is not None:
@@ -74,7 +75,7 @@ def latency(
         names = display_names(paths)
         print_overview({names[path]: each for path, each in reports})
         for bad in unreadable:
-            print(bad["reason"], file=sys.stderr)
+            print(printable(bad["reason"]), file=sys.stderr)
     if unreadable or not all(each.fit for _, each in reports):
         raise typer.Exit(1)
 
@@ -82,14 +83,14 @@ def latency(
 def print_report(report: "LatencyReport") -> None:
     """Print the latency report of one run: a table, losses, findings and the verdict."""
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.stages import LOOP_STAGES
 
-    console = Console()
+    console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
     # Without lines between the columns the table fits a terminal of 80 characters.
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -123,11 +124,12 @@ def print_report(report: "LatencyReport") -> None:
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     """Print a table of runs by name, one line each, and below it their findings or reasons."""
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console()
+    from hilrig_cli.terminal import TerminalConsole
+
+    console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("run", overflow="fold")

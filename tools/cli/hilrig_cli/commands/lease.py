@@ -52,8 +52,9 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
 
 
 def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import TerminalConsole
 
     table = Table()
     for column in ("rig", "lease holder", "last request", "session", "connections", "watchdog"):
@@ -68,7 +69,7 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
             str(status.connections),
             "tripped" if status.watchdog_tripped else timeout,
         )
-    console = Console()
+    console = TerminalConsole()
     console.print(table)
     if release:
         former = statuses[0].released

@@ -27,6 +27,7 @@ def play(
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.escaping import printable
     from hilrig_runtime.process.shutdown import stop_on_signals
     from hilrig_runtime.timing.clock import SYSTEM_CLOCK
     from hilrig_schemas.topics import CONFIG, RESERVED_RIG_NAMES, is_name
@@ -44,7 +45,8 @@ def play(
         played = publish_recording(
             bus, lab.name, player, SYSTEM_CLOCK, stopping, rename=None if name == opened.rig else name
         )
-    print(f"played {played} messages of {opened.session} as {name} in lab {lab.name}", file=sys.stderr)
+    session = printable(opened.session)
+    print(f"played {played} messages of {session} as {name} in lab {lab.name}", file=sys.stderr)
 
 
 def _bus(lab: "LabConfig", rig: str) -> "Bus":

@@ -33,6 +33,7 @@ def recover(
     from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, recovered_path
     from hilrig_recorder.mcap_format.recover import recover as recover_file
     from hilrig_runtime.errors import HilrigError, InputError
+    from hilrig_runtime.escaping import printable
 
     if output is not None and len(files) > 1:
         raise InputError(f"--out: expected one input file, got {len(files)}")
@@ -45,7 +46,7 @@ def recover(
             if len(files) == 1:
                 raise
             failed.append(str(error))
-            print(error, file=sys.stderr)
+            print(printable(str(error)), file=sys.stderr)
             continue
         if recovery.path is not None and output is None and source.name.endswith(PART_SUFFIX):
             source.unlink()
@@ -59,14 +60,17 @@ def recover(
 
 
 def _print(recovery: "Recovery") -> None:
+    from hilrig_runtime.escaping import printable
+
     if recovery.path is None:
-        print(f"{recovery.source}: complete; nothing to do")
+        print(printable(f"{recovery.source}: complete; nothing to do"))
         return
-    print(f"{recovery.source} -> {recovery.path}: recovered {recovery.messages} messages in {recovery.chunks} chunks")
+    written = f"recovered {recovery.messages} messages in {recovery.chunks} chunks"
+    print(printable(f"{recovery.source} -> {recovery.path}: {written}"))
     if recovery.damaged_bytes or recovery.orphans:
         print(
             f"  lost: {recovery.damaged_bytes} bytes, {recovery.damaged_chunks} damaged chunks, "
             f"{recovery.orphans} messages of unknown channels"
         )
         for reason in recovery.reasons[:10]:
-            print(f"  {reason}")
+            print(f"  {printable(reason)}")

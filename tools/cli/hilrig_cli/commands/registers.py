@@ -27,8 +27,9 @@ def registers(
 
 
 def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import TerminalConsole
 
     table = Table("table", "number", "address", "name", "type", "unit", "scale", "written by", "meaning")
     for row in rows:
@@ -37,4 +38,4 @@ def _print_table(rows: list[dict[str, str | int | bool]]) -> None:
             "controller" if row["writable"] else "rig",
             str(row["text"]),
         )
-    Console().print(table)
+    TerminalConsole().print(table)

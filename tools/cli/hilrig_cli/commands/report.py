@@ -34,19 +34,20 @@ def report(
     The page works without a network. Runs with the same torques (for example a replayed run) are listed. Exit code 1:
     at least one of several recordings could not be read; the report lists it with the reason.
     """
-    from rich.console import Console
     from rich.progress import Progress
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.grading.task_loading import load_task
     from hilrig_replay.io.output_file import check_output, output_file
     from hilrig_replay.io.paths import find_recordings
     from hilrig_replay.report.report import build_report
+    from hilrig_runtime.escaping import printable
 
     paths = find_recordings(runs)
     inputs = paths if task is None else [*paths, task]
     check_output(out, inputs)
     graded_by = None if task is None else load_task(task)
-    console = Console(stderr=True)
+    console = TerminalConsole(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
         result = build_report(
@@ -65,10 +66,10 @@ def report(
             )
         )
     else:
-        print(out)
+        print(printable(str(out)))
         for reason in result.left_out:
-            print(f"skipped: {reason}", file=sys.stderr)
+            print(f"skipped: {printable(reason)}", file=sys.stderr)
         for pair in result.same_torques:
-            print(f"same torques: {pair}", file=sys.stderr)
+            print(f"same torques: {printable(pair)}", file=sys.stderr)
     if result.left_out:
         raise typer.Exit(1)

@@ -28,8 +28,9 @@ Name = Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig.")]
 @app.command(name="list")
 def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     """List the rigs of a running lab with their addresses, simulation and edge, including rigs added at run time."""
-    from rich.console import Console
     from rich.table import Table
+
+    from hilrig_cli.terminal import TerminalConsole
 
     with _join(config) as (lab, _, found):
         rows = _rows(lab, found)
@@ -40,7 +41,7 @@ def list_rigs(config: Config = None, as_json: AsJson = False) -> None:
     for row in rows:
         origin = "lab.toml" if row["in_file"] else "added"
         table.add_row(row["rig"], row["address"], row["sim"] or "none", row["edge"] or "none", origin)
-    Console().print(table)
+    TerminalConsole().print(table)
 
 
 @app.command()

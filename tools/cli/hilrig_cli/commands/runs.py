@@ -13,6 +13,8 @@ from hilrig_cli.options import AsJson, Config, format_size
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rich.text import Text
+
     from hilrig_replay.analysis.index import RunEntry
 
 
@@ -128,10 +130,11 @@ def _measured(
     waiting = sum(1 for entry in entries if not entry.measured)
     if waiting < 5 or not sys.stderr.isatty():
         return measure(entries, None)
-    from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    from hilrig_cli.terminal import TerminalConsole
+
+    with Progress(console=TerminalConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("reading recordings", total=len(entries))
         return measure(entries, lambda done: progress.update(task, completed=done))
 
@@ -155,15 +158,17 @@ def _date(wall_ns: int, form: str) -> str:
 
 
 def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int) -> None:
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX
+    from hilrig_runtime.escaping import printable
 
     if not entries:
-        print(f"no matching recordings in {folder}" if read else f"no recordings in {folder}")
+        print(printable(f"no matching recordings in {folder}" if read else f"no recordings in {folder}"))
         return
-    console = Console() if sys.stdout.isatty() else Console(width=200)
+    console = TerminalConsole() if sys.stdout.isatty() else TerminalConsole(width=200)
     wide = console.width >= WIDE_TERMINAL_COLUMNS
     table = Table(title=f"Recordings in {folder}", title_justify="left", box=None, pad_edge=False)
     table.add_column("recording", min_width=20)
@@ -188,28 +193,28 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             _number(entry.loop_p50_ms),
             _number(entry.loop_p99_ms),
             _number(entry.age_p99_ms),
-            f"[red]{lost}[/]" if lost else "0",
+            Text(str(lost), style="red" if lost else ""),
             *([entry.controller, _yes_no(entry.verified)] if wide else []),
             _yes_no(entry.fit),
             _ending(entry),
         )
     console.print(table)
     if total > len(entries):
-        Console(stderr=True).print(f"{total - len(entries)} more; --limit 0 shows all")
+        TerminalConsole(stderr=True).print(f"{total - len(entries)} more; --limit 0 shows all")
 
 
 def _lost(entry: "RunEntry") -> int:
     return entry.lost_transport + entry.lost_recorder + entry.lost_file
 
 
-def _ending(entry: "RunEntry") -> str:
-    from rich.markup import escape
+def _ending(entry: "RunEntry") -> "Text":
+    from rich.text import Text
 
     if entry.error:
-        return f"[red]{escape(entry.error)}[/]"
+        return Text(entry.error, style="red")
     if entry.ended in ABNORMAL_ENDINGS:
-        return f"[yellow]{escape(f'{entry.ended}: {entry.reason}')}[/]"
-    return escape(entry.ended)
+        return Text(f"{entry.ended}: {entry.reason}", style="yellow")
+    return Text(entry.ended)
 
 
 def _duration(seconds: float) -> str:

@@ -9,7 +9,7 @@ import typer
 from hilrig_cli.options import AsJson
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from hilrig_cli.terminal import TerminalConsole
 
 
 def study(
@@ -41,11 +41,10 @@ def study(
     controller (PNG, SVG) and study.rrd. Exit code 1: a live measurement contradicts the prediction; with --from: no
     gain of the study is stable.
     """
-    from rich.console import Console
-
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.errors import InputError
 
-    console = Console(stderr=True, quiet=as_json)
+    console = TerminalConsole(stderr=True, quiet=as_json)
     if from_run is not None:
         if live:
             raise InputError("--from and --live can't be combined: use one of them")
@@ -62,7 +61,7 @@ def study(
         raise typer.Exit(1)
 
 
-def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: "Console") -> dict[str, Any]:
+def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: "TerminalConsole") -> dict[str, Any]:
     from rich.progress import Progress, TimeElapsedColumn
 
     from hilrig_runtime.errors import InputError, OperationError
@@ -122,10 +121,11 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from hilrig_cli.terminal import TerminalConsole
+
+    console = TerminalConsole()
     title = (
         f"{results['title']}: {results['runs']:,} runs, {results['simulated_s']:,.0f} s simulated in "
         f"{results['seconds']:.1f} s ({results['times_real_time']:,.0f} × real time)"
@@ -164,7 +164,7 @@ def _ms(seconds: float | None) -> str:
     return "–" if seconds is None else f"{seconds * 1e3:.1f}"
 
 
-def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Console") -> None:
+def _from_recording(path: Path, file: Path | None, as_json: bool, console: "TerminalConsole") -> None:
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.run import open_run
     from hilrig_study.live.from_recording import evaluate_gains
@@ -182,8 +182,10 @@ def _from_recording(path: Path, file: Path | None, as_json: bool, console: "Cons
 
 
 def _print_gains(evaluation: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+
+    from hilrig_cli.terminal import TerminalConsole
 
     latency, age = evaluation["latency"], evaluation["age_ms"]
     title = (
@@ -199,9 +201,9 @@ def _print_gains(evaluation: dict[str, Any]) -> None:
         table.add_row(
             gain["controller"],
             f"{gain['gain']:.3g}",
-            "yes" if gain["stable"] else "[red]no[/red]",
+            "yes" if gain["stable"] else Text("no", style="red"),
             f"{gain['mean_square_radius']:.4f}",
             "–" if cost is None else f"{cost:.2f}",
             "–" if gain["spare_ms"] is None else f"{'≥ ' if gain['spare_at_least'] else ''}{gain['spare_ms']:.0f}",
         )
-    Console().print(table)
+    TerminalConsole().print(table)

@@ -54,14 +54,14 @@ def top(
     In a terminal the display is updated until Ctrl-C. If it does not fit, the rigs with the lowest loop latency and
     less important columns are hidden.
     """
-    from rich.console import Console
     from rich.live import Live
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_monitoring.lab_watch import LabWatch
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    console = Console()
+    console = TerminalConsole()
     with LabWatch(lab) as watch:
         watch.wait()
         if as_json or once or not sys.stdout.isatty():

@@ -30,16 +30,17 @@ def verify(
 
     Exit code 1: re-simulation does not reproduce at least one recording, or one of several can't be read.
     """
-    from rich.console import Console
     from rich.text import Text
 
+    from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import find_recordings
     from hilrig_runtime.errors import HilrigError
+    from hilrig_runtime.escaping import printable
 
-    console = Console()
+    console = TerminalConsole()
     verifications, unreadable = [], []
     paths = find_recordings(runs)
     for path in paths:
@@ -51,7 +52,7 @@ def verify(
             if len(paths) == 1:
                 raise
             unreadable.append({"path": str(path), "reason": str(error)})
-            print(error, file=sys.stderr)
+            print(printable(str(error)), file=sys.stderr)
             continue
         # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
         with suppress(OSError):

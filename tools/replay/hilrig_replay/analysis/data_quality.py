@@ -24,6 +24,8 @@ MAX_UNCONTROLLED_SHARE: Final = 0.01
 """Largest share of steps without an age."""
 MAX_HELD_PERIODS: Final = 3
 """Control periods by which the p99 of the age may exceed that of the loop latency, beside one step."""
+MIN_READ_SHARE: Final = 0.01
+"""Smallest ratio of states that were read to samples: a controller that reads once and then only writes is no loop."""
 MIN_MISSING_BASES: Final = 5
 """Number of bases before the first state that shows that the beginning is missing: a controller may have read once,
 long before its first write."""
@@ -93,6 +95,8 @@ class Stalls:
             return f"once, {self.longest_ns / 1e6:.0f} ms"
         if self.shortest_ns >= 0.75 * self.longest_ns:
             return f"{self.count} times, {self.longest_ns / 1e6:.0f} ms each"
+        if self.shortest_ns:
+            return f"{self.count} times, {self.shortest_ns / 1e6:.0f} to {self.longest_ns / 1e6:.0f} ms"
         return f"{self.count} times, longest {self.longest_ns / 1e6:.0f} ms"
 
 
@@ -124,6 +128,10 @@ class DataQuality:
         self._last_command: Rows | None = None
         self._last_write_ns = np.empty(0, np.int64)
         self._read = dict.fromkeys(("state", "command", "event"), 0)
+        self._dropped_commands = 0
+        """Commands that have a number, but were not sent: the emulated network dropped them."""
+        self._bases, self._last_basis = 0, -1
+        """Number of different bases of the samples, and the basis of the last sample."""
         self._first_step: tuple[int, int] | None = None
         """Incarnation and step of the first state."""
         self._early_bases: set[int] = set()
@@ -144,10 +152,17 @@ class DataQuality:
             self._add_commands(commands)
         self._add_events(block.events)
         self._samples += len(samples)
+        if len(samples):
+            bases = samples["basis_step"].astype(np.int64)
+            self._bases += int((np.diff(bases, prepend=self._last_basis) != 0).sum())
+            self._last_basis = int(bases[-1])
         self._negative += sum(int((samples[stage] < 0).sum()) for stage in STAGES)
 
     def _add_commands(self, commands: Rows) -> None:
         self._gaps += _gaps(commands, self._last_command)
+        followed = commands if self._last_command is None else np.concatenate((self._last_command, commands))
+        numbers, sent = (np.diff(followed[name].astype(np.int64)) for name in ("seq", "sequence"))
+        self._dropped_commands += int((numbers - sent)[(sent > 0) & (numbers > sent)].sum())
         self._last_command = commands[-1:].copy()
         if self._first_step is not None and len(self._early_bases) < MIN_MISSING_BASES:
             incarnation, step = self._first_step
@@ -258,6 +273,10 @@ class DataQuality:
             yield Reason("negative_stages", text)
         if loop_ms is not None and age is not None:
             yield from self._omitted(loop_ms, age)
+        if self._bases < MIN_READ_SHARE * self._samples:
+            read = _count(self._bases, "state")
+            text = f"{_count(self._samples, 'command')} are based on {read}: the controller writes without reading"
+            yield Reason("few_reads", text)
         if not self._samples and not unmatched:
             yield NO_LOOP if self._written else NO_CONTROLLER
         elif self._samples < MIN_SAMPLES:
@@ -344,7 +363,8 @@ class DataQuality:
             text = f"no command with a basis acted on {age.uncontrolled_share:.1%} of the steps"
             yield Reason("uncontrolled", text)
         expected_ms = loop_ms.p99 + MAX_HELD_PERIODS * age.control_period_ms + self._run.step_ns / 1e6
-        if age.age_ms.p99 > expected_ms:
+        # Emulated losses are pauses on purpose.
+        if age.age_ms.p99 > expected_ms and not self._dropped_commands:
             text = (
                 f"the age of the acting torque (p99 {age.age_ms.p99:.0f} ms) does not follow from the loop latency "
                 f"(p99 {loop_ms.p99:.0f} ms) and the control period of {age.control_period_ms:.0f} ms: pauses, the "

@@ -28,6 +28,7 @@ from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum
 from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.escaping import csv_text
 from hilrig_schemas import Event
 
 WORLD_FRAME: Final = "world"
@@ -51,11 +52,11 @@ TEMPORARY_SUFFIX: Final = ".exporting"
 # -- tables ---------------------------------------------------------------------------------------------------------
 
 
-def table(run: Run, rows: Rows) -> pa.Table:
+def table(run: Run, rows: Rows, escape: Callable[[str], str] = str) -> pa.Table:
     """Convert rows of one of `TABLES` to an Arrow table.
 
     Units are SI as in the schemas, and `time_s` is the time since the run's first state. A joint vector becomes four
-    columns, one per joint.
+    columns, one per joint. `escape` converts each text.
     """
     columns: dict[str, Any] = {"time_s": run.time_s(rows)}
     for field in rows.dtype.names or ():
@@ -63,12 +64,12 @@ def table(run: Run, rows: Rows) -> pa.Table:
         if field == "message":
             continue
         if field in _INTERNED_FIELDS:
-            columns[field] = pa.array(run.names.texts(values).tolist(), pa.string())
+            columns[field] = pa.array(map(escape, run.names.texts(values).tolist()), pa.string())
         elif values.ndim == 2:
             for number, joint in enumerate(_VECTOR_NAMES):
                 columns[f"{field}_{joint}"] = np.ascontiguousarray(values[:, number])
         elif values.dtype == object:
-            columns[field] = pa.array(values.tolist(), pa.string())
+            columns[field] = pa.array(map(escape, values.tolist()), pa.string())
         else:
             columns[field] = np.ascontiguousarray(values)
     return pa.table(columns)
@@ -83,6 +84,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
     """
     paths = {name: folder / f"{name}.{kind}" for name in TABLES}
     empty = concatenate_records([])
+    escape = csv_text if kind == "csv" else str
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as closing:
@@ -96,7 +98,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
                 for name, rows_of in TABLES.items():
                     rows = rows_of(block)
                     if len(rows):
-                        writers[name].write_table(table(run, rows))
+                        writers[name].write_table(table(run, rows, escape))
     except OSError as error:
         raise OperationError(f"{folder}: can't be written: {error.strerror or error}") from error
     return list(paths.values())

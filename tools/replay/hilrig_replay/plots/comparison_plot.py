@@ -11,6 +11,7 @@ from hilrig_replay.analysis.summary import RunSummary
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
 from hilrig_replay.plots.palette import JOINT_SYMBOLS, RUN_COLORS
+from hilrig_runtime.escaping import plot_text
 from hilrig_sim.arm.joints import JOINT_SCALE
 
 
@@ -35,7 +36,7 @@ def comparison_figure(runs: Sequence[RunSummary]) -> Figure:
         for number, summary in enumerate(runs):
             color, trajectory = RUN_COLORS[number % len(RUN_COLORS)], summary.trajectory
             values = trajectory.position[:, joint] * JOINT_SCALE[joint]
-            axes.plot(trajectory.time_s, values, color=color, linewidth=1.1, label=summary.session)
+            axes.plot(trajectory.time_s, values, color=color, linewidth=1.1, label=plot_text(summary.session))
         unit = "mm" if joint == 2 else "°"
         label_axes(axes, f"{JOINT_SYMBOLS[joint]}, {unit}", "aligned time, s" if joint == 3 else "", "")
     figure.axes[0].legend(fontsize=7, frameon=False)

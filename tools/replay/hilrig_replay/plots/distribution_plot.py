@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from hilrig_replay.analysis.summary import RunSummary
 from hilrig_replay.plots.axes_style import label_axes
 from hilrig_replay.plots.palette import RUN_COLORS, TEXT_COLOR
+from hilrig_runtime.escaping import plot_text
 
 _MAX_NAMED_RUNS: Final = 60
 """With more runs the row labels would overlap, so rows are only numbered."""
@@ -40,7 +41,7 @@ def distribution_figure(runs: Sequence[RunSummary]) -> Figure:
     _boxes(loop, runs)
     label_axes(loop, "Loop latency, ms", "box: quartiles, whiskers: p1 and p99", "")
     ranks = [str(row + 1) for row in rows]
-    names = [f"{rank}. {_shorten(run.name)}" for rank, run in zip(ranks, runs, strict=True)]
+    names = [plot_text(f"{rank}. {_shorten(run.name)}") for rank, run in zip(ranks, runs, strict=True)]
     for axes in figure.axes:
         # Every panel has row labels, because a narrow page shows the panels one below the other.
         axes.set_yticks(

@@ -18,6 +18,7 @@ from hilrig_replay.plots.axes_style import label_axes, set_log_scale
 from hilrig_replay.plots.output import check_plot_path, save_figure
 from hilrig_replay.plots.palette import AGE_COLOR, LOOP_COLOR, TEXT_COLOR
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.escaping import plot_text
 
 Floats = NDArray[np.float64]
 
@@ -55,9 +56,11 @@ def latency_figure(report: LatencyReport, run: Run) -> Figure:
     verdict = "valid" if report.fit else "not valid"
     reason = "" if report.fit else f": {report.reasons[0].text}"
     figure.suptitle(
-        f"Loop latency of {report.session}\n"
-        f"{report.samples} samples, step {report.step_ms:g} ms, controller {report.controller or '(none)'} · "
-        f"{verdict} for latency measurements{reason}",
+        plot_text(
+            f"Loop latency of {report.session}\n"
+            f"{report.samples} samples, step {report.step_ms:g} ms, controller {report.controller or '(none)'} · "
+            f"{verdict} for latency measurements{reason}"
+        ),
         fontsize=11,
         color=TEXT_COLOR,
     )

@@ -12,6 +12,7 @@ from hilrig_replay.geometry.scene import workspace_outline
 from hilrig_replay.plots.axes_style import label_axes
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, RUN_COLORS
 from hilrig_runtime.config.task import TaskConfig
+from hilrig_runtime.escaping import plot_text
 from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_sim.arm.model import RigParameters
 
@@ -54,5 +55,7 @@ def _draw_workspace(axes: Axes, parameters: RigParameters, task: TaskConfig | No
     for pose in () if task is None else task.poses:
         x, y, _ = pose.position_mm
         axes.plot([x], [y], marker="+", markersize=11, markeredgewidth=2, color=TASK_COLOR)
-        axes.annotate(pose.name, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, color=TASK_COLOR)
+        axes.annotate(
+            plot_text(pose.name), (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, color=TASK_COLOR
+        )
     axes.set_aspect("equal", adjustable="datalim")

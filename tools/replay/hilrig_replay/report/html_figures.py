@@ -1,7 +1,6 @@
 """Converts figures to HTML images, one per column of panels; a narrow page shows the columns one below the other."""
 
 from base64 import b64encode
-from html import escape
 from io import BytesIO
 from itertools import pairwise
 from typing import Final
@@ -11,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
+
+from hilrig_runtime.escaping import as_html
 
 _MIN_COLUMN_GAP_PX: Final = 7
 """Smallest distance between columns of panels; guaranteed by constrained layout."""
@@ -52,4 +53,4 @@ def _image(pixels: NDArray[np.uint8], alt: str) -> str:
         imsave(file, np.ascontiguousarray(pixels), format="png")
         data = b64encode(file.getvalue()).decode()
     width = pixels.shape[1]
-    return f'<img alt="{escape(alt, quote=True)}" style="flex: {width}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{as_html(alt)}" style="flex: {width}" src="data:image/png;base64,{data}">'

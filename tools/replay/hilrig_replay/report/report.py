@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +23,7 @@ from hilrig_replay.plots.palette import EFFORT_SYMBOLS, event_title
 from hilrig_replay.report.html_figures import html_figure
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
+from hilrig_runtime.escaping import as_html
 from hilrig_runtime.process.process_pool import process_pool
 
 _MIN_RUNS_FOR_PROCESSES: Final = 4
@@ -142,12 +142,12 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
-        body = f'<h1>{escape(title)}</h1><p class="quiet">{escape(_origin(summary))}</p>{_run(pages[0])}'
+        body = f'<h1>{as_html(title)}</h1><p class="quiet">{as_html(_origin(summary))}</p>{_run(pages[0])}'
     else:
         title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
-            f"<details><summary>{number}. {escape(page.summary.name)} "
-            f'<span class="quiet">· {escape(_session_and_origin(page.summary))}</span></summary>{_run(page)}</details>'
+            f"<details><summary>{number}. {as_html(page.summary.name)} "
+            f'<span class="quiet">· {as_html(_session_and_origin(page.summary))}</span></summary>{_run(page)}</details>'
             for number, page in enumerate(pages, start=1)
         )
         notes = _list_section("Skipped recordings", left_out) + _list_section("Runs with the same torques", pairs)
@@ -155,7 +155,7 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{body}</body></html>\n"
+        f"<title>{as_html(title)}</title><style>{STYLE}</style></head><body>{body}</body></html>\n"
     )
 
 
@@ -245,7 +245,7 @@ def _facts(page: _Page) -> str:
     facts.append((f"{summary.motion.work_j:.1f} J", "drive work"))
     if page.verified is not None:
         facts.append(("verified" if page.verified.same else "not reproduced", page.verified.sentence()))
-    cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(text)}</span></div>" for value, text in facts)
+    cells = "".join(f"<div><b>{as_html(value)}</b><span>{as_html(text)}</span></div>" for value, text in facts)
     return f'<div class="facts">{cells}</div>'
 
 
@@ -254,13 +254,13 @@ def _task(summary: RunSummary) -> str:
     if grade is None:
         return ""
     rows = "".join(
-        f'<tr><td>{escape(goal)}</td><td class="{"good" if reached else "bad"}">{"yes" if reached else "no"}</td>'
-        f'<td class="text">{escape(text)}</td></tr>'
+        f'<tr><td>{as_html(goal)}</td><td class="{"good" if reached else "bad"}">{"yes" if reached else "no"}</td>'
+        f'<td class="text">{as_html(text)}</td></tr>'
         for goal, reached, text in grade.lines()
     )
     head = "<thead><tr><th>goal</th><th>reached</th><th>result</th></tr></thead>"
-    title = f"Task: {escape(grade.title)}" if grade.title else "Task"
-    verdict = f'<p class="{"good" if grade.passed else "bad"}">{escape(grade.headline())}.</p>'
+    title = f"Task: {as_html(grade.title)}" if grade.title else "Task"
+    verdict = f'<p class="{"good" if grade.passed else "bad"}">{as_html(grade.headline())}.</p>'
     return (
         f"<section><h2>{title}</h2>{verdict}"
         f'<div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div></section>'
@@ -288,10 +288,10 @@ def _latency(summary: RunSummary) -> str:
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
-        else f'<p class="bad">Not valid for latency measurements: {escape(latency.reason_text())}.</p>'
+        else f'<p class="bad">Not valid for latency measurements: {as_html(latency.reason_text())}.</p>'
     )
-    notes = "".join(f'<p class="quiet">{escape(note)}</p>' for note in latency.notes())
-    findings = "".join(f"<li>{escape(finding.text)}</li>" for finding in latency.findings)
+    notes = "".join(f'<p class="quiet">{as_html(note)}</p>' for note in latency.notes())
+    findings = "".join(f"<li>{as_html(finding.text)}</li>" for finding in latency.findings)
     table = _table(["ms", *STATISTICS_TITLES], rows)
     return f"{table}{notes}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
 
@@ -337,7 +337,7 @@ def _overview(pages: Sequence[_Page]) -> str:
 
 
 def _list_section(title: str, sentences: Iterable[str]) -> str:
-    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
+    items = "".join(f"<li>{as_html(sentence)}</li>" for sentence in sentences)
     return f'<section><h2>{title}</h2><ul class="bad">{items}</ul></section>' if items else ""
 
 
@@ -371,19 +371,18 @@ def _rank(page: _Page) -> tuple[float, ...]:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    head = "".join(f"<th>{as_html(cell)}</th>" for cell in header)
+    body = "".join("<tr>" + "".join(f"<td>{as_html(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _ranking(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Table whose rows become cards on a narrow page; each cell has its column's name for that."""
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+    head = "".join(f"<th>{as_html(cell)}</th>" for cell in header)
     body = "".join(
         "<tr>"
         + "".join(
-            f'<td data-label="{escape(column, quote=True)}">{escape(cell)}</td>'
-            for column, cell in zip(header, row, strict=True)
+            f'<td data-label="{as_html(column)}">{as_html(cell)}</td>' for column, cell in zip(header, row, strict=True)
         )
         + "</tr>"
         for row in rows
