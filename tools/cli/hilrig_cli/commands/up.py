@@ -35,7 +35,7 @@ def up(
     lab = load_lab(config)
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     say: Callable[[str], None] = partial(print, flush=True)
-    report = log
+    report: Callable[[str], None] = log
     if log_format != "text":
         start_logging("up", "1", log_format)
         say = report = logging.getLogger(__name__).info
