@@ -265,9 +265,10 @@ class FileStore:
         recording = file.recording
         del self._files[recording]
         end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
-        reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
-        self._finish(file, end, reason)
-        self._report(recording, reason)
+        reason = f"{error.strerror}; the recording ends here"
+        # The file contains its name only: the path could reveal the name of a user.
+        self._finish(file, end, f"{file.writer.path.name}: {reason}")
+        self._report(recording, f"{file.writer.path}: {reason}")
         self._on_failed(recording)
 
     def _report(self, recording: Recording, text: str) -> None:

@@ -31,8 +31,10 @@ def up(
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_sim.parameters import lab_parameters
 
     lab = load_lab(config)
+    lab_parameters(lab, str(config or "defaults"))
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     say: Callable[[str], None] = partial(print, flush=True)
     report: Callable[[str], None] = log
