@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilrig_sim.accuracy import accuracy_warnings
-from hilrig_sim.arm.model import ArmParameters, RigParameters, SceneParameters, StepParameters
+from hilrig_sim.arm.model import ArmParameters, PartParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.arm.stability import ERROR_BOUND, MAX_SUBSTEPS
 from hilrig_sim.plant.hard_stops import first_arrival
 from hilrig_sim.plant.linear_joints import free_motion, move_between_stops
@@ -55,6 +55,47 @@ def test_steps_and_impacts_equal_the_reference(step_ns: int, steps: int) -> None
             )
             impacts += len(expected)
     assert impacts > 10
+
+
+@pytest.mark.parametrize("substeps", ["auto", 1, 4])
+def test_joint_that_leaves_its_stop_in_the_step_is_reported(substeps: int | str) -> None:
+    # Joint 2 hits its stop after 4 ms, and is pulled back by the effort.
+    plant, reference = Plant([rig(substeps=substeps)]), ReferenceArm(ARM)
+    position, velocity = (0.3, ARM.upper[1] - 0.02, 0.1, 0.0), (0.0, 5.0, 0.0, 0.0)
+    effort = np.array([0.0, -12.0, -4.9, 0.0])
+    plant.set_state(0, position, velocity)
+    events = [
+        (hit.joint, hit.upper, hit.speed) for hit in plant.step(effort[:, np.newaxis], np.zeros(1, dtype=np.bool_))
+    ]
+    reference.step(np.array(position), np.array(velocity), effort, 0.02)
+    ((joint, upper, speed),) = reference.impacts
+    assert plant.position[1, 0] < ARM.upper[1]
+    assert [event[:2] for event in events] == [(joint, upper)] == [(2, True)]
+    assert events[0][2] == pytest.approx(speed, rel=0.01 if substeps != 1 else 0.1)
+
+
+@pytest.mark.parametrize("step_ns", [20_000_000, 5_000_000, 1_000_000])
+@pytest.mark.parametrize("surface", ["table", "part"])
+def test_quill_lands_at_the_time_of_the_reference(step_ns: int, surface: str) -> None:
+    part = PartParameters("a", "cylinder", (0.04, 0.04, 0.03), 0.2, True, "#808080", (0.6, 0.0, -0.045), 0.0)
+    parts = (part,) if surface == "part" else ()
+    scene = SceneParameters(parts=parts)
+    plant = Plant([replace(rig(step_ns), scene=scene)])
+    upper3 = ARM.l1 + 0.06 - (0.03 if parts else 0.0)
+    q, v = np.array([0.0, 0.0, 0.05, 0.0]), np.zeros(4)
+    plant.set_state(0, q, v)
+    effort, reference = np.array([0.0, 0.0, 3.0, 0.0]), ReferenceArm(ARM)
+    hits: list[tuple[int, float]] = []
+    expected: list[tuple[int, float]] = []
+    for _ in range(round(0.2e9 / step_ns)):
+        events = plant.step(effort[:, np.newaxis], np.zeros(1, dtype=np.bool_))
+        hits += [(event.joint, event.speed) for event in events]
+        q, v = reference.step(q, v, effort, step_ns * 1e-9, upper3)
+        expected += [(0, speed) for _, _, speed in reference.impacts]
+        np.testing.assert_allclose(plant.position[2, 0], q[2], atol=1e-8)
+        np.testing.assert_allclose(plant.velocity[2, 0], v[2], atol=1e-6)
+    assert len(hits) == len(expected) == 1
+    assert hits[0] == (0, pytest.approx(expected[0][1], rel=1e-6))
 
 
 def test_hours_of_random_torque_do_not_diverge() -> None:

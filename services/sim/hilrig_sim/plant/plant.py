@@ -104,6 +104,8 @@ class Plant:
         self._held = self._nothing_held
         self._plane = PlaneSolver(self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2])
         self._events: list[PlantEvent] = []
+        self._left: list[PlantEvent] = []
+        """Impacts of joints 1 and 2 in the last integration step of fixed length."""
         self.position[:] = np.array([arm.start for arm in self._arms]).T
         self._refresh_derived_state()
 
@@ -265,8 +267,9 @@ class Plant:
         impact_velocity = velocity.copy()
         plane = 2 * self.count
         self._touching_plane = _TRUE in at_lower[:plane] or _TRUE in at_upper[:plane]
+        self._left.clear()
         if self._touching_plane:
-            self._impact(effort)
+            self._impact(effort, impact_velocity)
             np.less_equal(position, self._lower, lower)
             np.greater_equal(position, self._upper, upper)
         # Joints 3 and 4 are decoupled: an impact sets their position to the limit.
@@ -276,6 +279,8 @@ class Plant:
         np.maximum(speed34, 0.0, out=speed34, where=lower34)
         np.minimum(speed34, 0.0, out=speed34, where=upper34)
         self._limits.update(lower, upper, self._upper[2], impact_velocity, self._events)
+        # Joints that left their stop before the end of the step.
+        self._events += [hit for hit in self._left if not (upper if hit.upper else lower)[hit.joint - 1, hit.rig]]
 
     def _steppers(self) -> list[FixedStep]:
         """Return the integrator of each integration step of a step; a rig with fewer of them has a length of zero."""
@@ -439,8 +444,8 @@ class Plant:
         below = world.contact(rigs, x, y, bottom)
         self._upper[2, rigs] = np.minimum(self._stop[2, rigs], self._l1[rigs] - world.held_height[rigs] - below)
 
-    def _impact(self, effort: Floats) -> None:
-        """Stop joints 1 and 2 at their limits, at the time of the impact within the step."""
+    def _impact(self, effort: Floats, impact_velocity: Floats) -> None:
+        """Stop joints 1 and 2 at their limits, at the time of the impact, and set `impact_velocity`, (4, N), there."""
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
         if any_true(beyond):
@@ -465,6 +470,10 @@ class Plant:
             hitting = outside & (fractions == first)
             np.copyto(plane[:2], limit, where=hitting)
             side = _sides(plane, self._lower[:, rigs], self._stop[:, rigs])
+            for joint, column in np.argwhere(hitting & (side * plane_rate[:2] > 0)).tolist():
+                rig, rate = int(rigs[column]), float(plane_rate[joint, column])
+                impact_velocity[joint, rig] = rate
+                self._left.append(PlantEvent(PlantEventKind.LIMIT_HIT, rig, joint + 1, rate > 0, abs(rate)))
             self._stop_plane(dynamics, plane, plane_rate, side)
             # The remainder of the step starts at the stop, pressed against it or leaving it.
             rest = FixedStep(dynamics, self._tableau, (1.0 - first) * step)

@@ -84,8 +84,10 @@ class Player:
     def _ordered(self, from_publish_ns: int | None) -> Iterator[Message]:
         """Messages in order of publication; only those within the reorder window are held in memory."""
         buffer: list[tuple[int, int, Message]] = []
-        from_log_ns = None if from_publish_ns is None else self._earliest_arrival(from_publish_ns)
-        for number, message in enumerate(self._file.messages(self._topics, from_ns=from_log_ns)):
+        has_steps = bool(int(self._file.metadata.get("hilrig.summary", {}).get("clock_steps", 0)))
+        from_log_ns = None if from_publish_ns is None or has_steps else self._earliest_arrival(from_publish_ns)
+        messages = self._file.messages(self._topics, from_ns=from_log_ns)
+        for number, message in enumerate(_without_clock_steps(messages) if has_steps else messages):
             if from_publish_ns is not None and message.publish_time < from_publish_ns:
                 continue
             heapq.heappush(buffer, (message.publish_time, number, message))
@@ -97,6 +99,28 @@ class Player:
     def _earliest_arrival(self, publish_ns: int) -> int | None:
         # The clocks of sender and recorder may differ: the index is used only if they are consistent.
         return publish_ns - _REORDER_WINDOW_NS if self._file.start_ns <= publish_ns <= self._file.end_ns else None
+
+
+def _without_clock_steps(messages: Iterator[Message]) -> Iterator[Message]:
+    """The messages with publication times as if the wall clock had not been set.
+
+    Messages are stored within `_REORDER_WINDOW_NS` of their publication: a larger difference of consecutive messages
+    of a channel is a step, except after a pause of both the channel and the recorder.
+    """
+    newest: int | None = None
+    sums: dict[int, int] = {}
+    total = 0
+    for message in messages:
+        step_ns = sums.get(message.channel_id, 0)
+        publish_ns = message.publish_time - step_ns
+        if newest is not None and abs(publish_ns - newest) > _REORDER_WINDOW_NS:
+            # Another channel may have found the step before.
+            if abs(message.publish_time - total - newest) > _REORDER_WINDOW_NS:
+                total = message.publish_time - newest
+            step_ns = sums[message.channel_id] = total
+            publish_ns = message.publish_time - step_ns
+        newest = publish_ns if newest is None else max(newest, publish_ns)
+        yield message._replace(publish_time=publish_ns)
 
 
 def publish_recording(

@@ -108,6 +108,7 @@ class Decoder:
             self._connections.drain(),
         )
         self._timebase.update(records.states)
+        self._timebase.update_commands(records.commands)
         # A protobuf message that is reused for parsing never frees memory: new decoders bound its growth.
         self._decoders = self._new_decoders()
         return records
