@@ -111,7 +111,9 @@ def test_late_subscriber_receives_earlier_recording_messages(open_bus: OpenBus) 
         publisher.put(str(number).encode())
     got: list[int] = []
     lost: list[int] = []
-    recorder.subscribe_recording("hil/lab/log/**", lambda _, payload: got.append(int(payload)), lost.append)
+    recorder.subscribe_recording(
+        "hil/lab/log/**", lambda _, payload: got.append(int(payload)), lambda _, count: lost.append(count)
+    )
     for number in range(50, 100):
         publisher.put(str(number).encode())
     eventually(lambda: len(got) >= 100)

@@ -45,7 +45,7 @@ def on_message(key, payload):
         done.set()
 
 with ZenohBus(BusConfig(first_port=int(sys.argv[1])), "recorder") as bus:
-    bus.subscribe_recording("hil/lab/log/*/*", on_message, lost.append, {CACHE_DEPTH})
+    bus.subscribe_recording("hil/lab/log/*/*", on_message, lambda _, count: lost.append(count), {CACHE_DEPTH})
     completed = done.wait(30)
 print(completed, numbers == list(range(len(numbers))), sum(lost))
 """

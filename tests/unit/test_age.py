@@ -112,6 +112,34 @@ def test_pauses_show_in_the_age_and_not_in_the_loop_latency(tmp_path: Path) -> N
     assert "age_inconsistent" in {reason.code for reason in report.reasons}
 
 
+@pytest.mark.parametrize("emulated", [False, True])
+def test_emulated_losses_explain_pauses(tmp_path: Path, emulated: bool) -> None:
+    script = Script(seconds=20.0, poll_ms=20.0)
+    made = make(script)
+    # A burst of 8 of 40 commands is lost.
+    lost = {one.message.seq for one in made if isinstance(one.message, TorqueCommand) and one.message.seq % 40 >= 32}
+    kept: list[TimedMessage] = []
+    number = 0
+    for one in made:
+        message = one.message
+        if isinstance(message, TorqueCommand):
+            if message.seq in lost:
+                continue
+            number += 1
+            message.seq = message.seq if emulated else number
+        elif isinstance(message, JointState) and message.command_seq:
+            if message.command_seq in lost:
+                message.basis_step = message.loop_latency_ns = message.command_arrived_ns = 0
+                message.command_seq = message.command_seq // 40 * 40 + 31
+            if not emulated:
+                message.command_seq -= sum(seq <= message.command_seq for seq in lost)
+        kept.append(one)
+    report = report_of(tmp_path, script, kept)
+    assert report.age_ms is not None
+    assert report.age_ms.p99 > 150
+    assert ("age_inconsistent" in {reason.code for reason in report.reasons}) == (not emulated)
+
+
 def closing(made: list[TimedMessage], last_ms: float, silent_ms: float) -> list[TimedMessage]:
     """The messages without commands after `last_ms`, and a lease that is lost `silent_ms` after the last command."""
     commands = [one for one in made if isinstance(one.message, TorqueCommand)]

@@ -10,13 +10,10 @@ from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Event
 
 
-def test_slow_disk_alert_is_raised_once_and_cleared(tmp_path: Path) -> None:
-    (tmp_path / "lab").mkdir()
-    sync_worker: Any = SimpleNamespace(sync_delay_s=0.2)
-    events: list[Event] = []
-    store = FileStore(
+def make_store(folder: Path, sync_worker: Any, events: list[Event]) -> FileStore:
+    return FileStore(
         "lab",
-        RecorderConfig(folder=tmp_path, min_free_mib=0),
+        RecorderConfig(folder=folder, min_free_mib=0),
         ManualClock(),
         sync_worker,
         instance="1",
@@ -25,6 +22,13 @@ def test_slow_disk_alert_is_raised_once_and_cleared(tmp_path: Path) -> None:
         request_config=lambda _: None,
         on_failed=lambda _: None,
     )
+
+
+def test_slow_disk_alert_is_raised_once_and_cleared(tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
+    sync_worker: Any = SimpleNamespace(sync_delay_s=0.2)
+    events: list[Event] = []
+    store = make_store(tmp_path, sync_worker, events)
     store.tick(0)
     assert (store.alert, events) == ("", [])
     sync_worker.sync_delay_s = SLOW_SYNC_S + 1
@@ -38,3 +42,19 @@ def test_slow_disk_alert_is_raised_once_and_cleared(tmp_path: Path) -> None:
     store.tick(6)
     assert store.alert == ""
     store.release()
+
+
+def test_resumed_recorder_does_not_report_a_slow_disk(tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
+    events: list[Event] = []
+    sync_worker: Any = SimpleNamespace(sync_delay_s=0.2)
+    store = make_store(tmp_path, sync_worker, events)
+    store.tick(0)
+    # The process was stopped for 14 s, in the middle of a sync.
+    sync_worker.sync_delay_s = 14.0
+    for now_ms in range(14_000, 18_000, 100):
+        store.tick(now_ms * 1_000_000)
+    assert (store.alert, events) == ("", [])
+    for now_ms in range(18_000, 20_000, 100):
+        store.tick(now_ms * 1_000_000)
+    assert "slow disk" in store.alert

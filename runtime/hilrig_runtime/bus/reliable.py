@@ -11,6 +11,7 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import zenoh
@@ -30,6 +31,8 @@ _RETRY_INTERVAL_S: Final = 0.25
 _RECOVERY_TIMEOUT_S: Final = 10.0
 """Time without progress after which a gap is declared lost, so that later samples can be written."""
 _HEARTBEAT_S: Final = 0.25
+_MAX_SAMPLE_NUMBER: Final = (1 << 32) - 1
+"""Largest number that zenoh gives to a sample."""
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +81,8 @@ class _Source:
 class ReliableSubscriber(Handle):
     """Subscribes to the recording publishers on `key_expr`; delivers the messages of each in order and without gaps.
 
-    `on_loss` gets the number of messages of a publisher that could not be recovered; each caches `cache_depth`.
+    `on_loss` gets the key and the number of messages of a publisher that could not be recovered; each caches
+    `cache_depth`.
     """
 
     def __init__(
@@ -127,9 +131,12 @@ class ReliableSubscriber(Handle):
             self._update_backlog(source)
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
+        number = int.from_bytes(sample.payload.to_bytes(), "little")
+        if number > _MAX_SAMPLE_NUMBER:
+            return
         with self._changed:
             source = self._source(_cache_of(sample))
-            source.samples.set_head(int.from_bytes(sample.payload.to_bytes(), "little"))
+            source.samples.set_head(number)
             self._update_backlog(source, _HEARTBEAT_GRACE_S)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
@@ -143,7 +150,9 @@ class ReliableSubscriber(Handle):
     def _source(self, cache: str) -> _Source:
         source = self._sources.get(cache)
         if source is None:
-            samples: ReorderBuffer[zenoh.Sample] = ReorderBuffer(self._deliver, self._on_loss, self._cache_depth)
+            samples: ReorderBuffer[zenoh.Sample] = ReorderBuffer(
+                self._deliver, partial(self._on_loss, cache.partition("/@adv/")[0]), self._cache_depth
+            )
             source = self._sources[cache] = _Source(cache, samples)
         return source
 

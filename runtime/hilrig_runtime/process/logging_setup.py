@@ -43,5 +43,6 @@ def start_logging(service: str, instance: str, log_format: str) -> None:
         handler.setFormatter(JsonFormatter(service, instance))
     else:
         source = service if instance == "1" else f"{service} {instance}"
-        handler.setFormatter(logging.Formatter(f"{source}: %(levelname)s: %(message)s"))
+        text = logging.Formatter(f"%(asctime)s.%(msecs)03d {source}: %(levelname)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
+        handler.setFormatter(text)
     logging.basicConfig(level=logging.INFO, handlers=[handler])

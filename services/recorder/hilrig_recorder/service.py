@@ -29,11 +29,13 @@ from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import ControlReply, Event, OpenSession, RigConfig, RigReport, StartSession, StopSession
-from hilrig_schemas.topics import CONFIG, CONTROL, LOG
+from hilrig_schemas.topics import CONFIG, CONTROL, LOG, source_of_key
 
 TICK_PERIOD_NS: Final = SECOND_NS // 10
 """Period of the housekeeping between received batches."""
 _CONFIG_TIMEOUT_S: Final = 0.8
+_LOSS_LOG_PERIOD_NS: Final = 10 * SECOND_NS
+"""Shortest time between two log messages about lost batches."""
 _CONFIG_RETRY_NS: Final = 2 * SECOND_NS
 _LAST_BATCHES_TIMEOUT_NS: Final = 3 * SECOND_NS // 10
 """Time after the stop request in which the recorder still receives the last batches of other services."""
@@ -86,6 +88,9 @@ class Recorder:
         self._executor = OwnerThreadExecutor()
         """Processes control requests and the results of other threads on the recorder's thread."""
         self._config_due_ns: dict[str, int] = {}
+        self._lost_batches: dict[str, int] = {}
+        """Lost batches that are not logged yet, by source."""
+        self._lost_batches_due_ns = 0
         self._config_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
         self._queue = IngestQueue(config.queue_entries, service.clock, service.counters)
         self._sync_worker = SyncWorker(
@@ -176,6 +181,7 @@ class Recorder:
     def _tick(self, now_ns: int) -> None:
         self._sessions.tick(now_ns, self._clock.wall_ns())
         self._executor.run_pending()
+        self._log_lost_batches(now_ns)
         self._store.tick(now_ns)
         for rig in self._store.unconfigured():
             if now_ns >= self._config_due_ns.get(rig, 0):
@@ -208,10 +214,19 @@ class Recorder:
     def _on_failed(self, recording: Recording) -> None:
         self._sessions.drop(recording)
 
-    @staticmethod
-    def _on_loss(batches: int) -> None:
-        # Lost messages are counted by their sequence numbers, where their rig is known.
-        logger.warning("%d batches of a recording stream were lost in transport", batches)
+    def _on_loss(self, key: str, batches: int) -> None:
+        # On a thread of the bus. Lost messages are counted by their sequence numbers, where their rig is known.
+        self._executor.post(lambda: self._count_lost_batches(source_of_key(key), batches))
+
+    def _count_lost_batches(self, source: str, batches: int) -> None:
+        self._lost_batches[source] = self._lost_batches.get(source, 0) + batches
+
+    def _log_lost_batches(self, now_ns: int) -> None:
+        if self._lost_batches and now_ns >= self._lost_batches_due_ns:
+            self._lost_batches_due_ns = now_ns + _LOSS_LOG_PERIOD_NS
+            for source, batches in self._lost_batches.items():
+                logger.warning("%d batches of the recording stream of %s were lost in transport", batches, source)
+            self._lost_batches.clear()
 
     # -- manual sessions --------------------------------------------------------------------------------------------
 

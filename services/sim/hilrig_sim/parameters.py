@@ -1,10 +1,13 @@
 """Converts the configuration of a lab to the parameters of its rigs in SI units, and validates them."""
 
 import math
+from collections.abc import Iterator
 
 from hilrig_runtime.config.lab import ArmConfig, LabConfig, RigSettings
 from hilrig_runtime.config.scene import SceneConfig, TrayConfig
+from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
+from hilrig_sim.arm.kinematics import UnreachableError, forward, in_reach, inverse
 from hilrig_sim.arm.model import (
     ArmParameters,
     PartParameters,
@@ -34,6 +37,55 @@ def rig_parameters(lab: LabConfig, rig: RigSettings) -> RigParameters:
     except InputError as error:
         raise InputError(f"rig {rig.name!r}: {error}") from error
     return parameters
+
+
+def lab_parameters(lab: LabConfig, where: str) -> dict[str, RigParameters]:
+    """Return the parameters of every rig of a lab, whose rigs can perform the lab's task.
+
+    Args:
+        lab: the lab.
+        where: name of its file in messages.
+
+    Raises:
+        InputError: names every mistake.
+    """
+    found, mistakes = {}, []
+    for rig in lab.rigs:
+        try:
+            found[rig.name] = rig_parameters(lab, rig)
+        except InputError as error:
+            mistakes += str(error).splitlines()
+        else:
+            mistakes += () if lab.task is None else task_mistakes(lab.task, found[rig.name])
+    if mistakes:
+        raise InputError("\n".join(f"{where}: {mistake}" for mistake in dict.fromkeys(mistakes)))
+    return found
+
+
+def task_mistakes(task: TaskConfig, parameters: RigParameters) -> Iterator[str]:
+    """Yield each reason why a rig can't perform a task: a pose or point out of reach, or a part not in the scene."""
+    for pose in task.poses:
+        x, y, z = (length / 1000 for length in pose.position_mm)
+        try:
+            inverse(parameters.arm, (x, y, z, 0.0 if pose.yaw_deg is None else math.radians(pose.yaw_deg)))
+        except UnreachableError as error:
+            yield f"task: pose {pose.name!r} is out of reach: {error}"
+    # The highest and the lowest position of the quill.
+    strokes = parameters.arm.upper[2], parameters.arm.lower[2]
+    low, high = (float(forward(parameters.arm, (0.0, 0.0, d3, 0.0))[2]) for d3 in strokes)
+    for number, (x_mm, y_mm, z_mm) in enumerate(() if task.path is None else task.path.points_mm, start=1):
+        within = low <= z_mm / 1000 <= high and bool(in_reach(parameters.arm, x_mm / 1000, y_mm / 1000))
+        if not within:
+            yield f"task: point {number} of the path, ({x_mm:g}, {y_mm:g}, {z_mm:g}) mm, is out of reach"
+    known = [part.name for part in parameters.scene.parts if part.ferromagnetic]
+    for name in () if task.place is None else task.place.parts:
+        if name not in known:
+            yield (
+                f"task.place.parts: no ferromagnetic part {name!r} in the scene; its ferromagnetic parts: "
+                f"{', '.join(known) or 'none'}"
+            )
+    if task.place is not None and not any(tray.places for tray in parameters.scene.trays):
+        yield "task.place: the scene has no tray with places"
 
 
 def _arm(config: ArmConfig) -> ArmParameters:

@@ -4,19 +4,21 @@ import sys
 import time
 from collections.abc import Sequence, Set
 from importlib.metadata import version
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from google.protobuf.message import Message
 
 from hilrig_cli.service_kinds import RIG_SERVICES
+from hilrig_runtime.bus.acl import RULES
 from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.bus.zenoh_config import own_identity
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.control import check_versions
 from hilrig_runtime.process.discovery import list_services
 from hilrig_schemas import ControlReply, ControlRequest, ServiceInfo
-from hilrig_schemas.topics import CONTROL, RigTopic, parse_rig_key
+from hilrig_schemas.topics import CONTROL, RigTopic, Topic, parse_rig_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -35,6 +37,7 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
         InputError: the lab has no such rig.
         OperationError: no edge replies, or the edge refuses the request.
     """
+    check_permission(lab, topic)
     payload = request.SerializeToString()
     deadline_s = time.monotonic() + QUERY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
@@ -56,12 +59,27 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
     return [topic.decode(by_rig[rig]) for rig in order]
 
 
+def check_permission(lab: LabConfig, topic: Topic[Any]) -> None:
+    """Check that the certificate of this command may query a topic: the bus would not answer a denied query.
+
+    Raises:
+        OperationError: it may not.
+    """
+    role = "operator" if lab.bus.tls is None else own_identity(lab.bus.tls, "tool")
+    if role not in RULES[topic.name].subscribers:
+        raise OperationError(
+            f"this host has only the {role} certificate; a {topic.name} request needs operator: copy operator.pem and "
+            f"operator.key into bus.tls.folder, or run the command on a host that has them"
+        )
+
+
 def send_control_request(bus: Bus, lab: LabConfig, info: ServiceInfo, request: ControlRequest) -> ControlReply:
     """Send a control request to a discovered service; return its reply.
 
     Raises:
         OperationError: the service has another version, does not reply, or refuses the request.
     """
+    check_permission(lab, CONTROL)
     request.software_version = version("hilrig")
     check_versions(info.software_version, request.software_version)
     key = CONTROL.key(lab.name, info.service, info.instance)

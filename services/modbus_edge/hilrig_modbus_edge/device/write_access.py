@@ -329,8 +329,9 @@ class WriteAccess:
         holder = self.lease.holder
         if holder is None:
             cause = f"{self._last_writer} no longer holds the lease"
-        elif now_ns - holder.last_request_ns >= self.watchdog.timeout_ns:
-            cause = f"{self._last_writer} sends no requests"
+        elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:
+            # It may have been unplugged after a read.
+            cause = f"no request from {self._last_writer} for {quiet_ns / 1e9:.1f} s"
         else:
             cause = f"{self._last_writer} reads but does not write"
         text = (

@@ -63,6 +63,7 @@ class RecordingWriter:
         self.path = path
         self.temporary_path = part_path(path) if temporary_path is None else temporary_path
         self._file = FileIO(self.temporary_path, "x+")
+        self._folder_synced = False
         lock_file(self._file.fileno())
         self.size = 0
         """Bytes in the file, all of complete records."""
@@ -219,6 +220,10 @@ class RecordingWriter:
             FileReplacedError: the temporary path no longer refers to this file. Writing continues to the open file.
         """
         os.fsync(self._file.fileno())
+        if not self._folder_synced:
+            self._folder_synced = True
+            # Without it, the file itself may be missing after a power failure.
+            sync_folder(self.path.parent)
         self._check_path()
 
     def _check_path(self) -> None:

@@ -26,8 +26,13 @@ logger = logging.getLogger(__name__)
 
 
 def find_unfinished(folder: Path) -> list[Path]:
-    """The unfinished recordings of earlier recorders in the folder of a lab."""
-    return sorted(path for path in folder.glob(f"*/*{UNFINISHED_SUFFIX}") if path.is_file())
+    """The unfinished recordings of earlier recorders in the folder of a lab, the newest first."""
+    times: list[tuple[int, Path]] = []
+    for path in folder.glob(f"*/*{UNFINISHED_SUFFIX}"):
+        with contextlib.suppress(FileNotFoundError):
+            if path.is_file():
+                times.append((path.stat().st_mtime_ns, path))
+    return [path for _, path in sorted(times, reverse=True)]
 
 
 class MaintenanceWorker:

@@ -4,6 +4,7 @@ A write error is handled here: the file accepts no more messages, counts the los
 owner, which finishes the file.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Final
@@ -15,6 +16,10 @@ from hilrig_schemas import RigConfig
 
 MAX_LOSS_RECORDS: Final = 1000
 """Maximum number of metadata records of losses in a file; the summary counts all losses."""
+
+
+_ABSOLUTE_PATH: Final = re.compile(r"""(["'])(?:~|[A-Za-z]:)?[/\\][^"'\n]*?([^"'/\\\n]*)[/\\]?\1""")
+"""A quoted absolute path; its second group is the name of the file or folder."""
 
 
 class SegmentFile:
@@ -97,7 +102,7 @@ class SegmentFile:
             "machine": config.machine,
         }
         self._add_metadata(numbered("hilrig.config", len(self.configurations)), values, is_repeated=True)
-        lab_toml = config.lab_toml or "# There was no lab.toml: the defaults were used.\n"
+        lab_toml = without_folders(config.lab_toml) or "# There was no lab.toml: the defaults were used.\n"
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
 
@@ -140,6 +145,11 @@ class SegmentFile:
             self.writer.add_attachment(name, media_type, text.encode(), log_time=self._clock.wall_ns())
         except OSError as error:
             self.fail(error)
+
+
+def without_folders(lab_toml: str) -> str:
+    """The text of a lab file with file names instead of absolute paths, which can reveal a user's name."""
+    return _ABSOLUTE_PATH.sub(r"\1\2\1", lab_toml)
 
 
 def numbered(name: str, number: int) -> str:

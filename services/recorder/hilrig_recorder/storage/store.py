@@ -73,6 +73,8 @@ class FileStore:
         self._on_failed = on_failed
         self._files: dict[Recording, SegmentFile] = {}
         self._finishing: dict[RecordingWriter, Recording] = {}
+        self._last_tick_ns = clock.monotonic_ns()
+        self._speed_valid_ns = 0
         self._alerts: dict[str, str] = {}
         self._reserve = DiskReserve(self.folder, instance, config.min_free_mib)
         self._space_due_ns = 0
@@ -172,7 +174,7 @@ class FileStore:
         if now_ns >= self._space_due_ns and not failed and not (self._reserve.is_exhausted and self._finishing):
             self._space_due_ns = now_ns + _SPACE_CHECK_PERIOD_NS
             self._check_space()
-        self._check_speed()
+        self._check_speed(now_ns)
         for file in list(self._files.values()):
             if file.failure is not None:
                 self._finish_failed(file, file.failure)
@@ -263,9 +265,10 @@ class FileStore:
         recording = file.recording
         del self._files[recording]
         end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
-        reason = f"{file.writer.path}: {error.strerror}; the recording ends here"
-        self._finish(file, end, reason)
-        self._report(recording, reason)
+        reason = f"{error.strerror}; the recording ends here"
+        # The file contains its name only: the path could reveal the name of a user.
+        self._finish(file, end, f"{file.writer.path.name}: {reason}")
+        self._report(recording, f"{file.writer.path}: {reason}")
         self._on_failed(recording)
 
     def _report(self, recording: Recording, text: str) -> None:
@@ -277,7 +280,13 @@ class FileStore:
             self._alerts[key] = text
             self._emit(Event(kind=Event.RECORDING, severity=severity, text=text, rig=rig, session=session))
 
-    def _check_speed(self) -> None:
+    def _check_speed(self, now_ns: int) -> None:
+        if now_ns - self._last_tick_ns > SECOND_NS:
+            # This process was stopped or starved: the syncs of that time say nothing about the disk.
+            self._speed_valid_ns = now_ns + round(SLOW_SYNC_S * SECOND_NS)
+        self._last_tick_ns = now_ns
+        if now_ns < self._speed_valid_ns:
+            return
         if self._sync_worker.sync_delay_s < SLOW_SYNC_S:
             self._alerts.pop(_SPEED_ALERT, None)
         else:

@@ -24,26 +24,17 @@ def check(
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
-    from hilrig_replay.grading.task_loading import validate_task
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
-    from hilrig_runtime.errors import InputError
     from hilrig_sim.accuracy import accuracy_warnings
     from hilrig_sim.arm.model import describe_substeps
-    from hilrig_sim.parameters import rig_parameters
+    from hilrig_sim.parameters import lab_parameters
 
     if template:
         print(lab_template(), end="")
         return
     lab = load_lab(file)
-    rigs = {}
-    try:
-        for rig in lab.rigs:
-            parameters = rigs[rig.name] = rig_parameters(lab, rig)
-            if lab.task is not None:
-                validate_task(lab.task, parameters)
-    except InputError as error:
-        raise InputError(f"{file or 'defaults'}: {error}") from error
+    rigs = lab_parameters(lab, str(file or "defaults"))
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return

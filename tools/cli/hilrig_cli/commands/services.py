@@ -3,11 +3,15 @@
 from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hilrig_cli.options import Config
+
+if TYPE_CHECKING:
+    from hilrig_runtime.config.lab import LabConfig
 
 StopWithParent = Annotated[
     bool, typer.Option("--stop-with-parent", help="Stop when standard input is closed, that is, the parent has ended.")
@@ -51,6 +55,7 @@ def _command(name: str, package: str, summary: str) -> Callable[..., None]:
                 f"--instance: expected letters, digits, - and _, starting with a letter or digit, got {instance!r}"
             )
         lab = load_lab(config)
+        _validate(lab, config)
         names = [rig.strip() for rig in rigs.split(",")] if rigs else None
         for rig, count in Counter(names).items():
             if count > 1:
@@ -61,6 +66,15 @@ def _command(name: str, package: str, summary: str) -> Callable[..., None]:
 
     run.__name__, run.__doc__ = name, summary
     return run
+
+
+def _validate(lab: "LabConfig", config: Path | None) -> None:
+    """Check what `hilrig check` checks, on hosts with the packages of the simulation."""
+    try:
+        from hilrig_sim.parameters import lab_parameters
+    except ModuleNotFoundError:
+        return
+    lab_parameters(lab, str(config or "defaults"))
 
 
 sim = _command(

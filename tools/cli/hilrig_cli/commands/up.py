@@ -1,7 +1,10 @@
 """`hilrig up`: runs all services of a lab on this host."""
 
+import logging
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -26,21 +29,29 @@ def up(
     from hilrig_cli.local.local_lab import POLL_S, running_lab
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_sim.parameters import lab_parameters
 
     lab = load_lab(config)
+    lab_parameters(lab, str(config or "defaults"))
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
+    say: Callable[[str], None] = partial(print, flush=True)
+    report: Callable[[str], None] = log
+    if log_format != "text":
+        start_logging("up", "1", log_format)
+        say = report = logging.getLogger(__name__).info
 
     processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
-    with running_lab(lab, config, log, stopping, processes, ["--log-format", log_format]) as supervisor:
+    with running_lab(lab, config, report, stopping, processes, ["--log-format", log_format]) as supervisor:
         if not stopping.is_set():
             for rig, kinds in zip(lab.rigs, lab.addresses().values(), strict=True):
                 addresses = ", ".join(f"{kind} at {address}" for kind, address in kinds.items())
                 impairment = lab.impairment_of(rig).describe()
                 suffix = "" if impairment == "none" else f", impairment: {impairment}"
-                print(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{suffix}")
-            print(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
-            print("running; press Ctrl-C to stop", flush=True)
+                say(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{suffix}")
+            say(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
+            say("running; press Ctrl-C to stop")
         viewer = None
         if view and not stopping.is_set():
             command = [sys.executable, "-m", "hilrig_cli", "live", lab.rigs[0].name]
@@ -50,4 +61,4 @@ def up(
             supervisor.poll()
         if viewer is not None:
             viewer.terminate()
-    print("stopped", flush=True)
+    say("stopped")

@@ -128,6 +128,8 @@ class DataQuality:
         self._last_command: Rows | None = None
         self._last_write_ns = np.empty(0, np.int64)
         self._read = dict.fromkeys(("state", "command", "event"), 0)
+        self._dropped_commands = 0
+        """Commands that have a number, but were not sent: the emulated network dropped them."""
         self._bases, self._last_basis = 0, -1
         """Number of different bases of the samples, and the basis of the last sample."""
         self._first_step: tuple[int, int] | None = None
@@ -158,6 +160,9 @@ class DataQuality:
 
     def _add_commands(self, commands: Rows) -> None:
         self._gaps += _gaps(commands, self._last_command)
+        followed = commands if self._last_command is None else np.concatenate((self._last_command, commands))
+        numbers, sent = (np.diff(followed[name].astype(np.int64)) for name in ("seq", "sequence"))
+        self._dropped_commands += int((numbers - sent)[(sent > 0) & (numbers > sent)].sum())
         self._last_command = commands[-1:].copy()
         if self._first_step is not None and len(self._early_bases) < MIN_MISSING_BASES:
             incarnation, step = self._first_step
@@ -358,7 +363,8 @@ class DataQuality:
             text = f"no command with a basis acted on {age.uncontrolled_share:.1%} of the steps"
             yield Reason("uncontrolled", text)
         expected_ms = loop_ms.p99 + MAX_HELD_PERIODS * age.control_period_ms + self._run.step_ns / 1e6
-        if age.age_ms.p99 > expected_ms:
+        # Emulated losses are pauses on purpose.
+        if age.age_ms.p99 > expected_ms and not self._dropped_commands:
             text = (
                 f"the age of the acting torque (p99 {age.age_ms.p99:.0f} ms) does not follow from the loop latency "
                 f"(p99 {loop_ms.p99:.0f} ms) and the control period of {age.control_period_ms:.0f} ms: pauses, the "
