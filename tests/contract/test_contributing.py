@@ -7,8 +7,11 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 PACKAGES = {path.name: path.parent for path in [*ROOT.glob("*/hilrig_*"), *ROOT.glob("*/*/hilrig_*")]}
 TERMS = set(re.findall(r"`([^`\n]+)`", PAGE))
-FOUR_JOINTS = re.compile(r"Vector4|\(4,\)|\(\(?4, (?:[a-zN]|8)|range\(4\)|theta4|[θτ]4|tau4|4[hf]\b|X4\b")
-NOT_JOINTS = re.compile(r"quaternion|rgba|figsize", re.IGNORECASE)
+FOUR_JOINTS = re.compile(
+    r"Vector4|\(4,\)|\(\(?4, (?:[a-zN]|8)|range\(4\)|theta4|[θτ]4|tau4|4[hf]\b|X4\b|[!=]= 4\b|\bJOINTS\b.* 4\b"
+    r"|(?:bytes|bytearray)\(8\)|0\.0, 0\.0, 0\.0, 0\.0|count=4\b|zeros\(4\)|\bjoint \+ 4\b"
+)
+NOT_JOINTS = re.compile(r"quaternion|rgba|figsize|len\((?:parts|request)\)", re.IGNORECASE)
 
 
 def place(name: str) -> Path:

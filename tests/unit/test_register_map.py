@@ -1,5 +1,6 @@
 """The register map, and its agreement with the device and with the examples."""
 
+import inspect
 import re
 import struct
 from itertools import pairwise
@@ -7,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from hilrig_modbus_edge.device import command_publisher, device
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
+from hilrig_modbus_edge.registers import image
 from hilrig_modbus_edge.registers.map import (
     DISCRETE_END,
     ECHO_ADDRESS,
@@ -26,6 +29,7 @@ from hilrig_modbus_edge.registers.map import (
     rows_of,
     struct_of,
 )
+from hilrig_schemas import TorqueCommand
 from support.device_bench import MS, Bench
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -212,3 +216,16 @@ def test_device_has_exactly_the_bits_and_input_registers() -> None:
 def test_addresses_of_examples_are_those_of_the_map(file: str, pattern: str, name: str) -> None:
     found = re.findall(pattern, (EXAMPLES / file).read_text(encoding="utf-8"))
     assert set(found) == {str(address_of(name))}
+
+
+def test_every_status_bit_is_set_somewhere() -> None:
+    source = inspect.getsource(image) + inspect.getsource(device)
+    assert [flag.name for flag in Status if f"status |= Status.{flag.name}\n" not in source] == []
+
+
+def test_internal_command_has_no_field_of_a_write() -> None:
+    every_command = {"rig", "session", "seq", "effort", "magnet", "safe", "echo", "resets", "sent_ns", "wall_ns"}
+    of_the_link = {"command_injected_ns"}
+    of_a_write = set(command_publisher._FIELDS_OF_A_WRITE)
+    assert set(TorqueCommand.DESCRIPTOR.fields_by_name) == every_command | of_the_link | of_a_write
+    assert not of_a_write & every_command

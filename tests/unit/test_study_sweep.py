@@ -1,7 +1,9 @@
 """Study: file validation, sweep, user-written controllers, results and plots."""
 
 import json
+import os
 import re
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from typer.testing import CliRunner
 
 from hilrig_cli.main import app
 from hilrig_runtime.errors import InputError
+from hilrig_study.controllers import user_controller
 from hilrig_study.plots import Marker, plane_figure, traces
 from hilrig_study.results import settled_interval
 from hilrig_study.study_config import StudyConfig, load_study
@@ -195,6 +198,9 @@ def test_example_controller_settles(tmp_path: Path) -> None:
         ("return [0, 0]", r"got \[0, 0\]"),
         ("return None", "got None"),
         ("return 'torque'", "got 'torque'"),
+        ("raise SystemExit(0)", r"mine\.py, line 6: Controller.update ended the process \(exit code 0\).* at t ="),
+        ("__import__('sys').exit()", r"mine\.py, line 6: Controller.update ended the process \(exit code None\)"),
+        ("__import__('os')._exit(0)", r"mine\.py, line 6: Controller.update ended the process \(exit code 0\)"),
     ],
 )
 def test_reports_controller_error_with_line_and_time(tmp_path: Path, body: str, expected: str) -> None:
@@ -216,6 +222,25 @@ def test_rejects_file_without_controller(tmp_path: Path, text: str, expected: st
     (tmp_path / "mine.py").write_text(text)
     with pytest.raises(InputError, match=expected):
         run_first(study, tmp_path)
+
+
+@pytest.mark.parametrize("text", ["while True: pass", "import time; time.sleep(60)", "import os; os._exit(0)"])
+def test_file_that_does_not_load_is_reported(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(user_controller, "TIME_LIMIT_S", 0.2)
+    study = user_study(tmp_path, "return [0] * 4")
+    (tmp_path / "mine.py").write_text(f"\n{text}\n")
+    with pytest.raises(InputError, match=r"mine\.py, line 2: import failed: (did not return within|ended the process)"):
+        run_first(study, tmp_path)
+
+
+def test_endless_update_is_reported_with_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(user_controller, "TIME_LIMIT_S", 0.2)
+    before = os._exit, signal.getsignal(signal.SIGALRM)
+    body = "\n        ".join(("while True:", "    try: pass", "    except Exception: pass"))
+    with pytest.raises(InputError, match=r"mine\.py, line [678]: Controller.update did not return within 0\.2 s"):
+        run_first(user_study(tmp_path, body), tmp_path)
+    assert (os._exit, signal.getsignal(signal.SIGALRM)) == before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def test_reports_missing_controller_file(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def process_pool(tasks: int, workers: int | None = None) -> Iterator[Executor]:
         try:
             yield executor
         except BrokenProcessPool as error:
-            raise OperationError("a worker process died, possibly out of memory") from error
+            raise OperationError("a worker process died: out of memory, or code of a controller ended it") from error
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise

@@ -1,20 +1,23 @@
 """Writing connections of a rig: each torque register and coil has one at a time, among those of one controller.
 
 The connections of a controller may write different things, for example one the torques and another the magnet. Two
-that write the same are two programs that disturb each other. Time is passed in.
+that write the same are two programs that disturb each other. Items are the writable rows of the register map, in its
+order. Time is passed in.
 """
 
 from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
+from hilrig_modbus_edge.registers.map import MAP
 
-TORQUES: Final = 0
+_ITEMS: Final = [register.name for register in MAP if register.writable]
+_COUNT: Final = len(_ITEMS)
+TORQUES: Final = _ITEMS.index("tau1")
 """Number of the first of the four torque registers."""
-MAGNET: Final = 4
-RESET: Final = 5
-EXTENDED: Final = 6
-"""Number of the first of the two registers of the extended map."""
-_COUNT: Final = 8
+EXTENDED: Final = _ITEMS.index("echo")
+"""Number of the first register of the extended map."""
+MAGNET: Final = _ITEMS.index("magnet")
+RESET: Final = _ITEMS.index("reset")
 
 
 class Writers:

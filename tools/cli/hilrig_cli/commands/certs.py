@@ -34,8 +34,8 @@ def certs(
 
     The certificates of the edge and the controllers are for Modbus/TCP Security. Those in FOLDER/bus, signed by a
     separate authority, are for the services, the router and the commands. Existing certificates are kept until they
-    are about to expire, and authorities are always kept, so controllers can be added later. Keep the private keys of
-    the authorities (ca.key) secret.
+    are about to expire, except those named with --client. Authorities are always kept, so controllers can be added
+    later. Keep the private keys of the authorities (ca.key) secret.
     """
     from datetime import UTC, datetime
 

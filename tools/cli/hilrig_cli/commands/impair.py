@@ -32,7 +32,9 @@ def impair(
     loss: Annotated[str, typer.Option(metavar="KIND:ARGS", help=f"Loss on both links: {LOSS_SYNTAX}.")] = "",
     trace: Annotated[
         Path | None,
-        typer.Option(metavar="RUN.MCAP", help="Delay the command link by the loop delays of this recording."),
+        typer.Option(
+            metavar="RUN.MCAP", help="Delay the command link by the delays outside the rig that this recording shows."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the delays and losses.")] = 1,
     off: Annotated[bool, typer.Option("--off", help="Remove the impairment.")] = False,

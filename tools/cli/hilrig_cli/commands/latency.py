@@ -31,9 +31,11 @@ def latency(
 ) -> None:
     """Measure loop latency and age of recordings: stages, percentiles, jitter, losses, and a diagnosis.
 
-    The loop latency is measured once per command, the age of the basis of the acting torque at every step.
+    The loop latency is measured once per command that took effect, the age of the basis of the acting torque at every
+    step.
 
-    Exit code 1: a recording is not valid for latency measurements; the reasons are printed.
+    Exit code 1: a recording is not valid for latency measurements, or one of several is unreadable; the reasons are
+    printed.
     """
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.isolation import isolated

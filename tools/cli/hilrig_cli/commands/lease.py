@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 def lease(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: all rigs of the lab.")] = "",
+    rig: Annotated[
+        str,
+        typer.Argument(metavar="RIG", help="Name of the rig; default: all rigs of the lab. Required with --release."),
+    ] = "",
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
     config: Config = None,
     as_json: AsJson = False,
