@@ -1,6 +1,7 @@
 """Automatic sub-steps compared with the event-driven reference: accuracy, impacts, and independence of the rigs."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hilrig_sim.accuracy import accuracy_warnings
 from hilrig_sim.arm.model import ArmParameters, PartParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.arm.stability import ERROR_BOUND, MAX_SUBSTEPS
 from hilrig_sim.plant.hard_stops import first_arrival
+from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG
 from hilrig_sim.plant.linear_joints import free_motion, move_between_stops
 from hilrig_sim.plant.plant import Plant
 from support.reference_plant import ReferenceArm
@@ -96,6 +98,31 @@ def test_quill_lands_at_the_time_of_the_reference(step_ns: int, surface: str) ->
         np.testing.assert_allclose(plant.velocity[2, 0], v[2], atol=1e-6)
     assert len(hits) == len(expected) == 1
     assert hits[0] == (0, pytest.approx(expected[0][1], rel=1e-6))
+
+
+@cache
+def dragged(step_ns: int) -> tuple[np.ndarray, int]:
+    """Return d3, m, of a tool that is dragged over the edge of a part, and the limit flags after the first step."""
+    part = PartParameters("a", "cylinder", (0.04, 0.04, 0.03), 0.2, True, "#808080", (0.6, 0.0, -0.045), 0.0)
+    plant = Plant([replace(rig(step_ns), scene=SceneParameters(parts=(part,)))])
+    plant.set_state(0, (0.0, 0.0, ARM.l1 + 0.03, 0.0), (0.0, 0.0, 0.0, 0.0))
+    effort = np.array([[6.0], [2.0], [10.0], [0.0]])
+    heights, first = [], plant.limit_flags[0]
+    for _ in range(160_000_000 // step_ns):
+        plant.step(effort, np.zeros(1, dtype=np.bool_))
+        heights.append(plant.position[2, 0])
+    return np.array(heights), first
+
+
+@pytest.mark.parametrize("step_ns", [20_000_000, 5_000_000, 1_000_000])
+def test_tool_falls_from_an_edge_when_it_leaves_it(step_ns: int) -> None:
+    found, flags = dragged(step_ns)
+    fine, _ = dragged(250_000)
+    every = step_ns // 250_000
+    np.testing.assert_allclose(found, fine[every - 1 :: every], atol=2e-5)
+    assert flags & TOOL_CONTACT_FLAG
+    assert found[0] == ARM.l1 + 0.03
+    assert found[-1] > 0.19
 
 
 def test_hours_of_random_torque_do_not_diverge() -> None:

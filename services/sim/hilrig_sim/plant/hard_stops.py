@@ -88,7 +88,7 @@ def first_arrival(
     # A joint that turns within the step may reach the stop that it moves toward first; else it may end beyond one.
     turns = start_rate * end_rate < 0
     turning = np.where(turns, _turning_point(start, end, start_rate, end_rate), 1.0)
-    farthest = np.where(turns, _cubic(start, end, start_rate, end_rate, turning), end)
+    farthest = np.where(turns, hermite(start, end, start_rate, end_rate, turning), end)
     toward_upper = np.where(turns, start_rate > 0, end > start)
     limit = np.where(toward_upper, upper, lower)
     before = np.where(toward_upper, farthest > limit, farthest < limit)
@@ -103,8 +103,8 @@ def first_arrival(
     return np.where(before | after, fraction, np.inf)
 
 
-def _cubic(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, fraction: Floats) -> Floats:
-    """Return the cubic Hermite interpolant at a fraction of the step."""
+def hermite(start: Floats, end: Floats, start_rate: Floats, end_rate: Floats, fraction: Floats) -> Floats:
+    """Return the cubic Hermite interpolant at a fraction of the step; the arguments are those of `crossing`."""
     distance = end - start
     cubic = start_rate + end_rate - 2 * distance
     square = 3 * distance - 2 * start_rate - end_rate

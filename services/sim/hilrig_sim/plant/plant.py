@@ -17,7 +17,7 @@ from hilrig_sim.arm.integrators import TABLEAUS, Tableau
 from hilrig_sim.arm.model import AUTO, RigParameters
 from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps
 from hilrig_sim.arm.stepping import FixedStep
-from hilrig_sim.plant.hard_stops import crossing, first_arrival, stop_outward
+from hilrig_sim.plant.hard_stops import crossing, first_arrival, hermite, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
 from hilrig_sim.plant.linear_joints import move_between_stops
 from hilrig_sim.plant.plane_solver import STEP_TOLERANCE, PlaneSolver
@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+EDGE_BISECTIONS: Final = 8
+"""Bisections of the time at which a tool leaves the edge of an object."""
 _TRUE: Final = b"\x01"
 _FALSE: Final = b"\x00"
 
@@ -93,6 +95,9 @@ class Plant:
         self._start_velocity = np.empty((4, count))
         self._limits = LimitFlags(self._stop[2])
         self._touching_plane = False
+        self._surface = np.empty(count)
+        """Upper stop of the quill at the start of the integration step, m, (N,)."""
+        self._leaving = np.zeros(count, dtype=np.bool_)
         self._work = np.empty((4, count))
         self._step_error = np.zeros((4, count))
         self._tolerance = np.empty((4, count))
@@ -300,8 +305,11 @@ class Plant:
         start_velocity[:] = velocity
         integrator.advance(position, velocity, effort, error)
         np.greater(position[2], self._free3, self._low)
+        leaves = False
         if any_true(self._low):
+            self._surface[:] = self._upper[2]
             self._find_contact()
+            leaves = self._limits.any and self._leaves_surface()
         np.absolute(error, error)
         np.less_equal(error, self._tolerance, accurate)
         np.greater(position, self._lower, above)
@@ -309,14 +317,14 @@ class Plant:
         # A joint that turned within the step may have reached a stop.
         np.multiply(start_velocity, velocity, self._work)
         np.greater_equal(self._work, 0.0, straight)
-        if self._touching_plane or _FALSE in regular.tobytes():
-            self._resolve(number, error, effort)
+        if leaves or self._touching_plane or _FALSE in regular.tobytes():
+            self._resolve(number, error, effort, leaves)
         elif self._limits.any:
             self._update_limits()
         if number:
             np.add(self.error, error, self.error)
 
-    def _resolve(self, number: int, error: Floats, effort: Floats) -> None:
+    def _resolve(self, number: int, error: Floats, effort: Floats, leaves: bool) -> None:
         """Repeat an integration step for the rigs that reach or leave a stop, or are not accurate enough."""
         position, velocity, lower, upper = self.position, self.velocity, self._lower, self._upper
         start, start_velocity = self._start_position, self._start_velocity
@@ -326,6 +334,8 @@ class Plant:
             repeat |= self._arrivals(~straight)
         if self._touching_plane:
             repeat[:2] |= (start[:2] <= lower[:2]) | (start[:2] >= upper[:2])
+        if leaves:
+            repeat[2] |= self._leaving
         if len(self._integrators) > 1:
             repeat &= number < self._base_substeps
         if not any_true(repeat):
@@ -338,6 +348,9 @@ class Plant:
             if any_true(self._low):
                 self._find_contact()
                 repeat[2] |= position[2] >= upper[2]
+                leaves = self._limits.any and self._leaves_surface()
+                if leaves:
+                    repeat[2] |= self._leaving
         linear = repeat[2:]
         if any_true(linear):
             # A joint that is pushed against its stop from rest stays there.
@@ -349,7 +362,11 @@ class Plant:
             linear &= ~rests
             if any_true(linear):
                 joint, rig = linear.nonzero()
-                self._resolve_linear(joint, rig, error, effort)
+                length = self._lengths[rig]
+                if leaves:
+                    leaving = (joint == 0) & self._leaving[rig]
+                    length[leaving] *= 1 - self._edge_fraction(rig[leaving])
+                self._resolve_linear(joint, rig, length, error, effort)
         self._update_limits()
 
     def _update_limits(self) -> None:
@@ -393,14 +410,37 @@ class Plant:
         for rig, joint, is_upper, speed in impacts:
             self._events.append(PlantEvent(PlantEventKind.LIMIT_HIT, rig, joint + 1, is_upper, speed))
 
-    def _resolve_linear(self, joint: Ints, rig: Ints, error: Floats, effort: Floats) -> None:
-        """Move joints 3 and 4, `joint` 0 and 1, of rigs by their closed form."""
+    def _leaves_surface(self) -> bool:
+        """Return whether a tool that rested on an object is above a lower one after the integration step."""
+        np.greater(self._upper[2], self._surface, self._leaving)
+        self._leaving &= (self._start_position[2] >= self._surface) & (self._start_velocity[2] == 0)
+        return any_true(self._leaving)
+
+    def _edge_fraction(self, rigs: Ints) -> Floats:
+        """Return the fraction of the integration step after which tools leave the object that they rested on, (K,)."""
+        world, dynamics, length = self.world, self.dynamics, self._lengths[rigs]
+        start, end = self._start_position[:, rigs], self.position[:, rigs]
+        rates = length * self._start_velocity[:, rigs], length * self.velocity[:, rigs]
+        held = world.held_height[rigs]
+        bottom = self._l1[rigs] - start[2] - held
+        low, high = np.zeros(rigs.size), np.ones(rigs.size)
+        for _ in range(EDGE_BISECTIONS):
+            middle = (low + high) / 2
+            theta1, theta2, _, theta4 = hermite(start, end, *rates, middle)
+            sum12 = theta1 + theta2
+            x = dynamics.l2[rigs] * np.cos(theta1) + dynamics.l3[rigs] * np.cos(sum12)
+            y = dynamics.l2[rigs] * np.sin(theta1) + dynamics.l3[rigs] * np.sin(sum12)
+            x, y = world.footprint_center(rigs, np.stack([x, y, start[2], sum12 + theta4]))
+            rests = self._l1[rigs] - held - world.contact(rigs, x, y, bottom) <= self._surface[rigs]
+            low, high = np.where(rests, middle, low), np.where(rests, high, middle)
+        return low
+
+    def _resolve_linear(self, joint: Ints, rig: Ints, length: Floats, error: Floats, effort: Floats) -> None:
+        """Move joints 3 and 4, `joint` 0 and 1, of rigs by their closed form for the last `length` of the step, s."""
         row = joint + 2
         start, lower, upper = self._start_position[row, rig], self._lower[row, rig], self._upper[row, rig]
         acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
-        motion = move_between_stops(
-            start, self._start_velocity[row, rig], acceleration, rate, lower, upper, self._lengths[rig]
-        )
+        motion = move_between_stops(start, self._start_velocity[row, rig], acceleration, rate, lower, upper, length)
         self.position[row, rig], self.velocity[row, rig] = motion.position, motion.velocity
         error[row, rig] = 0.0
         for index in np.flatnonzero(motion.side != 0).tolist():

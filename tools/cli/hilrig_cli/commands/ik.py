@@ -18,7 +18,7 @@ def ik(
     rig: Annotated[str, typer.Option(metavar="NAME", help="Rig of the lab; default: its first one.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Print every joint combination within the limits that reaches a pose, or the reason why there is none.
+    """Print every joint combination within the limits that reaches a pose, or the reason if there is no solution.
 
     Exit code 1: the pose cannot be reached.
     """
