@@ -20,6 +20,7 @@ from hilrig_cli.commands.figures import figures
 from hilrig_cli.commands.ik import ik
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
+from hilrig_cli.commands.join import join
 from hilrig_cli.commands.latency import latency
 from hilrig_cli.commands.lease import lease
 from hilrig_cli.commands.live import live
@@ -50,7 +51,7 @@ app = typer.Typer(
 PANELS = {
     "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs),
     "Run a single service": (sim, edge, recorder, router),
-    "Analyze recordings": (runs, latency, replay, compare, study, report, verify, figures, recover, play, export),
+    "Analyze recordings": (runs, latency, replay, compare, study, report, verify, figures, recover, join, play, export),
 }
 """Panels of the help, each with its commands."""
 
