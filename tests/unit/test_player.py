@@ -6,13 +6,16 @@ from itertools import islice
 
 import pytest
 
+from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_replay.export.player import Player, publish_recording, rig_config
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.bus.memory_bus import MemoryBus
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import JointState
-from hilrig_schemas.topics import RECORDED, STATE, parse_rig_key
+from hilrig_schemas.topics import RECORDED, STATE, STATES, parse_rig_key
 from support import recordings
 from support.labs import hilrig
 
@@ -95,6 +98,19 @@ def test_rename_changes_keys_and_messages(run: Run) -> None:
     assert {state.rig for state in states} == {"rig9"}
     assert [state.step for state in states] == [one.message.step for one in MADE if isinstance(one.message, JointState)]
     assert rig_config(run, "rig9").urdf == run.urdf
+
+
+def test_edge_follows_a_playback(run: Run) -> None:
+    # An edge receives the states of a simulation in batches only.
+    bus, clock = MemoryBus(), ManualClock()
+    states = LatestValueCache(clock, Counters(), {})
+    bus.subscribe_newest(STATES.key("lab", "*", "*"), states.on_message, 64)
+    publish_recording(bus, "lab", Player(run.file), clock, ManualEvent(clock), rename="rig9")
+    newest = states.get("rig9")
+    assert newest is not None
+    image = StateImage()
+    assert image.update(newest)
+    assert image.step == max(one.message.step for one in MADE if isinstance(one.message, JointState))
 
 
 def test_playback_stops_when_stopping_is_set(run: Run) -> None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from hilrig_monitoring.lab_view import LabView
+    from hilrig_schemas import Health
 
 REFRESH_S: Final = 0.5
 SERVICE_COLUMNS: Final = {
@@ -104,7 +105,7 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
             "overruns": str(health.overruns),
             "lost": str(health.lost_transport + health.lost_recorder),
             "queue": str(health.queue_depth),
-            "clock ms": f"{health.clock_offset_ns / 1e6:+.1f}" if health.clock_peer else "–",
+            "clock ms": _clock_text(health),
         }
         for service in view.services()
         for health in (service.health,)
@@ -159,3 +160,10 @@ def _table(
 
 def _or_dash(value_ms: float | None) -> str:
     return "–" if value_ms is None else f"{value_ms:.1f}"
+
+
+def _clock_text(health: "Health") -> str:
+    """Return the clock offset with its uncertainty; an offset within it is not known to differ from zero."""
+    if not health.clock_peer:
+        return "–"
+    return f"{health.clock_offset_ns / 1e6:+.1f}±{health.clock_uncertainty_ns / 1e6:.1f}"

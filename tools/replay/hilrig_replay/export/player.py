@@ -19,8 +19,8 @@ from hilrig_replay.io.run import Run
 from hilrig_runtime.bus.api import Bus, Publisher
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.timing.clock import Clock
-from hilrig_schemas import RigConfig
-from hilrig_schemas.topics import RECORDED
+from hilrig_schemas import RigBatch, RigConfig
+from hilrig_schemas.topics import RECORDED, STATE, STATES
 
 ALL_TOPICS: Final = frozenset(RECORDED)
 _REORDER_WINDOW_NS: Final = 1_000_000_000
@@ -128,12 +128,15 @@ def publish_recording(
 ) -> int:
     """Publish a recording's messages when they are due, until its end or until `stopping` is set; returns the count.
 
-    `rename` replaces the rig's name in keys and messages.
+    `rename` replaces the rig's name in keys and messages. As a simulation does, it publishes each state in a batch too,
+    which edges and the console follow.
     """
+    rig = player.rig if rename is None else rename
     start_ns = clock.monotonic_ns()
     count_sent = 0
     with ExitStack() as closing:
         publishers: dict[str, Publisher] = {}
+        batches = closing.enter_context(bus.publisher(STATES.key(lab, "sim", "play"), STATES.traffic))
         for scheduled in player:
             wait_ns = start_ns + scheduled.offset_ns - clock.monotonic_ns()
             if stopping.wait(wait_ns * 1e-9) if wait_ns > 0 else stopping.is_set():
@@ -141,12 +144,13 @@ def publish_recording(
             name, payload = scheduled.topic, scheduled.message.data
             topic = RECORDED[name]
             if name not in publishers:
-                rig = player.rig if rename is None else rename
                 publishers[name] = closing.enter_context(bus.publisher(topic.key(lab, rig), topic.traffic))
             if rename is not None:
-                message: Any = topic.decode(payload)
+                message: Any = topic.message.FromString(payload)
                 message.rig = rename
                 payload = message.SerializeToString()
+            if topic.name == STATE.name:
+                batches.put(RigBatch(source="sim/play", rigs=[rig], messages=[payload]).SerializeToString())
             publishers[name].put(payload)
             count_sent += 1
     return count_sent
