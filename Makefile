@@ -69,6 +69,7 @@ gen: .venv/dev ## generate code and documentation tables from their sources
 	$(BIN)/python scripts/generate_configuration.py
 	$(BIN)/hilrig registers --markdown > docs/registers.md
 	$(BIN)/python scripts/generate_conformance.py > docs/modbus-conformance.md
+	$(BIN)/python scripts/draw_grading.py
 
 bench: .venv/dev system ## run all benchmarks (up to one hour); writes docs/performance.md
 	$(BIN)/python bench/run_all.py

@@ -25,6 +25,12 @@ def rig(step_ns: int = 20_000_000, **sim: object) -> RigParameters:
     return RigParameters(sim=StepParameters(step_ns=step_ns, **sim), scene=NOTHING_BELOW)  # type: ignore[arg-type]
 
 
+def part_below_the_tool(level: int = 0) -> PartParameters:
+    """Return a part below the tool of a straight arm, on `level` others."""
+    z = 0.03 * level - 0.045
+    return PartParameters("abc"[level], "cylinder", (0.04, 0.04, 0.03), 0.2, True, "#808080", (0.6, 0.0, z), 0.0)
+
+
 def random_efforts(random: np.random.Generator, count: int) -> np.ndarray:
     signs = random.choice((-FULL, FULL), (4, count))
     return np.where(random.random(count) < 0.5, signs, random.uniform(-FULL, FULL, (4, count)))
@@ -76,14 +82,38 @@ def test_joint_that_leaves_its_stop_in_the_step_is_reported(substeps: int | str)
     assert events[0][2] == pytest.approx(speed, rel=0.01 if substeps != 1 else 0.1)
 
 
+@pytest.mark.parametrize("substeps", ["auto", 1])
+@pytest.mark.parametrize(
+    ("joint", "side", "stop"), [(2, 1, ARM.upper[2]), (2, -1, 0.0), (3, 1, ARM.upper[3]), (2, 1, ARM.l1 + 0.03)]
+)
+def test_linear_joint_that_leaves_its_stop_is_reported(joint: int, side: int, stop: float, substeps: int | str) -> None:
+    # The joint is near its stop, or the tool above a part, and turns outside within the step.
+    scene = SceneParameters(parts=(part_below_the_tool(),)) if stop == ARM.l1 + 0.03 else NOTHING_BELOW
+    plant, reference = Plant([replace(rig(substeps=substeps), scene=scene)]), ReferenceArm(ARM)
+    rate, force, distance = (0.4, 20.0, 0.0005) if joint == 2 else (4.0, 3.0, 0.005)
+    q, v, effort = np.array([0.0, 0.0, 0.1, 0.0]), np.zeros(4), np.array([0.0, 0.0, -4.9, 0.0])
+    q[joint], v[joint] = stop - side * distance, side * rate
+    effort[joint] -= side * force
+    plant.set_state(0, q, v)
+    events = plant.step(effort[:, np.newaxis], np.zeros(1, dtype=np.bool_))
+    found = [(hit.joint, hit.upper, hit.speed) for hit in events]
+    q, _ = reference.step(q, v, effort, 0.02, stop if joint == 2 and side > 0 else None)
+    ((number, upper, speed),) = reference.impacts
+    assert (q[joint] - stop) * side < -1e-6
+    assert found == [(0 if scene.parts else number, upper, pytest.approx(speed, rel=1e-6))]
+    assert plant.limit_flags == [0]
+    if substeps == "auto":
+        assert plant.position[joint, 0] == pytest.approx(q[joint], abs=1e-7)
+    assert not list(plant.step(effort[:, np.newaxis], np.zeros(1, dtype=np.bool_)))
+
+
 @pytest.mark.parametrize("step_ns", [20_000_000, 5_000_000, 1_000_000])
-@pytest.mark.parametrize("surface", ["table", "part"])
-def test_quill_lands_at_the_time_of_the_reference(step_ns: int, surface: str) -> None:
-    part = PartParameters("a", "cylinder", (0.04, 0.04, 0.03), 0.2, True, "#808080", (0.6, 0.0, -0.045), 0.0)
-    parts = (part,) if surface == "part" else ()
+@pytest.mark.parametrize("stacked", [0, 1, 2, 3])
+def test_quill_lands_at_the_time_of_the_reference(step_ns: int, stacked: int) -> None:
+    parts = tuple(part_below_the_tool(level) for level in range(stacked))
     scene = SceneParameters(parts=parts)
     plant = Plant([replace(rig(step_ns), scene=scene)])
-    upper3 = ARM.l1 + 0.06 - (0.03 if parts else 0.0)
+    upper3 = ARM.l1 + 0.06 - 0.03 * stacked
     q, v = np.array([0.0, 0.0, 0.05, 0.0]), np.zeros(4)
     plant.set_state(0, q, v)
     effort, reference = np.array([0.0, 0.0, 3.0, 0.0]), ReferenceArm(ARM)
@@ -103,8 +133,7 @@ def test_quill_lands_at_the_time_of_the_reference(step_ns: int, surface: str) ->
 @cache
 def dragged(step_ns: int) -> tuple[np.ndarray, int]:
     """Return d3, m, of a tool that is dragged over the edge of a part, and the limit flags after the first step."""
-    part = PartParameters("a", "cylinder", (0.04, 0.04, 0.03), 0.2, True, "#808080", (0.6, 0.0, -0.045), 0.0)
-    plant = Plant([replace(rig(step_ns), scene=SceneParameters(parts=(part,)))])
+    plant = Plant([replace(rig(step_ns), scene=SceneParameters(parts=(part_below_the_tool(),)))])
     plant.set_state(0, (0.0, 0.0, ARM.l1 + 0.03, 0.0), (0.0, 0.0, 0.0, 0.0))
     effort = np.array([[6.0], [2.0], [10.0], [0.0]])
     heights, first = [], plant.limit_flags[0]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import draw_grading
 from hilrig_replay.analysis.summary import summarize
 from hilrig_replay.grading.grade import Grade, Grader
 from hilrig_replay.grading.placement import PartPlacement, PlacementReport
@@ -408,3 +409,13 @@ def test_no_goal_is_reached_without_commands(tmp_path: Path) -> None:
     task = parse_lab("[[task.poses]]\nname = 'a'\nposition_mm = [300, 0, 0]\n").task
     (found,) = build_report([path], task=task).runs
     assert found["grade"]["score"] == 0
+
+
+def test_drawings_of_the_page_are_those_of_the_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    committed = draw_grading.IMAGES
+    monkeypatch.setattr(draw_grading, "IMAGES", tmp_path)
+    draw_grading.main()
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["grade-path.svg", "grade-pose.svg"]
+    for path in tmp_path.iterdir():
+        assert (committed / path.name).read_text() == path.read_text(), "run: make gen"
+        assert f"(images/{path.name})" in (committed.parent / "review.md").read_text()

@@ -282,6 +282,7 @@ def test_command_writes_all_result_files(tmp_path: Path) -> None:
     assert summary["runs"] == 6
     assert json.loads((out / "study.json").read_text()) == summary
     assert summary["controllers"][0]["settled_interval"] is None
+    assert summary["controllers"][0]["cost"] is None
     table = pyarrow.parquet.read_table(out / "runs.parquet")
     assert table.num_rows == 6
     # The page documents exactly the columns of the table.
@@ -306,7 +307,7 @@ def test_growing_error_is_not_settled(tmp_path: Path) -> None:
 def test_settled_share_of_random_runs_has_an_interval(tmp_path: Path) -> None:
     study = load(tmp_path, "runs = 4" + SMALL.replace("delay_ms", "jitter_ms"))
     found = sweep(study, tmp_path, lambda _: None, workers=1, theory=False)
-    low, high = settled_interval(study, found, 0) or (1.0, 0.0)
+    low, high = settled_interval(found, 0) or (1.0, 0.0)
     share = found.results["settled"].mean()
     assert low <= share <= high
     assert high - low > 0.1

@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
-from scipy.stats import binomtest
+from scipy.stats import binomtest, t
 
 from hilrig_replay.io.output_file import output_file
 from hilrig_sim.arm.joints import JOINT_NAMES
 from hilrig_sim.platform_fingerprint import machine_name
 from hilrig_study.study_config import StudyConfig
 from hilrig_study.sweep import CELL_DTYPE, SweepResult
+
+Floats = NDArray[np.float64]
 
 
 def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
@@ -33,13 +36,33 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
     return pa.table(columns)
 
 
-def settled_interval(study: StudyConfig, swept: SweepResult, controller: int) -> tuple[float, float] | None:
+def _is_random(swept: SweepResult, controller: int) -> bool:
+    return bool((swept.cells["run"][swept.cells["controller"] == controller] > 0).any())
+
+
+def settled_interval(swept: SweepResult, controller: int) -> tuple[float, float] | None:
     """Return the 95 % interval (Wilson) of the settled share of a controller; None: no run has random values."""
     rows = swept.cells["controller"] == controller
-    if study.runs == 1 or not (swept.cells["run"][rows] > 0).any():
+    if not _is_random(swept, controller):
         return None
     found = binomtest(int(swept.results["settled"][rows].sum()), int(rows.sum())).proportion_ci(method="wilson")
     return float(found.low), float(found.high)
+
+
+def cost_interval(study: StudyConfig, swept: SweepResult, controller: int) -> dict[str, Floats] | None:
+    """Return `mean` cost and `half_width` of its 95 % interval (Student) of each cell, (len(y), len(x)) each.
+
+    None: no run of the controller has random values. A cell with a run without a finite cost has no finite values.
+    """
+    if not _is_random(swept, controller):
+        return None
+    rows, cost = swept.cells["controller"] == controller, swept.results["cost"]
+    with np.errstate(invalid="ignore"):
+        mean = swept.plane(study, controller, cost)
+        deviation = cost - np.where(rows, mean[swept.cells["iy"], swept.cells["ix"]], 0.0)
+        variance = swept.plane(study, controller, deviation**2)
+    more = study.runs - 1
+    return {"mean": mean, "half_width": t.ppf(0.975, more) * np.sqrt(variance / more)}
 
 
 def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
@@ -47,6 +70,7 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
     controllers = []
     for number, controller in enumerate(study.controllers):
         settled = swept.plane(study, number, swept.results["settled"])
+        cost = cost_interval(study, swept, number)
         theory = [asdict(entry) for entry in swept.theory if entry.controller == number]
         for entry in theory:
             del entry["controller"]
@@ -55,7 +79,8 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
                 "name": controller.name,
                 "runs": int((swept.cells["controller"] == number).sum()),
                 "settled_share": float(settled.mean()),
-                "settled_interval": settled_interval(study, swept, number),
+                "settled_interval": settled_interval(swept, number),
+                "cost": cost and {name: np.round(values, 4).tolist() for name, values in cost.items()},
                 "theory": theory,
             }
         )

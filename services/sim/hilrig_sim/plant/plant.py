@@ -19,7 +19,7 @@ from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import crossing, first_arrival, hermite, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
-from hilrig_sim.plant.linear_joints import move_between_stops
+from hilrig_sim.plant.linear_joints import LinearMotion, move_between_stops
 from hilrig_sim.plant.plane_solver import STEP_TOLERANCE, PlaneSolver
 from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M
 from hilrig_sim.plant.world import ALL_RIGS, NO_PART, World
@@ -110,7 +110,7 @@ class Plant:
         self._plane = PlaneSolver(self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2])
         self._events: list[PlantEvent] = []
         self._left: list[PlantEvent] = []
-        """Impacts of joints 1 and 2 in the last integration step of fixed length."""
+        """Impacts in the last integration step of fixed length."""
         self.position[:] = np.array([arm.start for arm in self._arms]).T
         self._refresh_derived_state()
 
@@ -257,35 +257,57 @@ class Plant:
         self._integrator.advance(position, velocity, effort, self.error)
         if held:
             self.dynamics.release()
+        speed34, start_speed34 = velocity[2:], self._start_velocity[2:]
+        turned34 = start_speed34 * speed34 < 0
         np.greater(position[2], self._free3, self._low)
+        if any_true(turned34):
+            self._add_turned_tools(turned34[0])
         if any_true(self._low):
             self._find_contact()
         lower, upper = self._at_lower, self._at_upper
         np.less_equal(position, self._lower, lower)
         np.greater_equal(position, self._upper, upper)
+        lower34, upper34 = lower[2:], upper[2:]
         at_lower, at_upper = lower.tobytes(), upper.tobytes()
-        if not (_TRUE in at_lower or _TRUE in at_upper):
+        at_limit = _TRUE in at_lower or _TRUE in at_upper
+        self._left.clear()
+        moving34 = turned34 | ((lower34 | upper34) & (start_speed34 != 0)) if at_limit else turned34
+        if any_true(moving34):
+            joint, rig = moving34.nonzero()
+            self._left += self._linear_motion(joint, rig, self._lengths[rig], effort)[1]
+        if not at_limit:
             if self._limits.any:
                 self._touching_plane = False
                 self._limits.update(self._at_lower, self._at_upper, self._upper[2], None, self._events)
+            self._events += self._left
             return
-        impact_velocity = velocity.copy()
         plane = 2 * self.count
         self._touching_plane = _TRUE in at_lower[:plane] or _TRUE in at_upper[:plane]
-        self._left.clear()
+        impact_velocity = velocity.copy()
         if self._touching_plane:
-            self._impact(effort, impact_velocity)
+            self._impact(effort)
             np.less_equal(position, self._lower, lower)
             np.greater_equal(position, self._upper, upper)
         # Joints 3 and 4 are decoupled: an impact sets their position to the limit.
         np.maximum(position, self._lower, out=position)
         np.minimum(position, self._upper, out=position)
-        speed34, lower34, upper34 = velocity[2:], lower[2:], upper[2:]
         np.maximum(speed34, 0.0, out=speed34, where=lower34)
         np.minimum(speed34, 0.0, out=speed34, where=upper34)
+        # A joint that is not at its stop at the end of the step has left it.
+        left = []
+        for hit in self._left:
+            row = (hit.joint or 3) - 1
+            if (upper if hit.upper else lower)[row, hit.rig]:
+                impact_velocity[row, hit.rig] = hit.speed
+            else:
+                left.append(hit)
         self._limits.update(lower, upper, self._upper[2], impact_velocity, self._events)
-        # Joints that left their stop before the end of the step.
-        self._events += [hit for hit in self._left if not (upper if hit.upper else lower)[hit.joint - 1, hit.rig]]
+        self._events += left
+
+    def _add_turned_tools(self, turned: Bools) -> None:
+        """Add to `_low` the tools that turned, (N,), and may have touched an object within the integration step."""
+        # While it turns, a tool moves less than with its speed at the start.
+        self._low |= turned & (self._start_position[2] + self._lengths * self._start_velocity[2] > self._free3)
 
     def _steppers(self) -> list[FixedStep]:
         """Return the integrator of each integration step of a step; a rig with fewer of them has a length of zero."""
@@ -304,7 +326,12 @@ class Plant:
         start_velocity = self._start_velocity
         start_velocity[:] = velocity
         integrator.advance(position, velocity, effort, error)
+        # A joint that turned within the step may have reached a stop.
+        np.multiply(start_velocity, velocity, self._work)
+        np.greater_equal(self._work, 0.0, straight)
         np.greater(position[2], self._free3, self._low)
+        if _FALSE in straight[2].tobytes():
+            self._add_turned_tools(~straight[2])
         leaves = False
         if any_true(self._low):
             self._surface[:] = self._upper[2]
@@ -314,9 +341,6 @@ class Plant:
         np.less_equal(error, self._tolerance, accurate)
         np.greater(position, self._lower, above)
         np.less(position, self._upper, below)
-        # A joint that turned within the step may have reached a stop.
-        np.multiply(start_velocity, velocity, self._work)
-        np.greater_equal(self._work, 0.0, straight)
         if leaves or self._touching_plane or _FALSE in regular.tobytes():
             self._resolve(number, error, effort, leaves)
         elif self._limits.any:
@@ -438,18 +462,26 @@ class Plant:
     def _resolve_linear(self, joint: Ints, rig: Ints, length: Floats, error: Floats, effort: Floats) -> None:
         """Move joints 3 and 4, `joint` 0 and 1, of rigs by their closed form for the last `length` of the step, s."""
         row = joint + 2
-        start, lower, upper = self._start_position[row, rig], self._lower[row, rig], self._upper[row, rig]
-        acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
-        motion = move_between_stops(start, self._start_velocity[row, rig], acceleration, rate, lower, upper, length)
+        motion, hits = self._linear_motion(joint, rig, length, effort)
         self.position[row, rig], self.velocity[row, rig] = motion.position, motion.velocity
         error[row, rig] = 0.0
+        self._events += hits
+
+    def _linear_motion(
+        self, joint: Ints, rig: Ints, length: Floats, effort: Floats
+    ) -> tuple[LinearMotion, list[PlantEvent]]:
+        """Return the closed-form motion of joints 3 and 4 from the start of the integration step, and the impacts."""
+        row, upper = joint + 2, self._upper[joint + 2, rig]
+        start, lower = self._start_position[row, rig], self._lower[row, rig]
+        acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
+        motion = move_between_stops(start, self._start_velocity[row, rig], acceleration, rate, lower, upper, length)
+        hits = []
         for index in np.flatnonzero(motion.side != 0).tolist():
             number, is_upper = int(rig[index]), bool(motion.side[index] > 0)
             below = is_upper and joint[index] == 0 and upper[index] < self._stop[2, number]
-            hit = PlantEvent(
-                PlantEventKind.LIMIT_HIT, number, 0 if below else int(row[index]) + 1, is_upper, motion.speed[index]
-            )
-            self._events.append(hit)
+            hit = 0 if below else int(row[index]) + 1
+            hits.append(PlantEvent(PlantEventKind.LIMIT_HIT, number, hit, is_upper, motion.speed[index]))
+        return motion, hits
 
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 that are pressed against a stop at the start of a step; return whether any is."""
@@ -484,8 +516,8 @@ class Plant:
         below = world.contact(rigs, x, y, bottom)
         self._upper[2, rigs] = np.minimum(self._stop[2, rigs], self._l1[rigs] - world.held_height[rigs] - below)
 
-    def _impact(self, effort: Floats, impact_velocity: Floats) -> None:
-        """Stop joints 1 and 2 at their limits, at the time of the impact, and set `impact_velocity`, (4, N), there."""
+    def _impact(self, effort: Floats) -> None:
+        """Stop joints 1 and 2 at their limits, at the time of the impact."""
         position, velocity = self.position, self.velocity
         beyond = (position[:2] < self._lower[:2]) | (position[:2] > self._stop[:2])
         if any_true(beyond):
@@ -512,7 +544,6 @@ class Plant:
             side = _sides(plane, self._lower[:, rigs], self._stop[:, rigs])
             for joint, column in np.argwhere(hitting & (side * plane_rate[:2] > 0)).tolist():
                 rig, rate = int(rigs[column]), float(plane_rate[joint, column])
-                impact_velocity[joint, rig] = rate
                 self._left.append(PlantEvent(PlantEventKind.LIMIT_HIT, rig, joint + 1, rate > 0, abs(rate)))
             self._stop_plane(dynamics, plane, plane_rate, side)
             # The remainder of the step starts at the stop, pressed against it or leaving it.

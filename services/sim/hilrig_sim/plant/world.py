@@ -240,13 +240,25 @@ class World:
             # The lowest part first: parts above it stop on its new position.
             rows = np.flatnonzero(self._falling[:, rig]).tolist()
             for row in sorted(rows, key=lambda row: self._bottom(row, rig)):
+                speed = self._fall_speed[row, rig] + GRAVITY * duration
                 self._fall(row, rig, duration)
-                if something_falls:
+                if something_falls and not self._falling[row, rig]:
                     # The part below it may be falling itself.
                     self._falling[row, rig] = True
+                    if self._ballistic:
+                        self._fall_speed[row, rig] = min(speed, self._support_speed(row, rig))
                 something_falls |= bool(self._falling[row, rig])
             self._refresh_highest(np.array([rig]))
         self.falling = bool(self._falling.any())
+
+    def _support_speed(self, row: int, rig: int) -> float:
+        """Return the speed, m/s, at which the parts below a part fall; 0 if it is on another surface."""
+        dx, dy = self.x[:, rig] - self.x[row, rig], self.y[:, rig] - self.y[row, rig]
+        top = self.z[:, rig] + self.half_height[:, rig]
+        below = np.hypot(dx, dy) < self._radius[:, rig] + self._radius[row, rig]
+        below &= np.abs(top - self._bottom(row, rig)) <= CONTACT_TOLERANCE_M
+        below[self.held[rig]] &= self.held[rig] == NO_PART
+        return float(self._fall_speed[below, rig].min()) if below.any() else 0.0
 
     def _fall(self, row: int, rig: int, duration: float) -> None:
         drift = self._drift[:, row, rig]
