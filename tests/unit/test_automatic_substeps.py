@@ -114,12 +114,12 @@ def test_quill_lands_at_the_time_of_the_reference(step_ns: int, stacked: int) ->
     scene = SceneParameters(parts=parts)
     plant = Plant([replace(rig(step_ns), scene=scene)])
     upper3 = ARM.l1 + 0.06 - 0.03 * stacked
-    q, v = np.array([0.0, 0.0, 0.05, 0.0]), np.zeros(4)
+    q, v = np.array([0.0, 0.0, upper3 - 0.03, 0.0]), np.zeros(4)
     plant.set_state(0, q, v)
     effort, reference = np.array([0.0, 0.0, 3.0, 0.0]), ReferenceArm(ARM)
     hits: list[tuple[int, float]] = []
     expected: list[tuple[int, float]] = []
-    for _ in range(round(0.2e9 / step_ns)):
+    for _ in range(round(0.12e9 / step_ns)):
         events = plant.step(effort[:, np.newaxis], np.zeros(1, dtype=np.bool_))
         hits += [(event.joint, event.speed) for event in events]
         q, v = reference.step(q, v, effort, step_ns * 1e-9, upper3)

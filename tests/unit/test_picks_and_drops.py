@@ -165,13 +165,15 @@ def test_part_released_in_motion_lands_on(target: str, step_ns: int) -> None:
 def test_held_part_lands_on_a_stack_at_the_time_of_the_reference(stacked: int, step_ns: int) -> None:
     parts = [part("bcd"[level], 0.5, 0.0, TABLE + level * HEIGHT) for level in range(stacked)]
     plant = Plant([rig(step_ns, part("a", 0.0, 0.4, TABLE), *parts)])
-    q, v = np.array(kinematics.inverse(ARM, (0.51, 0.0, 0.13, 0.0))[0]), np.zeros(4)
-    poses = [(0.51, 0.0, 0.13 - HEIGHT / 2, 0.0), *((*one.position, one.yaw) for one in parts)]
+    top = TABLE + stacked * HEIGHT
+    start = top + HEIGHT + 0.02
+    q, v = np.array(kinematics.inverse(ARM, (0.51, 0.0, start, 0.0))[0]), np.zeros(4)
+    poses = [(0.51, 0.0, start - HEIGHT / 2, 0.0), *((*one.position, one.yaw) for one in parts)]
     plant.set_state(0, q, v, poses, 0)
     reference, effort, hits, expected = ReferenceArm(ARM, MASS), np.zeros(4), [], []
-    for _ in range(round(0.3e9 / step_ns)):
+    for _ in range(round(0.12e9 / step_ns)):
         hits += [(event.joint, event.speed) for event in plant.step(effort[:, np.newaxis], ON)]
-        q, v = reference.step(q, v, effort, step_ns * 1e-9, ARM.l1 - TABLE - (stacked + 1) * HEIGHT)
+        q, v = reference.step(q, v, effort, step_ns * 1e-9, ARM.l1 - top - HEIGHT)
         expected += [(0, pytest.approx(speed, rel=1e-6)) for _, _, speed in reference.impacts]
         np.testing.assert_allclose(plant.position[2, 0], q[2], atol=1e-8)
         assert plant.world.z[0, 0] == pytest.approx(ARM.l1 - q[2] - HEIGHT / 2, abs=1e-8)
