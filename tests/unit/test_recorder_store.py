@@ -1,9 +1,11 @@
 """Alerts of the recorder's file store: a slow disk is reported once, until it is fast again."""
 
+import errno
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from hilrig_recorder.ingest.recording import Recording
 from hilrig_recorder.storage.store import SLOW_SYNC_S, FileStore
 from hilrig_runtime.config.lab import RecorderConfig
 from hilrig_runtime.timing.clock import ManualClock
@@ -58,3 +60,20 @@ def test_resumed_recorder_does_not_report_a_slow_disk(tmp_path: Path) -> None:
     for now_ms in range(18_000, 20_000, 100):
         store.tick(now_ms * 1_000_000)
     assert "slow disk" in store.alert
+
+
+def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
+    sync_worker: Any = SimpleNamespace(sync_delay_s=0.0, follow=lambda _: None, finish=lambda *_: None)
+    store = make_store(tmp_path, sync_worker, [])
+    recording = Recording("rig1", "s", "", "edge/1", 1, 0, store)
+    assert store.open(recording)
+    folder, moved = tmp_path / "lab" / "rig1", tmp_path / "moved"
+    assert [path.name for path in folder.iterdir()] == ["s.mcap.part"]
+    # The folder is replaced while the file is open, writing fails, and the session continues in another file.
+    folder.rename(moved)
+    next(iter(store._files.values())).fail(OSError(errno.EIO, "Input/output error"))
+    store.tick(0)
+    assert store.open(recording)
+    assert [path.name for path in folder.iterdir()] == ["s.2.mcap.part"]
+    store.close(recording, "ended", "")
+    store.release()

@@ -75,6 +75,8 @@ class FileStore:
         self._finishing: dict[RecordingWriter, Recording] = {}
         self._last_tick_ns = clock.monotonic_ns()
         self._speed_valid_ns = 0
+        self._newest: dict[Recording, str] = {}
+        """Name of the newest segment of each session: its folder may be replaced, and restored later."""
         self._alerts: dict[str, str] = {}
         self._reserve = DiskReserve(self.folder, instance, config.min_free_mib)
         self._space_due_ns = 0
@@ -118,6 +120,7 @@ class FileStore:
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
         """Finish the file of a recording in the background."""
+        self._newest.pop(recording, None)
         file = self._files.pop(recording, None)
         if file is not None:
             self._finish(file, end, reason)
@@ -192,7 +195,7 @@ class FileStore:
     def _next_segment(self, recording: Recording, after: str = "") -> NextSegment | None:
         folder = self.folder / recording.rig
         try:
-            return next_segment(folder, recording.session, after)
+            return next_segment(folder, recording.session, after or self._newest.get(recording, ""))
         except OSError as error:
             self._report(recording, f"{folder}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
@@ -205,6 +208,7 @@ class FileStore:
         except OSError as error:
             self._report(recording, f"{segment.path}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
+        self._newest[recording] = segment.path.name
         file = self._files[recording] = SegmentFile(recording, writer, self._clock, self._on_failure)
         self._sync_worker.follow(writer)
         self._request_config(recording.rig)
