@@ -15,8 +15,8 @@ REQUEST_TIMEOUT_S: Final = 10.0
 """Time in which a request, header and body, must be received."""
 MAX_CONNECTIONS: Final = 512
 """Maximum number of connections; below the usual soft limit of open files."""
-MAX_CONNECTIONS_PER_HOST: Final = 64
-"""Maximum number of connections of one host; a browser opens six."""
+MAX_CONNECTIONS_PER_HOST: Final = 256
+"""Maximum number of connections of one host, which may be a proxy of all browsers."""
 
 
 class LimitedProtocol(H11Protocol):
