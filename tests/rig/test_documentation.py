@@ -33,6 +33,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
     "hilrig jitter": "tests/rig/test_jitter.py",
+    "hilrig join": "tests/unit/test_join.py",
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
     "hilrig study examples/": "tests/rig/test_study_live.py",

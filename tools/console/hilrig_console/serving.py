@@ -15,9 +15,11 @@ import uvicorn
 from hilrig_console.app import Console
 from hilrig_console.auth import HEALTH_PATH, AccessPolicy
 from hilrig_console.catalog import RecordingCatalog
+from hilrig_console.http_limits import LimitedProtocol
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError, listen_failure
+from hilrig_runtime.process.lifecycle import allow_open_files
 
 SHUTDOWN_GRACE_S: Final = 1
 """Time limit for downloads to finish on shutdown, s."""
@@ -105,6 +107,7 @@ class ConsoleServer:
     ) -> None:
         if tls is not None:
             tls.check()
+        allow_open_files()
         self._socket = address.open_socket()
         self.url = address.url(self._socket.getsockname()[1], "http" if tls is None else "https")
         self._subscriber = LabSubscriber(lab)
@@ -112,6 +115,7 @@ class ConsoleServer:
         self._console = Console(self._subscriber, self._catalog, policy)
         config = uvicorn.Config(
             self._console.app,
+            http=LimitedProtocol,
             log_config=None,
             access_log=False,
             server_header=False,

@@ -214,7 +214,9 @@ class AgeTable:
         if len(holds):
             limit_ns = MAX_PERIOD_RATIO * median(holds.column("ns"))
             regular = np.array([(held.sum(), len(held)) for held in _up_to(limit_ns, holds.column("ns"))])
-            period_ns = float(regular[:, 0].sum() / regular[:, 1].sum())
+            # Impossible timestamps of a forged recording leave no regular period.
+            if regular[:, 1].sum():
+                period_ns = float(regular[:, 0].sum() / regular[:, 1].sum())
             longest_ns = max(longest_ns, *(int(held.max()) for held in holds.column("ns")()))
         return LoopAge(
             age_ms=Statistics.of(self.ages_ns),
