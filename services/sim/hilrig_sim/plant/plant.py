@@ -260,10 +260,15 @@ class Plant:
         speed34, start_speed34 = velocity[2:], self._start_velocity[2:]
         turned34 = start_speed34 * speed34 < 0
         np.greater(position[2], self._free3, self._low)
-        if any_true(turned34):
+        turns = any_true(turned34)
+        if turns:
             self._add_turned_tools(turned34[0])
         if any_true(self._low):
             self._find_contact()
+        if turns:
+            # While it turns, a joint moves less than with its speed at the start.
+            reach = self._start_position[2:] + self._lengths * start_speed34
+            turned34 &= (reach < self._lower[2:]) | (reach > self._upper[2:])
         lower, upper = self._at_lower, self._at_upper
         np.less_equal(position, self._lower, lower)
         np.greater_equal(position, self._upper, upper)
