@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -20,17 +21,20 @@ from support.waiting import eventually
 HILRIG = [sys.executable, "-m", "hilrig_cli"]
 
 
+PORTS = range(10_000, 32_000)
+"""Below the ports that the system gives to outgoing connections: those of other tests could take a port that is probed
+now and used by a lab later."""
+
+
 def free_ports(count: int) -> int:
     """First of `count` consecutive ports that are free on loopback."""
     while True:
-        with closing(socket.socket()) as probe:
-            probe.bind(("127.0.0.1", 0))
-            first: int = probe.getsockname()[1]
+        first = random.SystemRandom().choice(PORTS)
         try:
             for port in range(first, first + count):
                 with closing(socket.socket()) as probe:
                     probe.bind(("127.0.0.1", port))
-        except (OSError, OverflowError):
+        except OSError:
             continue
         return first
 
