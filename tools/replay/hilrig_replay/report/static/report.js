@@ -22,7 +22,7 @@ function floats(text) {
   return new Float32Array(bytes(text).buffer);
 }
 
-// Index of the last value that is not larger than `wanted`; 0 if there is none.
+// Index of the last value that is not larger than `wanted`; 0: all are larger.
 function indexAt(values, wanted) {
   let low = 0, high = values.length;
   while (low < high) {
