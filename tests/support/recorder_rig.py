@@ -259,7 +259,7 @@ def times(name: str, default: int) -> int:
 
 
 def main() -> None:
-    """Run senders as a program: reads `begin`, `end` and `emit RIG` from standard input, then writes what was sent."""
+    """Run senders as a program: reads `begin`, `end` and `emit RIG` from standard input, then writes the messages."""
     lab, out = load_lab(Path(sys.argv[1])), Path(sys.argv[2])
     with sending(lab, [rig.name for rig in lab.rigs]) as senders:
         for line in sys.stdin:

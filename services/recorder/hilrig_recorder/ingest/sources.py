@@ -87,7 +87,7 @@ class PublisherState:
         return missing, stepped
 
     def next_events(self) -> LogBatch | None:
-        """Remove and return the next batch of events whose turn has come; None: there is none."""
+        """Remove and return the next batch of events that may be processed; None: it must wait."""
         return self.held.popleft().batch if self.held and self.held[0].batch.sequence < self._next_batch else None
 
     def is_before_first(self, events: LogBatch) -> bool:
