@@ -66,7 +66,7 @@ class Connection(asyncio.Protocol):
         self._pending = b""
         """Received bytes that are not executed yet: more requests than one turn executes, or an incomplete one."""
         self._arrived_ns = self._received_ns = 0
-        """Of the newest bytes: arrival at this process and the kernel's receive timestamp of a write; 0: unavailable."""
+        """Of the newest requests: arrival at this process, and the kernel's receive timestamp; 0: unavailable."""
         self._draining = False
         """Whether reading is paused until the pending requests are executed, in further turns."""
         self._blocked = False

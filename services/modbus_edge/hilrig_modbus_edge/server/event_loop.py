@@ -27,10 +27,10 @@ ACCEPT_RETRY_S: Final = 1.0
 """Pause after a connection could not be accepted, s."""
 
 _RECEIVE_BYTES: Final = 448
-"""Maximum number of bytes that are received in one turn. Python allocates an object of up to 512 bytes 0.1 µs faster."""
+"""Maximum number of bytes of one call. Python allocates an object of up to 512 bytes 0.1 µs faster."""
 _MS: Final = 0.001
 _SO_TIMESTAMPNS: Final = 35
-"""Number of the socket option on Linux, which the module `socket` has no name for: stamp received data in the kernel."""
+"""Number of the socket option on Linux that stamps received data; the module `socket` has no name for it."""
 _TIMESPEC: Final = struct.Struct("=qq")
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size) if hasattr(socket, "CMSG_SPACE") else 0
 _Args = TypeVarTuple("_Args")
