@@ -47,7 +47,7 @@ class OutageDetector:
         self._valid_ns = 0
         """Begin of the time in which this process could receive messages."""
         self._since_ns: int | None = None
-        """Arrival of the last message before the outage; None: there is none."""
+        """Arrival of the last message before the outage; None: no outage."""
         self._back_ns: int | None = None
         """Arrival of the first message after it, if no other interruption followed."""
         self._ended_ns = -STEADY_NS
@@ -104,7 +104,7 @@ class OutageLog:
             self._pending.setdefault(event.kind, []).append(event)
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Log what was collected, if that is due; ns, monotonic clock."""
+        """Log the collected events, if that is due; ns, monotonic clock."""
         for kind in [kind for kind in self._pending if now_ns >= self._due_ns[kind]]:
             events = self._pending.pop(kind)
             self._due_ns[kind] = now_ns + OUTAGE_LOG_PERIOD_NS
@@ -114,7 +114,7 @@ class OutageLog:
 
 
 def describe_outage(what: str, outage: Outage, wall_offset_ns: int) -> str:
-    """Return the text of an event: since when, what is missing, until when.
+    """Return the text of an event: the missing messages, and begin or end of the outage.
 
     Args:
         what: the missing messages, in the plural.
