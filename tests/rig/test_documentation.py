@@ -32,6 +32,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
+    "hilrig grade": "tests/unit/test_classroom_grades.py",
     "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig join": "tests/unit/test_join.py",
     "hilrig play": "tests/rig/test_recorder_play.py",

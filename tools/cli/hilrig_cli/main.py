@@ -17,6 +17,7 @@ from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
 from hilrig_cli.commands.export import export
 from hilrig_cli.commands.figures import figures
+from hilrig_cli.commands.grade import grade
 from hilrig_cli.commands.ik import ik
 from hilrig_cli.commands.impair import impair
 from hilrig_cli.commands.jitter import jitter
@@ -51,7 +52,21 @@ app = typer.Typer(
 PANELS = {
     "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs),
     "Run a single service": (sim, edge, recorder, router),
-    "Analyze recordings": (runs, latency, replay, compare, study, report, verify, figures, recover, join, play, export),
+    "Analyze recordings": (
+        runs,
+        latency,
+        replay,
+        compare,
+        study,
+        report,
+        grade,
+        verify,
+        figures,
+        recover,
+        join,
+        play,
+        export,
+    ),
 }
 """Panels of the help, each with its commands."""
 

@@ -1,0 +1,1 @@
+"""Classroom: roster, assignments, grades and gradebooks of a class. Reads recordings only; no service needs it."""
