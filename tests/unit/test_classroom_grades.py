@@ -47,7 +47,7 @@ def classroom(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def grade(classroom: Path, out: Path, student: str = "") -> dict[str, Any]:
     roster = read_roster(classroom / "roster.csv")
-    return GradeFolder(out, classroom / "runs", load_assignment(classroom / "a"), roster).grade(student)
+    return GradeFolder(out, classroom / "runs", load_assignment(classroom / "a"), roster, workers=1).grade(student)
 
 
 @pytest.fixture(scope="module")

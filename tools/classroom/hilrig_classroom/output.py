@@ -25,15 +25,28 @@ Progress = Callable[[float], None]
 
 
 class GradeFolder:
-    """The results of one assignment in a folder, which is created if it is missing."""
+    """The results of one assignment in a folder, which is created if it is missing.
 
-    def __init__(self, out: Path, folder: Path, assignment: Assignment, roster: Roster, *, names: bool = False) -> None:
+    `workers` is the number of processes; None: one per core.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        folder: Path,
+        assignment: Assignment,
+        roster: Roster,
+        *,
+        names: bool = False,
+        workers: int | None = None,
+    ) -> None:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; expected the folder with the recordings of the class")
         self._out = out
         self._folder = folder
         self._assignment = assignment
         self._roster = roster
+        self._workers = workers
         self._page_names = {student.id: f"{_file_name(student, names)}.html" for student in roster.students}
         try:
             (out / PAGES).mkdir(parents=True, exist_ok=True)
@@ -57,6 +70,7 @@ class GradeFolder:
             self._roster,
             overrides=read_overrides(overrides),
             only=student,
+            workers=self._workers,
             on_progress=on_progress,
         ).as_dict()
         if student:
@@ -100,6 +114,7 @@ class GradeFolder:
             self._assignment,
             students,
             self._page_names,
+            workers=self._workers,
             on_progress=on_progress,
         )
 
