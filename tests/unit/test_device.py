@@ -1,5 +1,6 @@
 """Unit tests of `Device` with a manual clock and states of the test."""
 
+import re
 import struct
 
 import pytest
@@ -17,6 +18,7 @@ from hilrig_modbus_edge.registers.map import (
     Status,
     address_of,
 )
+from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
@@ -360,7 +362,47 @@ def test_denials_are_reported_once_per_second_with_count(bench: Bench) -> None:
             bench.write(other, 0, 6)
     refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
     assert len(refusals) == 2
-    assert "(67 times)" in refusals[1]
+    assert "(66 times)" in refusals[1]
+    bench.wait(1000)
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert "(33 times)" in refusals[2]
+
+
+def test_denials_of_a_session_are_not_counted_in_the_next(bench: Bench) -> None:
+    """The first client is refused 30 times; minutes later, in another session, a second one is refused once."""
+    for refused in (30, 1):
+        holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+        bench.write(holder, 0, 5)
+        session = bench.device.session
+        for _ in range(refused):
+            with pytest.raises(ModbusError):
+                bench.write(other, 0, 6)
+        bench.device.disconnect(other, "done")
+        bench.device.disconnect(holder, "done")
+        # The session ends within the period of the report.
+        bench.device.stop("the edge stops")
+        refusals = [event for event in bench.events if event.kind == Event.LEASE_REFUSED]
+        counts = [int(found[1]) if (found := re.search(r"\((\d+) times\)", one.text)) else 1 for one in refusals]
+        assert counts == [1, 29][:refused]
+        assert session is not None
+        assert {one.session for one in refusals} == {session.id}
+        bench.events.clear()
+
+
+def test_denials_are_counted_per_cause(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    observer = bench.connect(host="10.0.0.2", may_write=False)
+    bench.write(holder, 0, 5)
+    for client in (other, observer, other, observer, observer):
+        with pytest.raises(ModbusError):
+            bench.write(client, 0, 6)
+    for _ in range(10):
+        bench.write(holder, 0, 5)
+        bench.wait(100)
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert ["read-only" in text for text in refusals] == [False, True, False, True]
+    assert "times" not in "".join(refusals[:3])
+    assert refusals[3].endswith("(2 times)")
 
 
 def test_denials_of_new_connections_are_limited_per_host(bench: Bench) -> None:
@@ -373,8 +415,8 @@ def test_denials_of_new_connections_are_limited_per_host(bench: Bench) -> None:
         bench.device.disconnect(other, "done")
     refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
     assert len(refusals) == 2
-    assert "10.0.0.2:67: write to rig1 denied" in refusals[1]
-    assert "(67 times)" in refusals[1]
+    assert "10.0.0.2:66: write to rig1 denied" in refusals[1]
+    assert "(66 times)" in refusals[1]
 
 
 def one_shot(bench: Bench, port: int, host: str = "10.0.0.1") -> int:
@@ -617,6 +659,48 @@ def test_trip_event_has_the_cause(bench: Bench) -> None:
     bench.device.disconnect(client, "connection closed by the client")
     bench.wait(1000)
     assert "10.0.0.1:1000 no longer holds the lease" in trip_text()
+
+
+def test_another_controller_takes_lease_after_trip(bench: Bench) -> None:
+    """A program that wrote once and only polls does not keep the rig."""
+    polls, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(polls, 0, 5)
+    for _ in range(9):
+        bench.wait(100)
+        bench.read(polls, 4, 4)
+        with pytest.raises(ModbusError):
+            bench.write(other, 0, 6)
+    bench.wait(100)
+    assert bench.device.watchdog.tripped
+    bench.read(polls, 4, 4)
+    bench.write(other, 0, 6)
+    assert bench.device.lease.holder is other.controller
+    assert not bench.device.watchdog.tripped
+    lost = next(event for event in bench.events if event.kind == Event.LEASE_LOST)
+    assert lost.controller_data.controller == polls.address
+    assert "the watchdog has tripped, and 10.0.0.2:1000 writes" in lost.text
+    assert bench.kinds().count("SESSION_START") == 2
+    with pytest.raises(ModbusError):
+        bench.write(polls, 0, 7)
+
+
+def test_holder_that_writes_keeps_lease_on_lossy_link() -> None:
+    """The watchdog trips because the emulated network drops each write."""
+    bench = Bench(impairment=ImpairmentConfig.model_validate({"command": {"loss": "bernoulli 100"}}))
+    bench.state(1)
+    bench.device.start()
+    writes, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(writes, 0, 5)
+    bench.device.watchdog.feed(bench.clock.monotonic_ns())
+    for _ in range(30):
+        bench.wait(50)
+        bench.write(writes, 0, 5)
+    assert bench.device.watchdog.tripped
+    with pytest.raises(ModbusError):
+        bench.write(other, 0, 6)
+    bench.wait(1000)
+    bench.write(other, 0, 6)
+    assert bench.device.lease.holder is other.controller
 
 
 def test_next_write_rearms_the_watchdog(bench: Bench) -> None:

@@ -18,10 +18,12 @@ from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
 from hilrig_runtime.process.service import Service
-from hilrig_schemas import Event, RigReport, topics
+from hilrig_schemas import Event, ExceptionCount, RigReport, topics
 
 REQUEST_LOG_PERIOD_NS: Final = 200_000_000
 """Period at which the request log of a rig is published, ns."""
+CHECK_PERIOD_NS: Final = 500_000_000
+"""Period at which the connections are checked, ns."""
 TCP_FIGURES_PERIOD_NS: Final = 1_000_000_000
 """Period at which the TCP figures of the connections are recorded, ns."""
 
@@ -90,6 +92,7 @@ class RigEndpoint:
         self.request_log_due_ns = 0
         """Time at which the request log is published next, ns, monotonic clock."""
         self._tcp_figures_due_ns = 0
+        self._check_due_ns = 0
         self._sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
 
     def bind(self, port: int, tls_port: int | None) -> None:
@@ -116,12 +119,14 @@ class RigEndpoint:
             await self._server.listen(listening, policy)
 
     def on_tick(self, now_ns: int) -> None:
-        """Do the periodic work: device, idle connections, request log; ns, monotonic clock."""
+        """Do the periodic work: device, connections, request log; ns, monotonic clock."""
         server = self._server
         self.device.check(now_ns)
         if server.connections:
             self.device.refresh_state()
-            server.close_idle(now_ns)
+        if now_ns >= self._check_due_ns:
+            self._check_due_ns = now_ns + CHECK_PERIOD_NS
+            server.check(now_ns)
         count = server.request_log.count
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
             late_ns = max(0, now_ns - self.request_log_due_ns)
@@ -133,13 +138,18 @@ class RigEndpoint:
 
     def report(self) -> RigReport:
         """Return the part of the health report that describes the rig."""
-        status = self.device.lease_status()
+        status, server = self.device.lease_status(), self._server
         return RigReport(
             rig=status.rig,
             controller=status.holder,
             session=status.session,
             watchdog_tripped=status.watchdog_tripped,
             connections=status.connections,
+            exceptions=[
+                ExceptionCount(host=host, function=function, code=code, count=count)
+                for host, function, code, count in server.exceptions.counts()
+            ],
+            alert=server.alert(),
         )
 
     def stop(self, reason: str) -> None:

@@ -11,7 +11,8 @@ from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.registers.map import MAP
 
 _ITEMS: Final = [register.name for register in MAP if register.writable]
-_COUNT: Final = len(_ITEMS)
+ITEMS: Final = len(_ITEMS)
+"""Number of items."""
 TORQUES: Final = _ITEMS.index("tau1")
 """Number of the first of the four torque registers."""
 EXTENDED: Final = _ITEMS.index("echo")
@@ -24,8 +25,8 @@ class Writers:
     """The connection that wrote each item last; items are numbered, and written in ranges."""
 
     def __init__(self) -> None:
-        self._clients: list[Client | None] = [None] * _COUNT
-        self._written_ns = [0] * _COUNT
+        self._clients: list[Client | None] = [None] * ITEMS
+        self._written_ns = [0] * ITEMS
 
     def rewrite(self, client: Client, begin: int, end: int, now_ns: int) -> bool:
         """Record a write of items that `client` wrote last; return False if another one, or none, wrote one of them."""
@@ -54,4 +55,4 @@ class Writers:
 
     def clear(self) -> None:
         """Remove all connections, because the lease was released."""
-        self._clients = [None] * _COUNT
+        self._clients = [None] * ITEMS

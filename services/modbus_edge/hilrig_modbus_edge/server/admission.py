@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.timing.rate_limiter import RateLimiter
+from hilrig_runtime.timing.rate_limiter import RepeatReporter
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two events about refused connections of one host and reason, ns."""
@@ -34,7 +34,7 @@ class Limits:
     connections: int
     connections_per_host: int
     idle_ns: int
-    """Time without a request after which a connection is closed, ns; 0: never."""
+    """Time without a request after which a connection may be closed for another one, ns; 0: never."""
     allow: tuple[IPv4Network | IPv6Network, ...]
     """Networks that may connect; empty: all."""
 
@@ -51,14 +51,25 @@ class PendingHandshake(Protocol):
 class Admission:
     """Admission control of one rig."""
 
-    def __init__(self, device: Device, limits: Limits, monotonic_ns: Callable[[], int], counters: Counters) -> None:
+    def __init__(
+        self,
+        device: Device,
+        limits: Limits,
+        monotonic_ns: Callable[[], int],
+        counters: Counters,
+        make_room: Callable[[str], bool],
+    ) -> None:
         self.pending_handshakes: set[PendingHandshake] = set()
         """They count as connections: otherwise one host could block all others with incomplete handshakes."""
         self._device = device
         self._limits = limits
         self._monotonic_ns = monotonic_ns
         self._counters = counters
-        self._rate_limiter: RateLimiter[tuple[str, str]] = RateLimiter(REFUSED_EVENT_PERIOD_NS)
+        self._make_room = make_room
+        """Closes an idle connection of a host, or, with an empty host, of any; returns whether there was one."""
+        self._refused: RepeatReporter[tuple[str, str], tuple[str, str]] = RepeatReporter(
+            REFUSED_EVENT_PERIOD_NS, self._report_refused
+        )
 
     def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
         """Return host and port of an admitted connection; else close the connection and return None."""
@@ -79,24 +90,30 @@ class Admission:
         limits, device, pending = self._limits, self._device, self.pending_handshakes
         if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
             return "its address is not in the allow-list; add it to `allow` of the rig in lab.toml"
-        if len(device.clients) + len(pending) >= limits.connections:
-            return (
-                f"the rig has its maximum of {limits.connections} connections; close unused ones, or raise "
-                "edge.max_connections"
-            )
-        if device.connections_of(host) + sum(one.host == host for one in pending) >= limits.connections_per_host:
+        of_host = device.connections_of(host) + sum(one.host == host for one in pending)
+        if of_host >= limits.connections_per_host and not self._make_room(host):
             return (
                 f"the host has its maximum of {limits.connections_per_host} connections; close unused ones, or raise "
                 "edge.max_connections_per_host"
+            )
+        if len(device.clients) + len(pending) >= limits.connections and not self._make_room(""):
+            return (
+                f"the rig has its maximum of {limits.connections} connections; close unused ones, or raise "
+                "edge.max_connections"
             )
         return ""
 
     def refuse(self, host: str, port: int, reason: str) -> None:
         """Count a refused connection and report it, rate-limited."""
         self._counters.refused += 1
-        count = self._rate_limiter.record((host, reason), self._monotonic_ns())
-        if count:
-            self._device.report_refused_connection(address_of(host, port), reason, count)
+        self._refused.record((host, reason), (address_of(host, port), reason), self._monotonic_ns())
+
+    def check(self, now_ns: int) -> None:
+        """Report the refused connections that were not reported yet, if that is due; ns, monotonic clock."""
+        self._refused.check(now_ns)
+
+    def _report_refused(self, refused: tuple[str, str], count: int) -> None:
+        self._device.report_refused_connection(*refused, count)
 
 
 def set_socket_options(connected: socket.socket) -> None:

@@ -8,6 +8,7 @@ read its responses, no further requests are read from it.
 import asyncio
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, Protocol
 
 from pymodbus.constants import ExcCodes
@@ -16,6 +17,7 @@ from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import HEADER, MAX_FRAME, MIN_FRAME, Request, decode_frames
+from hilrig_modbus_edge.protocol.recognition import Foreign, first_bytes, foreign_protocol
 from hilrig_modbus_edge.registers.map import UNIT_IDS
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.event_loop import SocketTransport
@@ -26,9 +28,11 @@ BUFFER_BYTES: Final = 2048
 """Size of the receive buffer: several of the longest requests, and few enough for a short turn."""
 MAX_REQUESTS_PER_TURN: Final = 16
 """Requests of one connection per turn of the event loop; also the TCP guide's limit of transactions."""
+STALL_NS: Final = 1_000_000_000
+"""Time without the remainder of an incomplete request after which it is reported, ns."""
 _PDU: Final = HEADER.size
 """Offset of the PDU in a frame, bytes."""
-_WRITES: Final = frozenset(int(function) for function in FunctionCode if function.is_write)
+WRITES: Final = frozenset(int(function) for function in FunctionCode if function.is_write)
 _TARGET_SILENT: Final = int(ExcCodes.GATEWAY_NO_RESPONSE)
 
 _pack_header, _unpack_header = HEADER.pack, HEADER.unpack_from
@@ -47,8 +51,17 @@ class ConnectionOwner(Protocol):
     monotonic_ns: Callable[[], int]
     connections: "set[Connection]"
 
-    def report_malformed(self, client: Client, defect: str) -> None:
-        """Count and log a connection that is closed because of its malformed data."""
+    def record_exception(self, client: Client, transaction: int, unit: int, request: bytes, code: int) -> None:
+        """Count and log an exception response, see `ExceptionLog.record`."""
+
+    def report_malformed(self, client: Client, protocol: str, text: str) -> None:
+        """Count and log data of a client that is not Modbus TCP.
+
+        Args:
+            client: connection that sent it.
+            protocol: name of its protocol; empty: unknown.
+            text: what was sent, and the fix.
+        """
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -68,10 +81,14 @@ class Connection(asyncio.BufferedProtocol):
         self._buffer = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buffer)
         self._filled = 0
+        self._incomplete_since_ns = 0
+        """Arrival of the last bytes of an incomplete request, ns, monotonic clock; 0: none, or it was reported."""
+        self._connected_ns = client.last_request_ns
         self._backlog: list[Request] = []
         self._arrived_ns = self._received_ns = 0
         """Of the backlog: arrival at this process and the kernel's receive timestamp, as in `buffer_updated`."""
-        self._malformed = ""
+        self._malformed: tuple[str, str] | None = None
+        """Protocol and defect of the data after the backlog; None: it is valid so far."""
         self._blocked = False
         self._reason = ""
 
@@ -83,6 +100,8 @@ class Connection(asyncio.BufferedProtocol):
             return
         self._server.connections.remove(self)
         self._server.counters.connections -= 1
+        if self._incomplete_since_ns and not self._reason:
+            self._report_incomplete("closed the connection")
         cause = f"connection lost: {exc}" if exc else "connection closed by the client"
         self._device.disconnect(self.client, self._reason or cause)
 
@@ -99,7 +118,7 @@ class Connection(asyncio.BufferedProtocol):
             if nbytes == 6 + length and not protocol:
                 pdu = self._view[_PDU:nbytes].tobytes()
                 client = self.client
-                received_ns = self._kernel_received_ns(client.last_request_ns, now_ns) if pdu[0] in _WRITES else 0
+                received_ns = self._kernel_received_ns(client.last_request_ns, now_ns) if pdu[0] in WRITES else 0
                 client.record_request(now_ns)
                 self._transport.write(self._reply(transaction, unit, pdu, now_ns, received_ns))
                 return
@@ -109,22 +128,29 @@ class Connection(asyncio.BufferedProtocol):
         filled = self._filled + nbytes
         requests, used, malformed = decode_frames(self._buffer[:filled])
         self._filled = filled - used
-        if self._filled:
+        self._incomplete_since_ns = 0
+        defect = None
+        if malformed:
+            found = Foreign(f"data that is not Modbus TCP: {malformed}", "check protocol and port of the client")
+            defect = _describe(self._buffer[:filled], used, found, "is disconnected")
+        elif self._filled:
             self._buffer[: self._filled] = self._buffer[used:filled]
+            self._incomplete_since_ns = now_ns
+            self._acknowledge()
         received_ns = 0
         if requests:
-            if any(request.pdu[0] in _WRITES for request in requests):
+            if any(request.pdu[0] in WRITES for request in requests):
                 received_ns = self._kernel_received_ns(self.client.last_request_ns, now_ns)
             self.client.record_request(now_ns)
         if len(requests) <= MAX_REQUESTS_PER_TURN and not self._backlog:
             self._answer(requests, now_ns, received_ns)
-            if malformed:
-                self._close_malformed(malformed)
+            if defect:
+                self._close_malformed(defect)
             return
         is_draining = bool(self._backlog)
         self._backlog += requests
         self._arrived_ns, self._received_ns = now_ns, received_ns
-        self._malformed = malformed
+        self._malformed = defect
         self._transport.pause_reading()
         if not is_draining:
             self._drain_backlog()
@@ -141,6 +167,17 @@ class Connection(asyncio.BufferedProtocol):
 
     # -- called by the server
 
+    @property
+    def is_silent(self) -> bool:
+        """Whether it has sent no valid request since it was opened."""
+        return self.client.last_request_ns == self._connected_ns
+
+    def report_stall(self, now_ns: int) -> None:
+        """Report an incomplete request whose remainder has not arrived for a second, once; ns, monotonic clock."""
+        if self._incomplete_since_ns and now_ns - self._incomplete_since_ns >= STALL_NS:
+            self._incomplete_since_ns = 0
+            self._report_incomplete("sends nothing more")
+
     def feed(self, data: bytes) -> None:
         """Process data that was received before the connection was attached."""
         while data and not self._transport.is_closing():
@@ -154,6 +191,11 @@ class Connection(asyncio.BufferedProtocol):
         """Close the connection; `reason` is reported."""
         self._reason = reason
         self._transport.abort()
+
+    def make_room(self, reason: str) -> None:
+        """Close the connection, and remove it at once from those that count against a limit."""
+        self.close(reason)
+        self.connection_lost(None)
 
     # -- inside
 
@@ -182,16 +224,50 @@ class Connection(asyncio.BufferedProtocol):
             reply = execute(self._device, client, pdu, arrived_ns, received_ns)
         else:
             reply = exception_response(pdu[0], _TARGET_SILENT)
-        code = reply[1] if reply[0] & 0x80 else 0
+        code = 0
+        if reply[0] & 0x80:
+            code = reply[1]
+            self._server.record_exception(client, transaction, unit, pdu, code)
         self._log_request(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
         self._counters.requests += 1
         return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
 
-    def _close_malformed(self, defect: str) -> None:
-        self._server.report_malformed(self.client, defect)
-        self._reason = f"not Modbus TCP: {defect}"
+    def _acknowledge(self) -> None:
+        """Acknowledge a part of a request at once.
+
+        With Nagle's algorithm a client sends the rest of a request when its first part is acknowledged, and a delayed
+        acknowledgment takes 40 ms.
+        """
+        if hasattr(socket, "TCP_QUICKACK"):
+            # The peer may have disconnected.
+            with suppress(OSError):
+                self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
+    def _report_incomplete(self, event: str) -> None:
+        found = Foreign(f"{self._filled} bytes of a longer request", "send each request completely")
+        self._server.report_malformed(self.client, *_describe(self._buffer[: self._filled], 0, found, event))
+
+    def _close_malformed(self, defect: tuple[str, str]) -> None:
+        self._server.report_malformed(self.client, *defect)
+        self._reason = f"it {defect[1]}"
         # Not aborted: the responses to the valid requests before are sent first.
         self._transport.close()
+
+
+def _describe(data: bytearray, used: int, otherwise: Foreign, event: str) -> tuple[str, str]:
+    """Return the name of a foreign protocol, empty: none is recognized, and a description of the data with the fix.
+
+    Args:
+        data: received data.
+        used: number of its bytes that are valid requests. A frame of Modbus RTU may begin with such bytes.
+        otherwise: description if no protocol is recognized.
+        event: what happened then.
+    """
+    rest = data[used:]
+    for part in (rest, data):
+        if (found := foreign_protocol(part)) is not None:
+            return found.name, f"sent {found.name} and {event}: {found.fix} ({first_bytes(part)})"
+    return "", f"sent {otherwise.name} and {event}: {otherwise.fix} ({first_bytes(rest)})"
 
 
 assert BUFFER_BYTES > MAX_FRAME
