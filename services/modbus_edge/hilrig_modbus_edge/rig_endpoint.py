@@ -14,6 +14,7 @@ from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
 from hilrig_modbus_edge.server.admission import Limits
 from hilrig_modbus_edge.server.listener import RigServer, bind
 from hilrig_modbus_edge.server.tls import TlsPolicy
+from hilrig_runtime.addresses import format_address, reachable_hosts
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
@@ -72,6 +73,7 @@ class RigEndpoint:
         lab = service.lab
         self._clock = service.clock
         self._edge = lab.edge
+        self._host = lab.host_of(rig)
         self._output = BusOutput(rig.name, service, sessions_changed)
         settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
         publisher = service.rig_publisher(topics.COMMAND, rig.name)
@@ -87,7 +89,7 @@ class RigEndpoint:
         self.closing = ExitStack()
         """Resources that are closed with the endpoint."""
         self.address = ""
-        """Human-readable listening addresses. Stored, because a thread of the bus reads them while the edge closes."""
+        """Addresses that reach the rig, human-readable. Stored: a thread of the bus reads it while the edge closes."""
         self._request_log = service.rig_publisher(topics.TRAFFIC, rig.name)
         self.request_log_due_ns = 0
         """Time at which the request log is published next, ns, monotonic clock."""
@@ -103,11 +105,12 @@ class RigEndpoint:
         """
         edge, rig = self._edge, self.device.rig
         if edge.plain:
-            self._sockets.append((self.closing.enter_context(bind(rig, edge.host, port)), None))
+            self._sockets.append((self.closing.enter_context(bind(rig, self._host, port)), None))
         if edge.tls is not None and tls_port is not None:
-            listening = self.closing.enter_context(bind(rig, edge.host, tls_port, "edge.tls.first_port"))
+            listening = self.closing.enter_context(bind(rig, self._host, tls_port, "edge.tls.first_port"))
             self._sockets.append((listening, TlsPolicy(edge.tls)))
-        self.address = ", ".join(f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in self._sockets)
+        ports = [listening.getsockname()[1] for listening, _ in self._sockets]
+        self.address = ", ".join(format_address(host, port) for port in ports for host in reachable_hosts(self._host))
 
     def bind_single(self, port: int) -> None:
         """Bind one address: without TLS, or with TLS if the lab has no plain connections. Raises as `bind`."""

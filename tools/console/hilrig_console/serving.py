@@ -17,8 +17,9 @@ from hilrig_console.auth import HEALTH_PATH, AccessPolicy
 from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.http_limits import LimitedProtocol
 from hilrig_console.subscriber import LabSubscriber
+from hilrig_runtime.addresses import listen_reason
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.errors import InputError, OperationError, listen_failure
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.lifecycle import allow_open_files
 
 SHUTDOWN_GRACE_S: Final = 1
@@ -66,7 +67,7 @@ class ListenAddress:
         except OSError as error:
             where = f"{self.host or '0.0.0.0'}:{self.port}"
             raise OperationError(
-                f"can't listen on {where}: {listen_failure(error)}; choose another address with --listen"
+                f"can't listen on {where}: {listen_reason(error)}; choose another address with --listen"
             ) from error
 
     def url(self, port: int, scheme: str) -> str:

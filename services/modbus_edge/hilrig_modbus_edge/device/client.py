@@ -12,11 +12,6 @@ NO_STATE: Final[ServedState] = (NO_STATE_REF, 0)
 """No state was served."""
 
 
-def address_of(host: str, port: int) -> str:
-    """Return "host:port"; an IPv6 host is put in brackets."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
 @dataclass(slots=True, eq=False)
 class ConnectedController:
     """A controller with all its connections: one connection may read and another write."""

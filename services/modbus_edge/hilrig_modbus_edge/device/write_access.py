@@ -276,6 +276,7 @@ class WriteAccess:
         if controller is None:
             return
         self._writers.clear()
+        self._commands.is_reset_requested = False
         for client in controller.clients:
             client.writes = False
         if self._session.current is not None:

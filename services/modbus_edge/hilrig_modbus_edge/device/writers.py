@@ -1,8 +1,8 @@
 """Writing connections of a rig: each torque register and coil has one at a time, among those of one controller.
 
 The connections of a controller may write different things, for example one the torques and another the magnet. Two
-that write the same are two programs that disturb each other. Items are the writable rows of the register map, in its
-order. Time is passed in.
+that write the same are two programs that disturb each other. Items are the writable values of the register map, in its
+order; a mirror is the same item. Time is passed in.
 """
 
 from typing import Final
@@ -10,7 +10,7 @@ from typing import Final
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.registers.map import MAP
 
-_ITEMS: Final = [register.name for register in MAP if register.writable]
+_ITEMS: Final = [register.name for register in MAP if register.writable and not register.mirrors]
 ITEMS: Final = len(_ITEMS)
 """Number of items."""
 TORQUES: Final = _ITEMS.index("tau1")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from ipaddress import IPv4Network, IPv6Network, ip_address
 from typing import Final, Protocol
 
-from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
+from hilrig_runtime.addresses import format_address, plain_host
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.timing.rate_limiter import RepeatReporter
 
@@ -76,7 +76,7 @@ class Admission:
         peer = transport.get_extra_info("peername")
         # A peer that has already disconnected has no name.
         if peer:
-            host, port = peer[:2]
+            host, port = plain_host(peer[0]), peer[1]
             reason = self.rejection_reason(host)
             if not reason:
                 set_socket_options(transport.get_extra_info("socket"))
@@ -106,7 +106,7 @@ class Admission:
     def refuse(self, host: str, port: int, reason: str) -> None:
         """Count a refused connection and report it, rate-limited."""
         self._counters.refused += 1
-        self._refused.record((host, reason), (address_of(host, port), reason), self._monotonic_ns())
+        self._refused.record((host, reason), (format_address(host, port), reason), self._monotonic_ns())
 
     def check(self, now_ns: int) -> None:
         """Report the refused connections that were not reported yet, if that is due; ns, monotonic clock."""

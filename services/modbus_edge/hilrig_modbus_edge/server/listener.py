@@ -1,7 +1,6 @@
 """Modbus TCP listener: one server per rig, which accepts connections, with or without TLS, and closes them."""
 
 import asyncio
-import errno
 import logging
 import socket
 from collections.abc import Callable
@@ -23,8 +22,9 @@ from hilrig_modbus_edge.server.event_loop import (
 from hilrig_modbus_edge.server.exception_log import LOG_PERIOD_NS, ExceptionLog
 from hilrig_modbus_edge.server.tcp_figures import tcp_figures
 from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
+from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.errors import OperationError, listen_failure
+from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.rate_limiter import RepeatReporter, repeat_suffix
 
@@ -161,7 +161,7 @@ class RigServer:
             connection.close(reason)
 
 
-def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> socket.socket:
+def bind(rig: str, host: str, port: int, setting: str = "edge.first_port, or `port` of the rig") -> socket.socket:
     """Return a listening socket for the clients of a rig; `setting`: key of lab.toml that the port comes from.
 
     Raises:
@@ -169,18 +169,12 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
     """
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        # All addresses of IPv6 include those of IPv4.
+        dual = address[0] == "::" and socket.has_dualstack_ipv6()
+        listening = socket.create_server(address[:2], family=family, backlog=BACKLOG, dualstack_ipv6=dual)
     except OSError as error:
-        reason = listen_failure(error)
-        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            hint = "edge.host in lab.toml must be an address of this host"
-        elif error.errno in (errno.EMFILE, errno.ENFILE):
-            hint = "allow more open files (ulimit -n, or LimitNOFILE of the service)"
-        else:
-            hint = (
-                f"stop the program that listens there, or choose another port in lab.toml ({setting}, or `port` of the "
-                "rig)"
-            )
-        raise OperationError(f"rig {rig!r} can't listen on {host}:{port}: {reason}; {hint}") from error
+        hint = listen_hint(error, port, "edge.host, or `host` of the rig,", setting)
+        where = format_address(host, port)
+        raise OperationError(f"rig {rig!r} can't listen on {where}: {listen_reason(error)}; {hint}") from error
     set_receive_timestamps(listening)
     return listening
