@@ -107,6 +107,7 @@ def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[Edg
     """Run an edge with these settings; every rig has one state on entry."""
     ports = free_ports(len(rigs))
     settings = [{"name": name, "port": port} for name, port in zip(rigs, ports, strict=True)]
+    settings = edge.pop("rig_settings", settings)
     allow = edge.pop("allow", None)
     if allow is not None:
         settings[0]["allow"] = allow

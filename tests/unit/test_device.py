@@ -15,6 +15,7 @@ from hilrig_modbus_edge.registers.map import (
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
+    SWITCH_ADDRESS,
     Status,
     address_of,
 )
@@ -324,6 +325,95 @@ def test_coil_switches_the_magnet(bench: Bench) -> None:
 
 
 # -- lease
+
+
+def test_register_switches_the_magnet(bench: Bench) -> None:
+    client = bench.connect()
+    for value, on in ((1, True), (0, False), (0xFF00, True)):
+        bench.write(client, SWITCH_ADDRESS, value)
+        assert bench.commands[-1].magnet is on
+        assert bench.read(client, SWITCH_ADDRESS, 1) == [on]
+        assert bench.device.read_bits(client, RegisterTable.COIL, 0, 1) == on
+
+
+def test_reset_register_resets_once_per_change(bench: Bench) -> None:
+    """A scanner writes the same registers in each cycle."""
+    client = bench.connect()
+    bench.write(client, 0, 500)
+    for _ in range(3):
+        bench.write(client, SWITCH_ADDRESS, 1, 1)
+    assert bench.commands[-1].resets == 1
+    assert list(bench.commands[-1].effort) == [0, 0, 0, 0]
+    assert bench.read(client, SWITCH_ADDRESS, 2) == [1, 1]
+    bench.write(client, SWITCH_ADDRESS + 1, 0)
+    bench.write(client, SWITCH_ADDRESS + 1, 7)
+    assert bench.commands[-1].resets == 2
+    assert bench.commands[-1].magnet
+
+
+def test_reset_register_works_for_one_shot_clients(bench: Bench) -> None:
+    for number in range(3):
+        client = bench.connect(port=number)
+        bench.write(client, SWITCH_ADDRESS + 1, 1)
+        bench.device.disconnect(client, "connection closed by the client")
+    assert bench.commands[-1].resets == 3
+
+
+def test_switch_registers_and_coils_have_one_writer(bench: Bench) -> None:
+    one, other = bench.connect(), bench.connect(port=2)
+    bench.device.write_coil(one, 0, True, bench.clock.monotonic_ns())
+    with pytest.raises(ModbusError, match="06"):
+        bench.write(other, SWITCH_ADDRESS, 0)
+    bench.write(other, SWITCH_ADDRESS + 1, 1)
+    with pytest.raises(ModbusError, match="06"):
+        bench.device.write_coil(one, 100, True, bench.clock.monotonic_ns())
+
+
+def test_block_reads_over_gaps_are_zero_if_permitted() -> None:
+    bench = Bench(unmapped_reads="zeros")
+    bench.state(1)
+    client = bench.connect()
+    bench.write(client, 0, 11, 12, 13, 14)
+    bench.write(client, ECHO_ADDRESS, 99)
+    exact = [*bench.read(client, 0, 8), *[0] * 92, *bench.read(client, ECHO_ADDRESS, 2)]
+    # Modbus Poll reads 10 registers by default, ModScan 100 from number 100 on; a scanner one block for all.
+    assert bench.read(client, 0, 10) == exact[:10]
+    assert bench.read(client, 0, 102) == exact
+    assert bench.read(client, 99, 100) == [0, 99, 1000, *[0] * 97]
+    assert bench.read(client, 3, 5) == exact[3:8]
+    inputs = bench.read(client, 0, INPUT_END, RegisterTable.INPUT_REGISTER)
+    assert bench.read(client, 0, 125, RegisterTable.INPUT_REGISTER) == inputs + [0] * (125 - INPUT_END)
+    assert bench.read(client, 195, 110) == [0] * 5 + inputs + [0] * 64 + [0, 0] + [0] * 3
+    bench.device.write_coil(client, 0, True, bench.clock.monotonic_ns())
+    assert bench.device.read_bits(client, RegisterTable.COIL, 0, 16) == 1
+    assert bench.device.read_bits(client, RegisterTable.COIL, 90, 16) == 0
+    status = bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 16)
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 4, 32) == status >> 4
+    # An address in the traditional numbering is a mistake, and no write may hit a gap.
+    for table, address, count in (
+        (RegisterTable.HOLDING_REGISTER, 40004, 4),
+        (RegisterTable.HOLDING_REGISTER, 8, 90),
+        (RegisterTable.INPUT_REGISTER, INPUT_END, 2),
+        (RegisterTable.HOLDING_REGISTER, 0xFFFF, 2),
+    ):
+        with pytest.raises(ModbusError, match="02"):
+            bench.read(client, address, count, table)
+    with pytest.raises(ModbusError, match="02"):
+        bench.write(client, 0, *[0] * 10)
+
+
+def test_gaps_are_refused_by_default(bench: Bench) -> None:
+    client = bench.connect()
+    for table, address, count in (
+        (RegisterTable.HOLDING_REGISTER, 0, 9),
+        (RegisterTable.HOLDING_REGISTER, 99, 3),
+        (RegisterTable.HOLDING_REGISTER, 235, 2),
+        (RegisterTable.INPUT_REGISTER, 0, INPUT_END + 1),
+    ):
+        with pytest.raises(ModbusError, match="02"):
+            bench.read(client, address, count, table)
+    with pytest.raises(ModbusError, match="02"):
+        bench.device.read_bits(client, RegisterTable.COIL, 0, 2)
 
 
 def test_first_writer_acquires_lease_and_others_get_06(bench: Bench) -> None:

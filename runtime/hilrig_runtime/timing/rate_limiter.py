@@ -57,7 +57,7 @@ class _Reported(NamedTuple, Generic[ItemT]):
     """What a `RepeatReporter` knows of one key."""
 
     reported_ns: int
-    count: int
+    suppressed: int
     """Number of occurrences since the last report."""
     newest: ItemT
 
@@ -82,7 +82,7 @@ class RepeatReporter(Generic[KeyT, ItemT]):
         self.check(now_ns)
         before = self._reported.get(key)
         if before is not None and now_ns - before.reported_ns < self._period_ns:
-            self._reported[key] = _Reported(before.reported_ns, before.count + 1, item)
+            self._reported[key] = _Reported(before.reported_ns, before.suppressed + 1, item)
             self._suppressed += 1
             return
         self._remember(key, item, now_ns)

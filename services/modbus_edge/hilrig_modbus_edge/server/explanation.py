@@ -9,6 +9,7 @@ from hilrig_modbus_edge.protocol.mbap import encode_frame
 from hilrig_modbus_edge.protocol.recognition import foreign_protocol
 from hilrig_modbus_edge.registers.export import TABLE_NAMES
 from hilrig_modbus_edge.registers.map import rows_of
+from hilrig_modbus_edge.request_log import kind_of
 from hilrig_modbus_edge.server.pdu import MAX_QUANTITY
 
 Block = tuple[int, int]
@@ -109,21 +110,24 @@ def _request(request: bytes) -> str:
     if function.table is None or len(request) < 5:
         return f"sent function {int(function)} ({function.name.lower().replace('_', ' ')})"
     if function is FunctionCode.READ_WRITE_MULTIPLE_REGISTERS:
-        return f"wrote holding registers {_span(_write_numbers(request))} and read {_span(_numbers(request))}"
-    verb = "wrote" if function.is_write else "read"
-    first, last = _numbers(request)
-    return f"{verb} {TABLE_NAMES[function.table]}{'s' if last > first else ''} {_span((first, last))}"
+        return f"wrote {_named(function, _write_numbers(request))} and read {_named(function, _numbers(request))}"
+    return f"{'wrote' if function.is_write else 'read'} {_named(function, _numbers(request))}"
+
+
+def _named(function: FunctionCode, numbers: Block) -> str:
+    assert function.table is not None
+    first, last = numbers
+    return f"{TABLE_NAMES[function.table]}{'s' if last > first else ''} {_span(numbers)}"
 
 
 def _function(request: bytes) -> FunctionCode | None:
-    return FunctionCode(request[0]) if request[0] in iter(FunctionCode) else None
+    return next((function for function in FunctionCode if function == request[0]), None)
 
 
 def _numbers(request: bytes) -> Block:
     """Return the numbers that the first address and quantity of a request select."""
-    number = int.from_bytes(request[1:3]) + 1
-    has_quantity = FunctionCode(request[0]).layout is RequestLayout.QUANTITY
-    return number, number + (int.from_bytes(request[3:5]) if has_quantity else 1) - 1
+    _, address, count = kind_of(request[:5])
+    return address + 1, address + count
 
 
 def _write_numbers(request: bytes) -> Block:

@@ -65,7 +65,8 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResul
     if lab.edge.plain and exposed:
         yield CheckResult.warning(
             "ports",
-            f"edge.host is {list_names(sorted(exposed))}: any host that reaches the edge can control a rig without a certificate",
+            f"edge.host is {list_names(sorted(exposed))}: any host that reaches the edge can control a rig without a "
+            "certificate",
             "list the networks that may connect to each rig (allow), or use [edge.tls] with plain = false",
         )
 
