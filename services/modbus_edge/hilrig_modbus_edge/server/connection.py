@@ -83,6 +83,8 @@ class Connection(asyncio.BufferedProtocol):
         self._filled = 0
         self._incomplete_since_ns = 0
         """Arrival of the last bytes of an incomplete request, ns, monotonic clock; 0: none, or it was reported."""
+        self._incomplete = bytearray()
+        """These bytes with the requests that arrived with them: a frame of Modbus RTU may begin like a request."""
         self._connected_ns = client.last_request_ns
         self._backlog: list[Request] = []
         self._arrived_ns = self._received_ns = 0
@@ -134,8 +136,8 @@ class Connection(asyncio.BufferedProtocol):
             found = Foreign(f"data that is not Modbus TCP: {malformed}", "check protocol and port of the client")
             defect = _describe(self._buffer[:filled], used, found, "is disconnected")
         elif self._filled:
+            self._incomplete, self._incomplete_since_ns = self._buffer[:filled], now_ns
             self._buffer[: self._filled] = self._buffer[used:filled]
-            self._incomplete_since_ns = now_ns
             self._acknowledge()
         received_ns = 0
         if requests:
@@ -245,7 +247,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def _report_incomplete(self, event: str) -> None:
         found = Foreign(f"{self._filled} bytes of a longer request", "send each request completely")
-        self._server.report_malformed(self.client, *_describe(self._buffer[: self._filled], 0, found, event))
+        used = len(self._incomplete) - self._filled
+        self._server.report_malformed(self.client, *_describe(self._incomplete, used, found, event))
 
     def _close_malformed(self, defect: tuple[str, str]) -> None:
         self._server.report_malformed(self.client, *defect)
@@ -259,7 +262,7 @@ def _describe(data: bytearray, used: int, otherwise: Foreign, event: str) -> tup
 
     Args:
         data: received data.
-        used: number of its bytes that are valid requests. A frame of Modbus RTU may begin with such bytes.
+        used: number of its bytes that are valid requests.
         otherwise: description if no protocol is recognized.
         event: what happened then.
     """
