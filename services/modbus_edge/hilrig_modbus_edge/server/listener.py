@@ -90,7 +90,8 @@ class RigServer:
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
-        connection.feed(early)
+        if early:
+            connection.data_received(early)
 
     def report_malformed(self, client: Client, protocol: str, text: str) -> None:
         """See `ConnectionOwner.report_malformed`; the log is rate-limited."""
