@@ -165,7 +165,7 @@ def test_operator_lists_and_revokes_leases(lab: RunningLab) -> None:
 
 
 def test_lease_command_reports_errors(lab: RunningLab, tmp_path: Path) -> None:
-    unknown = hilrig("lease", "rig9", "--config", lab.config)
+    unknown = hilrig("lease", "rig10", "--config", lab.config)
     assert unknown.returncode == 2
     assert "rig1, rig2, rig3" in unknown.stderr
     assert hilrig("lease", "--release", "--config", lab.config).returncode == 2

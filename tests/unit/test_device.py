@@ -776,7 +776,7 @@ def test_another_controller_takes_lease_after_trip(bench: Bench) -> None:
 
 def test_holder_that_writes_keeps_lease_on_lossy_link() -> None:
     """The watchdog trips because the emulated network drops each write."""
-    bench = Bench(impairment=ImpairmentConfig.model_validate({"command": {"loss": "bernoulli 1"}}))
+    bench = Bench(impairment=ImpairmentConfig.model_validate({"command": {"loss": {"kind": "bernoulli", "rate": 1.0}}}))
     bench.state(1)
     bench.device.start()
     writes, other = bench.connect(), bench.connect(host="10.0.0.2")

@@ -1,6 +1,8 @@
 """The explanation of an exception response names request, cause and fix; each example is a mistake of real clients."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hilrig_modbus_edge.protocol.functions import FunctionCode, RequestLayout
 from hilrig_modbus_edge.server.explanation import explain
@@ -74,6 +76,16 @@ def test_observer_is_explained() -> None:
     pdu = bytes.fromhex("06 0000 0001")
     reply = execute(bench.device, bench.connect(may_write=False), pdu, 0)
     assert "which its certificate does not permit (exception 01)" in explain(1, 1, pdu, reply[1])
+
+
+@given(st.binary(min_size=1, max_size=20), st.sampled_from(sorted(FunctionCode)), st.integers(0, 255))
+def test_any_refused_request_is_explained(data: bytes, function: int, unit: int) -> None:
+    """An error in the explanation would close the connection of the client."""
+    for pdu in (data, bytes((function,)) + data):
+        for code in (*range(1, 8), 10, 11):
+            text = explain(0, unit, pdu, code)
+            assert f"(exception {code:02X}): " in text
+            assert text.isprintable()
 
 
 def test_every_function_with_a_quantity_has_its_limit() -> None:

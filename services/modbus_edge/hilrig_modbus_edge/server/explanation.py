@@ -57,7 +57,9 @@ def _cause_and_fix(transaction: int, unit: int, request: bytes, code: int) -> tu
             return "which its certificate does not permit", "use a certificate with the role operator"
         return "the rig has device identification only", "use MEI type 14"
     if function is not None and code == ExcCodes.ILLEGAL_ADDRESS:
-        return _wrong_address(function, request)
+        if function.table is None:
+            return "the object does not exist", "read code 01 lists the objects"
+        return _wrong_address(function, function.table, request)
     if function is not None and code == ExcCodes.ILLEGAL_VALUE:
         return _wrong_value(function, request)
     if function is not None and code == ExcCodes.DEVICE_FAILURE:
@@ -67,9 +69,7 @@ def _cause_and_fix(transaction: int, unit: int, request: bytes, code: int) -> tu
     return "which was refused", "see docs/controllers.md"
 
 
-def _wrong_address(function: FunctionCode, request: bytes) -> tuple[str, str]:
-    table = function.table
-    assert table is not None
+def _wrong_address(function: FunctionCode, table: RegisterTable, request: bytes) -> tuple[str, str]:
     first, last = _numbers(request)
     blocks, writes = blocks_of(table, writable=function.is_write), function.is_write
     if function is FunctionCode.READ_WRITE_MULTIPLE_REGISTERS:
