@@ -6,7 +6,7 @@ import struct
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from ipaddress import ip_address
+from ipaddress import IPv4Address, ip_address
 from pathlib import Path
 from typing import Final
 
@@ -33,9 +33,10 @@ def reachable_hosts(host: str) -> list[str]:
     """Return the hosts that reach a socket on `host`; of a wildcard: the addresses of this host, and its name."""
     if host not in WILDCARDS:
         return [host]
-    addresses = [ip_address(text) for text in _interface_addresses()]
-    found = [str(one) for one in addresses if not one.is_loopback and (one.version == 4 or host != "0.0.0.0")]
-    return [*dict.fromkeys(found), socket.gethostname()]
+    addresses = [one for one in map(ip_address, _interface_addresses()) if not one.is_loopback]
+    if host == "0.0.0.0":
+        addresses = [one for one in addresses if isinstance(one, IPv4Address)]
+    return [*dict.fromkeys(map(str, addresses)), socket.gethostname()]
 
 
 def listen_reason(error: OSError) -> str:
