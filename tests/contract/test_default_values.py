@@ -103,7 +103,7 @@ DOCUMENTED = [
         for page in (
             "README.md",
             "docs/controllers.md",
-            *(f"docs/controllers/{name}.md" for name in ("python", "c", "nodejs", "octave", "go", "forte")),
+            *(f"docs/controllers/{name}.md" for name in ("python", "c", "nodejs", "go", "forte")),
             *(f"examples/hold_position.{kind}" for kind in ("py", "c", "js")),
         )
         for pattern in (r"(?:127\.0\.0\.1[: ]|-p |--port |[pP]ort.{1,22}[=:] \"?)(\d{4})\b",)

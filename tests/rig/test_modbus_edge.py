@@ -425,7 +425,7 @@ def test_listens_on_ipv4_and_ipv6_at_once() -> None:
 
 
 def test_rigs_have_the_same_port_at_several_addresses() -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     rigs = [{"name": f"rig{number}", "host": f"127.0.0.{number}", "port": port} for number in (1, 2)]
     with running_edge(("rig1", "rig2"), rig_settings=rigs):
         for number in (1, 2):
