@@ -104,9 +104,13 @@ class EdgeRig:
 
 @contextmanager
 def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[EdgeRig]:
-    """Run an edge with these settings; every rig has one state on entry."""
+    """Run an edge with these settings; every rig has one state on entry.
+
+    `first_rig` are settings of the first rig.
+    """
     ports = free_ports(len(rigs))
     settings = [{"name": name, "port": port} for name, port in zip(rigs, ports, strict=True)]
+    settings[0] |= edge.pop("first_rig", {})
     allow = edge.pop("allow", None)
     if allow is not None:
         settings[0]["allow"] = allow

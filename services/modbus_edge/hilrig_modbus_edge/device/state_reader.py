@@ -20,6 +20,11 @@ class StateReader:
         self._states = states
         self._received: TimestampedPayload | None = None
 
+    @property
+    def next_ns(self) -> int | None:
+        """Time at which the next state is due on the impaired link, ns, monotonic clock; None: none is in flight."""
+        return None if self.delayed is None else self.delayed.line.next_ns
+
     def refresh(self) -> StateImage:
         """Update the register image to the newest state, and return the image."""
         state = self._states.get(self._rig)
