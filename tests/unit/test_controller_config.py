@@ -2,6 +2,7 @@
 
 import pytest
 
+from hilrig_modbus_edge.registers.map import MAGNET_COIL, PAPER_END, POSITION_ADDRESS, TORQUE_ADDRESS
 from hilrig_runtime.config.controller import RegisterBlock, RegistersConfig, parse_controller, parse_register
 from hilrig_runtime.config.lab import LabConfig, parse_lab, read_rig
 from hilrig_runtime.errors import InputError
@@ -130,3 +131,10 @@ def test_description_names_every_register() -> None:
     )
     assert read_rig(rig.model_dump_json()) == rig
     assert read_rig(LabConfig().rigs[0].model_dump_json()) == LabConfig().rigs[0]
+
+
+def test_default_registers_are_those_of_the_rig_itself() -> None:
+    registers = RegistersConfig()
+    assert (registers.torque_block.address, registers.position_block.address) == (TORQUE_ADDRESS, POSITION_ADDRESS)
+    assert registers.position_block.end == PAPER_END
+    assert registers.magnet_block == RegisterBlock("coil", MAGNET_COIL)
