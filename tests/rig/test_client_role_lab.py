@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +32,7 @@ class Result:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Result]:
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     folder = tmp_path_factory.mktemp("lab")
     in_c = compile_with_libmodbus(EXAMPLES / "server_controller.c", folder)
     port = free_ports(2)
@@ -56,7 +55,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Result]:
         eventually(lambda: len(lab.recordings) == 2)
         codes = [program.returncode for program in programs]
         recordings = sorted(lab.recordings, key=lambda path: path.parent.name)
-    yield Result(config, outputs, codes, recordings)
+    return Result(config, outputs, codes, recordings)
 
 
 def test_example_servers_hold_and_move_the_arm(result: Result) -> None:
@@ -74,5 +73,5 @@ def test_recordings_of_the_client_role_are_evaluated(result: Result, tmp_path: P
     assert hilrig("report", first, "--out", tmp_path / "report.html").returncode == 0
     rrd = hilrig("replay", first, "--save", tmp_path / "run.rrd")
     assert rrd.returncode == 0, rrd.stderr
-    shown = json.loads(hilrig("runs", first, second, "--json").stdout)
+    shown = json.loads(hilrig("runs", first.parents[1], "--json").stdout)
     assert len(shown) == 2
