@@ -33,6 +33,8 @@ class Event(_message.Message):
         RIG_ADDED: _ClassVar[Event.Kind]
         RIG_REMOVED: _ClassVar[Event.Kind]
         INACCURATE_STEP: _ClassVar[Event.Kind]
+        STATE_LOST: _ClassVar[Event.Kind]
+        STATE_BACK: _ClassVar[Event.Kind]
         CONTROLLER_FAULT: _ClassVar[Event.Kind]
         CONTROLLER_BACK: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
@@ -57,6 +59,8 @@ class Event(_message.Message):
     RIG_ADDED: Event.Kind
     RIG_REMOVED: Event.Kind
     INACCURATE_STEP: Event.Kind
+    STATE_LOST: Event.Kind
+    STATE_BACK: Event.Kind
     CONTROLLER_FAULT: Event.Kind
     CONTROLLER_BACK: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
