@@ -79,7 +79,7 @@ class _Transactions(TransactionManager):
 
     def callback_data(self, data: bytes, addr: tuple[str, int] | None = None) -> int:  # noqa: ARG002
         """See `TransactionManager`: bytes were received; pass on the valid response only."""
-        frames = decode_frames(data)
+        frames = decode_frames(data, len(data))
         for frame in frames.requests:
             fault = self._check(frame)
             if fault is not None:
