@@ -71,7 +71,7 @@ def parse_register(value: int | str, default: Table) -> RegisterBlock:
     """Parse the address of a register or coil; a number is an address of the table `default`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the address is invalid.
     """
     if isinstance(value, int):
         if 30_001 <= value <= 39_999 or 40_001 <= value <= 49_999:
@@ -176,7 +176,7 @@ class RegistersConfig(Section):
 
     @property
     def echo_block(self) -> RegisterBlock | None:
-        """The copy of the step number; None: there is none."""
+        """The copy of the step number; None: no echo register."""
         return None if self.echo is None else parse_register(self.echo, "holding")
 
     @property

@@ -248,7 +248,7 @@ class Exchange:
             self._client.skipped_states += max(0, image.step - newest[1] - 1)
 
     async def _next_state(self) -> StateImage | None:
-        """Wait for a state that was not written yet; None: there is none, the torques are read all the same."""
+        """Wait for a state that was not written yet; None: none arrived, the torques are read all the same."""
         deadline_ns = self._monotonic_ns() + max(MAX_STATE_WAIT_NS, 2 * self._settings.step_ns)
         while True:
             self._state_arrived.clear()
