@@ -1,8 +1,8 @@
 """One connection to a controller: pymodbus's asynchronous client, with checked responses and described failures.
 
 pymodbus encodes requests, decodes responses, and matches them by transaction identifier, one request at a time. It
-skips some failures silently, and waits for its timeout on others: a wrong identifier, length or unit, a lost connection, a
-late response. They are detected here, and fail the request at once with a `ControllerError`.
+skips some failures silently, and waits for its timeout on others: a wrong identifier, length or unit, a lost
+connection, a late response. They are detected here, and fail the request at once with a `ControllerError`.
 """
 
 import logging
