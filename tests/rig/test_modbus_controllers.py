@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from support.clients import mbpoll_read, mbpoll_write, require_mbpoll
+from support.clients import compile_with_libmodbus, mbpoll_read, mbpoll_write, require_mbpoll
 from support.edge_rig import EdgeRig, RawClient, running_edge
 from support.guides import write_programs
 from support.labs import RunningLab, hilrig, write_lab
@@ -39,20 +39,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
 
 @pytest.fixture(scope="module")
 def in_c(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> Path:
-    if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
-        pytest.skip("needs gcc and pkg-config (Debian's packages of these names)")
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "libmodbus"], check=False, capture_output=True, text=True
-    )
-    if flags.returncode:
-        pytest.skip("needs libmodbus (Debian's package libmodbus-dev)")
     folder = tmp_path_factory.mktemp("c")
     write_programs("c", folder, lab.lab.ports["rig9"])
-    warnings = ["-O2", "-Wall", "-Wextra", "-Werror"]
-    for name in ("hold_position", "first"):
-        command = ["gcc", *warnings, "-o", name, f"{name}.c", *flags.stdout.split(), "-lm"]
-        subprocess.run(command, check=True, cwd=folder)
-    return folder / "hold_position"
+    compile_with_libmodbus(folder / "first.c", folder)
+    return compile_with_libmodbus(folder / "hold_position.c", folder)
 
 
 @pytest.fixture(scope="module")
