@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hilrig_replay.analysis.latency import LatencyReport
+    from hilrig_replay.io.run import Run
+    from hilrig_runtime.config.task import TaskConfig
 
 
 def latency(
@@ -57,7 +60,7 @@ def latency(
         try:
             with isolated(path):
                 run = open_run(path)
-                report = measure(run)
+                report = measure(run, task=_task(run))
         except HilrigError as error:
             # An unreadable recording of several is reported in its own line.
             if len(paths) == 1:
@@ -82,6 +85,16 @@ def latency(
         raise typer.Exit(1)
 
 
+def _task(run: "Run") -> "TaskConfig | None":
+    """The recorded task; None: not recorded, or of another version, which only a grade reports."""
+    from hilrig_replay.grading.task_loading import recorded_task
+    from hilrig_runtime.errors import InputError
+
+    with suppress(InputError):
+        return recorded_task(run)
+    return None
+
+
 def print_report(report: "LatencyReport") -> None:
     """Print the latency report of one run: a table, losses, findings and the verdict."""
     from rich.box import SIMPLE_HEAD
@@ -89,6 +102,7 @@ def print_report(report: "LatencyReport") -> None:
     from rich.text import Text
 
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_replay.analysis.diagnosis.evidence import sections
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.stages import LOOP_STAGES
 
@@ -115,8 +129,10 @@ def print_report(report: "LatencyReport") -> None:
     console.print(lost if report.loop_ms is None else jitter + lost)
     for note in report.notes():
         console.print(Text(note))
-    for finding in report.findings:
-        console.print(Text(f"• {finding.text}"))
+    for title, sentences in sections(report.findings):
+        console.print(f"{title}:")
+        for sentence in sentences:
+            console.print(Text(f"• {sentence}"))
     if report.fit:
         console.print(Text("valid for latency measurements", style="green"))
     else:
@@ -146,6 +162,6 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
         table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
     console.print(table)
     for name, report in reports.items():
-        note = report.reason_text() or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
+        note = report.reason_text() or ", ".join(finding.code.replace("_", " ") for finding in report.findings)
         if note:
             console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))

@@ -6,17 +6,20 @@ from the recording, and unrelated to everything that a program without these pos
 were computed from them. The statistic is that of a generalized least-squares fit in blocks of commands, each with its
 own trend in time and its own gains; for comparison it is computed with the rounding errors of other times.
 
+The same errors show which poll the torques were computed from: the first poll whose rounding errors they contain.
+
 With a small gain, rounding hides in the resolution of the torque registers. There, a law that restores a set point and
 explains each torque register to its resolution is evidence, too.
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.columns import Rows, last_of_each_read
 from hilrig_sim.arm.joints import JOINT_SCALE
 
 Floats = NDArray[np.float64]
@@ -35,6 +38,12 @@ MIN_STATISTIC: Final = 20.0
 MIN_RATIO: Final = 2.0
 """Required ratio to the largest statistic of the other times."""
 ROUNDING_VARIANCE: Final = 1 / 12
+MAX_POLLS: Final = 3
+"""Number of earlier polls that are compared with the newest one."""
+MIN_GAIN_STATISTIC: Final = 25.0
+"""Squared ratio of the largest gain to its standard error from which the gains are significant."""
+MIN_GAIN_RATIO: Final = 0.2
+"""Gain of the first poll that the torques contain, as a share of the largest gain."""
 LAW_COMMANDS: Final = 24
 """Commands of a segment in which one law is fitted."""
 MIN_SEGMENTS: Final = 2
@@ -67,6 +76,99 @@ def _series(states: Rows, commands: Rows) -> Iterator[Series]:
         if len(chosen):
             position = known["position"][at] * JOINT_SCALE * 100
             yield chosen["write_arrived_ns"] / 1e9, position, chosen["effort"] * 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class RoundingGains:
+    """Gains with which torques contain the rounding errors of the positions in the registers."""
+
+    gains: Floats
+    """By joint and poll, the newest first: N·m per 0.01°, joint 3 N per 0.01 mm, (4, MAX_POLLS + 1)."""
+    statistics: Floats
+    """Squared ratios of the gains to their standard errors, same shape; 0: the joint shows nothing."""
+    older_steps: Floats
+    """Mean number of steps by which the state of each poll is older than the newest one, (MAX_POLLS + 1,)."""
+
+    @property
+    def noise(self) -> Floats:
+        """Standard deviation of the torques that is caused by the rounding, N·m or N, (4,); 0: not significant."""
+        shown = self.statistics.max(axis=1) >= MIN_GAIN_STATISTIC
+        return np.asarray(np.where(shown, np.sqrt((self.gains**2).sum(axis=1) * ROUNDING_VARIANCE), 0.0))
+
+    @property
+    def polls_behind(self) -> int | None:
+        """Polls between the newest one and that which the torques were computed from; None: they do not show it."""
+        joint = int(np.argmax(self.statistics.max(axis=1)))
+        statistics, gains = self.statistics[joint], np.abs(self.gains[joint])
+        if not statistics.max() >= MIN_GAIN_STATISTIC:
+            return None
+        used = (gains >= MIN_GAIN_RATIO * gains.max()) & (statistics >= MIN_GAIN_STATISTIC / 2)
+        return int(np.argmax(used))
+
+
+def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
+    """Estimate the gains of the rounding errors, by generalized least squares in blocks of commands.
+
+    Args:
+        windows: states and commands of parts of a run, fields as `STATE_DTYPE` and `COMMAND_DTYPE`.
+    """
+    normal, right = np.zeros((4, MAX_POLLS + 1, MAX_POLLS + 1)), np.zeros((4, MAX_POLLS + 1))
+    older: list[NDArray[np.int64]] = [np.zeros((MAX_POLLS + 1, 0), np.int64)]
+    for states, commands in windows:
+        for basis_step, (time_s, position, torque) in _polls(states, commands):
+            steps = np.diff(basis_step, prepend=basis_step[0])
+            lagged = np.stack([basis_step - _lagged(basis_step, lag) for lag in range(MAX_POLLS + 1)])
+            older.append(lagged[:, MAX_POLLS:])
+            # A poll that returned the state of the one before can't be distinguished from it.
+            fresh = np.flatnonzero(steps > 0)
+            fresh = fresh[fresh >= MAX_POLLS]
+            rows = fresh[: len(fresh) // BLOCK_COMMANDS * BLOCK_COMMANDS].reshape(-1, BLOCK_COMMANDS)
+            if not len(rows):
+                continue
+            error = np.rint(position) - position
+            for joint in range(4):
+                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(2)])
+                unexplained = _without(known, torque[rows, joint])
+                errors = _without(known, np.stack([error[rows - lag, joint] for lag in range(MAX_POLLS + 1)], axis=-1))
+                # The variance without the part that the errors explain, which may be most of it.
+                variance = _residual_variance(unexplained, errors, BLOCK_COMMANDS - known.shape[2])
+                weight = np.where((unexplained**2).sum(axis=1) > 1e-6, 1 / (variance + ROUNDING_VARIANCE), 0.0)
+                normal[joint] += np.einsum("b,bli,blj->ij", weight, errors, errors)
+                right[joint] += np.einsum("b,bli,bl->i", weight, errors, unexplained)
+    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    gains = np.einsum("jik,jk->ji", inverse, right)
+    variances = np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 1e-300)
+    statistics = np.where(np.diagonal(normal, axis1=1, axis2=2) > 0, gains**2 / variances, 0.0)
+    steps_of_polls = np.concatenate(older, axis=1)
+    mean_steps = steps_of_polls.mean(axis=1) if steps_of_polls.shape[1] else np.zeros(MAX_POLLS + 1)
+    return RoundingGains(gains / 1e3, statistics, mean_steps)
+
+
+def _lagged(values: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
+    return np.concatenate((values[:lag], values))[: len(values)]
+
+
+def _polls(states: Rows, commands: Rows) -> Iterator[tuple[NDArray[np.int64], Series]]:
+    """Steps of the bases of consecutive polls, and their series, by incarnation of the simulation."""
+    commands = last_of_each_read(commands)
+    for incarnation in np.unique(states["incarnation"]):
+        known = states[states["incarnation"] == incarnation]
+        chosen = commands[commands["basis_incarnation"] == incarnation]
+        at = np.minimum(np.searchsorted(known["step"], chosen["basis_step"]), len(known) - 1)
+        found = known["step"][at] == chosen["basis_step"]
+        chosen, at = chosen[found], at[found]
+        if len(chosen) > MAX_POLLS:
+            position = known["position"][at] * JOINT_SCALE * 100
+            series = chosen["write_arrived_ns"] / 1e9, position, chosen["effort"] * 1e3
+            yield chosen["basis_step"].astype(np.int64), series
+
+
+def _residual_variance(unexplained: Floats, errors: Floats, freedom: int) -> Floats:
+    """Variance of the torques of each block, (blocks,), without their best fit by the errors of that block."""
+    left, sizes, _ = np.linalg.svd(errors, full_matrices=False)
+    left = left * (sizes > 1e-9)[:, np.newaxis, :]
+    rest = unexplained - np.einsum("bli,bi->bl", left, np.einsum("bli,bl->bi", left, unexplained))
+    return np.asarray((rest**2).sum(axis=1) / max(freedom - errors.shape[2], 1))
 
 
 def contains_rounding_errors(series: Iterable[Series]) -> bool:

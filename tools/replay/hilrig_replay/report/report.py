@@ -6,6 +6,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
+from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.stages import LOOP_STAGES
@@ -291,9 +292,12 @@ def _latency(summary: RunSummary) -> str:
         else f'<p class="bad">Not valid for latency measurements: {as_html(latency.reason_text())}.</p>'
     )
     notes = "".join(f'<p class="quiet">{as_html(note)}</p>' for note in latency.notes())
-    findings = "".join(f"<li>{as_html(finding.text)}</li>" for finding in latency.findings)
+    findings = "".join(
+        f"<p>{title}:</p><ul>{''.join(f'<li>{as_html(sentence)}</li>' for sentence in sentences)}</ul>"
+        for title, sentences in sections(latency.findings)
+    )
     table = _table(["ms", *STATISTICS_TITLES], rows)
-    return f"{table}{notes}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
+    return f"{table}{notes}{verdict}{findings}"
 
 
 def _events(summary: RunSummary) -> str:
