@@ -23,7 +23,9 @@ from hilrig_replay.io.columns import (
 from hilrig_replay.io.records import EVENT_DTYPE, Records
 from hilrig_replay.io.run import Run
 from hilrig_replay.io.timebase import Timebase
+from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_schemas import Event
+from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
 from support.recordings import CONTROLLER, EDGE_FROM_WALL_NS, PARAMETERS, REGISTER_SCALE, START_WALL_NS
 
@@ -110,8 +112,8 @@ def virtual_runs(programs: Sequence[Program]) -> list[VirtualRun]:
     [(_, step_ms)] = {(one.seconds, one.step_ms) for one in programs}
     count = len(programs)
     loops = [_Loop(program) for program in programs]
-    plant = Plant([PARAMETERS] * count)
-    assert plant.rigs[0].sim.step_ns == round(step_ms * MS)
+    parameters = rig_parameters(LabConfig.model_validate({"sim": {"step_ms": step_ms}}), RigSettings())
+    plant = Plant([parameters] * count)
     for number, program in enumerate(programs):
         plant.set_state(number, tuple(np.array(program.start) / REGISTER_SCALE), (0.0, 0.0, 0.0, 0.0))
     magnet = np.zeros(count, np.bool_)

@@ -152,7 +152,7 @@ def limit_cycle(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Findin
 
 
 def _oscillation(position: Floats, step_s: float, lowest_hz: float) -> tuple[float, float] | None:
-    """Frequency, Hz, and amplitude of a sustained oscillation of a signal; None: there is none."""
+    """Frequency, Hz, and amplitude of a sustained oscillation of a signal; None: not found."""
     count = len(position)
     time = np.linspace(-1.0, 1.0, count)
     if not np.isfinite(position).all():

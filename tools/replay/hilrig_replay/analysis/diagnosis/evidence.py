@@ -1,4 +1,4 @@
-"""What the rules of the diagnosis evaluate, and the findings that they return.
+"""Values that the rules of the diagnosis evaluate, and the findings that they return.
 
 A rule is a total function of rows: it accepts empty windows, commands without a basis and a single row.
 """
@@ -49,7 +49,7 @@ class Finding:
     code: str
     """Machine-readable: a word that does not change."""
     text: str
-    """Human-readable: what was found, with the measured values."""
+    """Human-readable, with the measured values."""
     remedy: str
     """What to change."""
     gain_ms: float | None
