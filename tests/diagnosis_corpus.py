@@ -28,8 +28,8 @@ from support.virtual_loop import Law, Program, virtual_runs
 Random = np.random.Generator
 UNDISTURBED: Final = "undisturbed"
 WEIGHT: Final = np.array([0.0, 0.0, -4.905, 0.0])
-RUNS: Final = {"sample": 2, "judged": 30}
-"""Runs of each cause; of undisturbed runs there are twice as many."""
+RUNS: Final = 30
+"""Runs of each cause in the complete corpus; of undisturbed runs there are three times as many."""
 
 
 @dataclass
@@ -177,9 +177,7 @@ def case_of(code: str, part: str, number: int) -> Case:
     def within(name: str) -> float:
         return float(random.uniform(*of.ranges[name]))
 
-    def program(
-        period_ms: float, gain: float = 1.0, damping: float = 1.0, of_law: str = law, **changes: Any
-    ) -> Program:
+    def program(period_ms: float, gain: float = 1.0, damping: float = 1.0, kind: str = law, **changes: Any) -> Program:
         polled_ms = max(period_ms, changes.get("wait_ms", 0.0) + changes.get("compute_ms", 0.0))
         values = {"period_ms": period_ms, "phase_ms": phase, "seed": number + 1, "step_ms": step_ms, **changes}
         start = tuple(goal(0.0) + np.array([8, -8, 4, 5]))
@@ -247,7 +245,9 @@ def case_of(code: str, part: str, number: int) -> Case:
             return Case(code, sagging)
         case "overshoot":
             goal = goal_of("poses", random)
-            return Case(code, program(step_ms, within("overshooting") / kp, 0.0, kind=of.laws[0]))
+            return Case(
+                code, program(step_ms, within("overshooting") / kp, 0.0, kind=of.laws[0]), frozenset({"saturation"})
+            )
         case "noise_amplification":
             step_ms = 5.0
             noisy = program(step_ms, 1.0, kind=of.laws[0], seconds=10.0, phase_ms=1.5)
@@ -324,8 +324,8 @@ def diagnosed(cases: Sequence[Case]) -> Iterator[Result]:
 
 
 def corpus(part: str, runs: int) -> list[Case]:
-    """Cases of a part: `runs` of each cause, and twice as many undisturbed runs."""
-    return [case_of(code, part, number) for code in CODES for number in range(runs * (1 + (code == UNDISTURBED)))]
+    """Cases of a part: `runs` of each cause, and three times as many undisturbed runs."""
+    return [case_of(code, part, number) for code in CODES for number in range(runs * (3 if code == UNDISTURBED else 1))]
 
 
 def interval(count: int, total: int) -> str:
@@ -349,7 +349,7 @@ def table(results: Sequence[Result]) -> str:
 
 
 if __name__ == "__main__":
-    selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [RUNS["judged"]])[0])
+    selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [RUNS])[0])
     judged = list(diagnosed(corpus(selected[0], count)))
     print(table(judged))
     for one in judged:

@@ -38,11 +38,15 @@ MIN_STATISTIC: Final = 20.0
 MIN_RATIO: Final = 2.0
 """Required ratio to the largest statistic of the other times."""
 ROUNDING_VARIANCE: Final = 1 / 12
+GAIN_BLOCK_COMMANDS: Final = 24
+MIN_GAIN_BLOCKS: Final = 5
+MIN_ERROR_VARIANCE: Final = 0.002
+"""Smallest variance of the rounding errors of a block; that of a moving joint is 1/12."""
 MAX_POLLS: Final = 3
 """Number of earlier polls that are compared with the newest one."""
 MIN_GAIN_STATISTIC: Final = 25.0
 """Squared ratio of the largest gain to its standard error from which the gains are significant."""
-MIN_GAIN_RATIO: Final = 0.2
+MIN_GAIN_RATIO: Final = 0.4
 """Gain of the first poll that the torques contain, as a share of the largest gain."""
 LAW_COMMANDS: Final = 24
 """Commands of a segment in which one law is fitted."""
@@ -112,7 +116,8 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
     Args:
         windows: states and commands of parts of a run, fields as `STATE_DTYPE` and `COMMAND_DTYPE`.
     """
-    normal, right = np.zeros((4, MAX_POLLS + 1, MAX_POLLS + 1)), np.zeros((4, MAX_POLLS + 1))
+    blocks: list[list[tuple[Floats, Floats]]] = [[], [], [], []]
+    """By joint: normal matrices and right-hand sides of its blocks."""
     older: list[NDArray[np.int64]] = [np.zeros((MAX_POLLS + 1, 0), np.int64)]
     for states, commands in windows:
         for basis_step, (time_s, position, torque) in _polls(states, commands):
@@ -122,26 +127,47 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
             # A poll that returned the state of the one before can't be distinguished from it.
             fresh = np.flatnonzero(steps > 0)
             fresh = fresh[fresh >= MAX_POLLS]
-            rows = fresh[: len(fresh) // BLOCK_COMMANDS * BLOCK_COMMANDS].reshape(-1, BLOCK_COMMANDS)
+            rows = fresh[: len(fresh) // GAIN_BLOCK_COMMANDS * GAIN_BLOCK_COMMANDS].reshape(-1, GAIN_BLOCK_COMMANDS)
             if not len(rows):
                 continue
             error = np.rint(position) - position
             for joint in range(4):
-                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(2)])
+                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(MAX_POLLS + 1)])
                 unexplained = _without(known, torque[rows, joint])
                 errors = _without(known, np.stack([error[rows - lag, joint] for lag in range(MAX_POLLS + 1)], axis=-1))
                 # The variance without the part that the errors explain, which may be most of it.
-                variance = _residual_variance(unexplained, errors, BLOCK_COMMANDS - known.shape[2])
+                variance = _residual_variance(unexplained, errors, GAIN_BLOCK_COMMANDS - known.shape[2])
                 weight = np.where((unexplained**2).sum(axis=1) > 1e-6, 1 / (variance + ROUNDING_VARIANCE), 0.0)
-                normal[joint] += np.einsum("b,bli,blj->ij", weight, errors, errors)
-                right[joint] += np.einsum("b,bli,bl->i", weight, errors, unexplained)
-    inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-    gains = np.einsum("jik,jk->ji", inverse, right)
-    variances = np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 1e-300)
-    statistics = np.where(np.diagonal(normal, axis1=1, axis2=2) > 0, gains**2 / variances, 0.0)
+                # A joint at rest has no errors that change.
+                weight *= (errors**2).mean(axis=(1, 2)) > MIN_ERROR_VARIANCE
+                normal = np.einsum("b,bli,blj->bij", weight, errors, errors)
+                blocks[joint].append((normal, np.einsum("b,bli,bl->bi", weight, errors, unexplained)))
+    fits = [_fit(of_joint) for of_joint in blocks]
+    gains, statistics = np.stack([fit[0] for fit in fits]), np.stack([fit[1] for fit in fits])
     steps_of_polls = np.concatenate(older, axis=1)
     mean_steps = steps_of_polls.mean(axis=1) if steps_of_polls.shape[1] else np.zeros(MAX_POLLS + 1)
     return RoundingGains(gains / 1e3, statistics, mean_steps)
+
+
+def _fit(blocks: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Gains and their statistics of a joint, (MAX_POLLS + 1,) each, from normal matrices and right-hand sides.
+
+    The standard error is the larger one of the model and of the scatter between blocks, so that a few blocks with a
+    limited torque or a step of the set point show nothing.
+    """
+    size = MAX_POLLS + 1
+    normals = np.concatenate([np.zeros((0, size, size)), *(normal for normal, _ in blocks)])
+    rights = np.concatenate([np.zeros((0, size)), *(right for _, right in blocks)])
+    used = np.diagonal(normals, axis1=1, axis2=2).any(axis=1)
+    if used.sum() < MIN_GAIN_BLOCKS:
+        return np.zeros(size), np.zeros(size)
+    inverse = np.linalg.pinv(normals.sum(axis=0), rcond=1e-9, hermitian=True)
+    gains = inverse @ rights.sum(axis=0)
+    scores = rights[used] - normals[used] @ gains
+    count = len(scores)
+    scatter = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
+    variances = np.maximum(np.maximum(np.diagonal(inverse), np.diagonal(scatter)), 1e-300)
+    return gains, gains**2 / variances
 
 
 def _lagged(values: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
@@ -197,7 +223,7 @@ def contains_rounding_errors(series: Iterable[Series]) -> bool:
 
 
 def _basis_of_known(time_s: Floats, positions: list[Floats]) -> Floats:
-    """Orthonormal basis of a cubic trend in time and of the exact positions, by block, (blocks, commands, 6)."""
+    """Orthonormal basis of a cubic trend in time and of exact positions, by block, (blocks, commands, k)."""
     since = time_s - time_s.mean(axis=1, keepdims=True)
     since /= np.maximum(np.abs(since).max(axis=1, keepdims=True), 1e-9)
     moved = [position - position.mean(axis=1, keepdims=True) for position in positions]

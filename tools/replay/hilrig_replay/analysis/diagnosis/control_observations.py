@@ -5,7 +5,6 @@ with poses, and a periodic set point of more than `MIN_FREQUENCY_HZ` looks like 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -51,9 +50,16 @@ MIN_STOP_SHARE: Final = 0.05
 
 REST_SPEED: Final = 1.0
 """°/s or mm/s; a joint that is slower is at rest."""
-REST_S: Final = 0.3
-MIN_MOVE: Final = 4.0
+REST_S: Final = 0.1
+"""A joint that rests for this time before a turning point does not oscillate."""
+MIN_MOVES: Final = 2
+MIN_MOVE: Final = 8.0
 """° or mm."""
+MIN_TURN: Final = 0.1
+"""Smallest distance of turning points, ° or mm: the registers cause small oscillations."""
+MAX_RETURN: Final = 0.8
+"""Largest return after a move, as a share of the move; a longer one is another move."""
+MAX_POSITION: Final = 1e5
 MIN_OVERSHOOT: Final = 0.1
 
 NEAR_POSE_MM: Final = 100.0
@@ -235,12 +241,12 @@ def steady_state_error(evidence: Evidence, found: Sequence[Finding]) -> Iterator
 
 
 def overshoot(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Finding]:
-    """Moves from rest to rest that pass their end."""
+    """Moves that pass their end."""
     oscillating, step_s = _found(found, "limit_cycle"), evidence.step_ns / 1e9
     best: tuple[float, int, int] | None = None
     for joint in sorted({0, 1, 2, 3} - oscillating):
         shares = [share for stretch in controlled(evidence) for share in _overshoots(stretch, joint, step_s)]
-        median = float(np.median(shares)) if shares else 0.0
+        median = float(np.median(shares)) if len(shares) >= MIN_MOVES else 0.0
         if median >= MIN_OVERSHOOT and (best is None or median > best[0]):
             best = median, joint, len(shares)
     if best is not None:
@@ -256,16 +262,37 @@ def overshoot(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Finding]
 
 
 def _overshoots(stretch: Rows, joint: int, step_s: float) -> Iterator[float]:
-    """Overshoot of each move of a joint, as a share of the move."""
-    position = stretch["position"][:, joint] * JOINT_SCALE[joint]
-    slow = np.abs(stretch["velocity"][:, joint] * JOINT_SCALE[joint]) < REST_SPEED
-    rests = [(begin, end) for begin, end in _stretches(slow) if (end - begin) * step_s >= REST_S]
-    for (_, left), (begin, _) in pairwise(rests):
-        start, final = float(position[left - 1]), float(position[begin])
-        if abs(final - start) < MIN_MOVE:
+    """Overshoot of each move of a joint, as a share of the move.
+
+    The end of a move follows from the next two turning points, for a decaying oscillation around it.
+    """
+    position = stretch["position"] * JOINT_SCALE
+    moved = position[:, joint]
+    speed = stretch["velocity"][:, joint] * JOINT_SCALE[joint]
+    if not np.isfinite(position).all() or np.abs(position).max(initial=0.0) > MAX_POSITION:
+        return
+    turns = np.flatnonzero(np.diff(np.sign(speed)) != 0)
+    turns = turns[np.append(np.abs(np.diff(moved[turns])) > MIN_TURN, True)] if len(turns) else turns
+    ends = np.append(turns, len(moved) - 1)
+    swings = np.diff(moved[ends])
+    for number in range(len(swings) - 2):
+        move, returned, again = swings[number : number + 3].tolist()
+        before, peak = ends[number : number + 2]
+        last = abs(swings[number - 1]) if number else 0.0
+        if abs(move) < max(MIN_MOVE, 1.2 * last) or move * returned >= 0 or abs(returned) > MAX_RETURN * abs(move):
             continue
-        beyond = (position[left:begin] - final) * np.sign(final - start)
-        yield max(float(beyond.max(initial=0.0)) / abs(final - start), 0.0)
+        if abs(again) >= abs(returned):
+            # Not a decaying oscillation: another set point.
+            again = 0.0
+        other = 1 - joint if joint < 2 else joint
+        if abs(move) < 0.5 * abs(position[peak, other] - position[before, other]):
+            # Joints 1 and 2 move each other.
+            continue
+        if (np.abs(speed[max(int(peak - REST_S / step_s), 0) : peak]) < REST_SPEED).all():
+            # It rested, and then turned to another set point.
+            continue
+        beyond = abs(returned) / (1 + abs(again) / abs(returned))
+        yield beyond / (abs(move) - beyond)
 
 
 def noise_amplification(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Finding]:  # noqa: ARG001
