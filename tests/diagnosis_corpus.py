@@ -259,7 +259,7 @@ def case_of(code: str, part: str, number: int) -> Case:
                 return np.asarray(free(t, q) - gain * np.array([1, 0, 0, 0]) * speed)
 
             noisy.law = with_derivative
-            return Case(code, noisy)
+            return Case(code, noisy, frozenset({"saturation"}))
     raise ValueError(code)
 
 

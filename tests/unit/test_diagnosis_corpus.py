@@ -1,4 +1,4 @@
-"""Error rate of the diagnosis on runs with a known cause; with HILRIG_LONG in the environment, of the complete corpus."""
+"""Error rate of the diagnosis on runs with a known cause; with HILRIG_LONG set, of the complete corpus."""
 
 import os
 

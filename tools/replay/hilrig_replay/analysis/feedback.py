@@ -138,6 +138,9 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
                 # The variance without the part that the errors explain, which may be most of it.
                 variance = _residual_variance(unexplained, errors, GAIN_BLOCK_COMMANDS - known.shape[2])
                 weight = np.where((unexplained**2).sum(axis=1) > 1e-6, 1 / (variance + ROUNDING_VARIANCE), 0.0)
+                # A limited torque contains no errors.
+                limited = np.abs(torque[rows, joint]) >= np.abs(torque[:, joint]).max() - 0.5
+                weight *= ~limited.any(axis=1)
                 # A joint at rest has no errors that change.
                 weight *= (errors**2).mean(axis=(1, 2)) > MIN_ERROR_VARIANCE
                 normal = np.einsum("b,bli,blj->bij", weight, errors, errors)

@@ -52,7 +52,9 @@ REST_SPEED: Final = 1.0
 """°/s or mm/s; a joint that is slower is at rest."""
 REST_S: Final = 0.1
 """A joint that rests for this time before a turning point does not oscillate."""
-MIN_MOVES: Final = 2
+REST_SHARE: Final = 0.06
+"""Share of the largest speed of a move; a joint that is slower at its end rests."""
+MIN_MOVES: Final = 3
 MIN_MOVE: Final = 8.0
 """° or mm."""
 MIN_TURN: Final = 0.1
@@ -288,7 +290,8 @@ def _overshoots(stretch: Rows, joint: int, step_s: float) -> Iterator[float]:
         if abs(move) < 0.5 * abs(position[peak, other] - position[before, other]):
             # Joints 1 and 2 move each other.
             continue
-        if (np.abs(speed[max(int(peak - REST_S / step_s), 0) : peak]) < REST_SPEED).all():
+        slow = max(REST_SPEED, REST_SHARE * float(np.abs(speed[before:peak]).max(initial=0.0)))
+        if (np.abs(speed[max(int(peak - REST_S / step_s), 0) : peak]) < slow).all():
             # It rested, and then turned to another set point.
             continue
         beyond = abs(returned) / (1 + abs(again) / abs(returned))
