@@ -91,7 +91,7 @@ PARTS: Final = {
             "gap": (1250, 3000),
             "saturating": (5, 18),
             "cycling": (4.0, 9.0),
-            "noise": (0.26, 0.5),
+            "noise": (0.26, 0.36),
             "overshooting": (0.5, 1.2),
             "error": (13, 60),
         },
