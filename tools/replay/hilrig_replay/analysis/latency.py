@@ -9,6 +9,7 @@ A sample is only as good as its basis. A command of a connection that did not re
 another connection of the same controller was served. Its latency is measured only if the torques follow the positions.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -20,10 +21,12 @@ from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, windows
 from hilrig_replay.analysis.distribution import Statistics, percentiles
 from hilrig_replay.analysis.edge_stalls import edge_stalls
 from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
+from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.geometry.scene import parameters_of
+from hilrig_replay.io.disk_table import Blocks
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_replay.io.sequence_order import Repairs
@@ -54,6 +57,9 @@ class LatencyReport:
     loop_ms: Statistics | None
     """None: no closed loop (see `reasons`)."""
     stages_ms: dict[str, Statistics]
+    intervals_ms: dict[str, dict[str, Interval]]
+    """95 % confidence intervals of the percentiles of `loop`, each stage and `age`, by percentile (`intervals.SHARES`);
+    an infinite bound is not supported by the samples."""
     age_ms: Statistics | None
     """Age of the loop at each step; None: no command that is based on a state took effect."""
     control_period_ms: float | None
@@ -116,9 +122,12 @@ class LatencyReport:
         return "; ".join(reason.text for reason in self.reasons)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, without the samples."""
+        """Plain values for JSON, without the samples; None for an infinite bound."""
         plain = asdict(self.without_table())
         del plain["table"], plain["ages"]
+        for of_quantity in plain["intervals_ms"].values():
+            for name, bounds in of_quantity.items():
+                of_quantity[name] = [bound if math.isfinite(bound) else None for bound in bounds]
         return plain
 
 
@@ -146,6 +155,7 @@ def measure(
     table.finish()
     ages.finish()
     age, loop, stages, spread = ages.statistics(), None, {}, 0.0
+    intervals: dict[str, dict[str, Interval]] = {}
     windows = windows_of(run)
     other_connection = _other_connection_share(table) >= 0.5
     open_loop = other_connection and not follows_positions((window.states, window.commands) for window in windows)
@@ -157,6 +167,9 @@ def measure(
         stages = {stage: Statistics.of(table.column(stage)) for stage in STAGES}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
+        intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *STAGES)}
+    if age is not None:
+        intervals["age"] = _intervals_ms(ages.ages_ns)
     stalled = edge_stalls(quality.edge_stalls, table, windows, run.time_ns)
     reasons = tuple(quality.reasons(matcher.unmatched, loop, age, stalled))
     if open_loop:
@@ -186,6 +199,7 @@ def measure(
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
         stages_ms=stages,
+        intervals_ms=intervals,
         age_ms=age.age_ms if age else None,
         control_period_ms=age.control_period_ms if age else None,
         longest_hold_ms=age.longest_hold_ms if age else None,
@@ -203,6 +217,11 @@ def measure(
         table=table,
         ages=ages if age else None,
     )
+
+
+def _intervals_ms(values_ns: Blocks) -> dict[str, Interval]:
+    found = percentile_intervals(values_ns)
+    return {name: (low / 1e6, high / 1e6) for name, (low, high) in found.items()}
 
 
 def _other_connection_share(samples: SampleTable) -> float:
