@@ -51,7 +51,7 @@ def test_bounds_of_strongly_correlated_values_are_not_too_narrow() -> None:
     assert min(covered.values()) >= 85, covered
 
 
-def test_independent_values_would_be_too_narrow_for_correlated_ones() -> None:
+def test_correlation_reduces_the_effective_number_of_values() -> None:
     random = np.random.default_rng(2)
     correlated, independent = (autoregressive(rho, 4000, random) for rho in (0.9, 0.0))
     assert inefficiency(independent) < 1.5

@@ -17,9 +17,9 @@ from typing import Any
 from hilrig_replay.analysis.age import AgeTable
 from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
 from hilrig_replay.analysis.diagnosis.diagnose import diagnose
+from hilrig_replay.analysis.diagnosis.edge_stalls import edge_stalls
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, windows_of
 from hilrig_replay.analysis.distribution import Statistics, percentiles
-from hilrig_replay.analysis.edge_stalls import edge_stalls
 from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
 from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
