@@ -13,7 +13,7 @@ _PORT = "5020"
 def write_programs(guide: str, folder: Path, port: int) -> None:
     """Write the programs of a guide ("Save as `name`:") for the rig at this port, and copy the examples it names."""
     text = (GUIDES / f"{guide}.md").read_text(encoding="utf-8")
-    for name, program in re.findall(r"Save as `([^`]+)`:\n\n```\w*\n(.*?)```", text, re.DOTALL):
+    for name, program in re.findall(r"Save as `([^`]+)`[^\n]*:\n\n```\w*\n(.*?)```", text, re.DOTALL):
         (folder / name).write_text(program.replace(_PORT, str(port)), encoding="utf-8")
     for name in re.findall(r"`examples/([\w./-]+\.\w+)`", text):
         shutil.copy(EXAMPLES / name, folder)

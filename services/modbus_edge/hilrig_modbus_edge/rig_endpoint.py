@@ -180,5 +180,6 @@ class RigEndpoint:
         self.closing.close()
 
     def _publish_request_log(self) -> None:
-        clock = self._clock
-        self._request_log.publish(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
+        clock, server = self._clock, self._server
+        server.counters.requests += server.request_log.count
+        self._request_log.publish(server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))

@@ -75,7 +75,6 @@ class Connection(asyncio.Protocol):
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._log_request = server.request_log.record
-        self._counters = server.counters
         self._pending = b""
         """Received bytes that are not executed yet: more requests than one turn executes, or an incomplete one."""
         self._incomplete = b""
@@ -202,7 +201,6 @@ class Connection(asyncio.Protocol):
             code = reply[1]
             self._server.record_exception(client, transaction, unit, pdu, code)
         self._log_request(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
-        self._counters.requests += 1
         return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
 
     def _acknowledge(self) -> None:
