@@ -12,7 +12,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals
+from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, call_on_hangup, force_exit_after, stop_on_signals
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, lower_priority, set_short_slice
 
 ROUTER_RETRY_S: Final = 0.5
@@ -39,10 +39,18 @@ def run_service(
     allow_open_files()
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     force_exit_after(stopping, close_timeout_s)
+    running: list[Service] = []
+
+    def reload() -> None:
+        for service in running:
+            service.reload()
+
+    call_on_hangup(reload, stopping)
     bus = _open_bus(lab, name, instance, stopping)
     if bus is None:
         return
     with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
+        running.append(service)
         logger.debug("running as %s", service.source)
         with _stop_on_thread_crash(service):
             run(service)

@@ -5,6 +5,7 @@ is set; everything that it declared is closed afterwards, in reverse order. The 
 publishers and caches of `messaging`.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -29,6 +30,8 @@ from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, al
 MessageT = TypeVar("MessageT", bound=Message)
 EXTRA_QUEUED_BATCHES: Final = 64
 """Capacity of the queue of received batches beyond one batch per rig."""
+
+logger = logging.getLogger(__name__)
 
 
 class Service(Handle):
@@ -69,6 +72,8 @@ class Service(Handle):
         self._token: Handle | None = None
         self._failure = ""
         info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
+        self.reload: Callable[[], object] = lambda: logger.info("nothing to read again on SIGHUP")
+        """Called on SIGHUP, in any thread; set by the edge."""
         self.addresses: Callable[[str], str] = lambda _: ""
         """Returns the address of a rig for the service info; set by the edge."""
         self._registry = PeerRegistry(

@@ -1,7 +1,8 @@
 """Shutdown of a process: signals, end of the parent process, exit codes, and a forced exit if closing hangs.
 
 The first signal requests a shutdown and the loop ends itself; a second signal ends the process at once. A service
-started by `hilrig up` also stops when its parent ends, which closes its standard input. Every command uses this
+started by `hilrig up` also stops when its parent ends, which closes its standard input. SIGHUP makes a service read its
+configuration again, and ends it only if its terminal was closed. Every command uses this
 module, so it imports nothing that is slow to import.
 """
 
@@ -62,6 +63,35 @@ def stop_on_signals(*, stop_with_parent: bool = False) -> threading.Event:
     if stop_with_parent:
         stop_with_stdin(stopping)
     return stopping
+
+
+def call_on_hangup(callback: Callable[[], None], stopping: threading.Event) -> None:
+    """Call `callback`, in a thread, at each SIGHUP; set `stopping` instead if this process has lost its terminal."""
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is None:
+        return
+    # A program that was started with nohup runs on without its terminal.
+    stops_with_terminal = signal.getsignal(hangup) is not signal.SIG_IGN and _has_terminal()
+    received: SimpleQueue[int] = SimpleQueue()
+
+    def handle() -> None:
+        while True:
+            received.get()
+            if stops_with_terminal and not _has_terminal():
+                stopping.set()
+            else:
+                callback()
+
+    threading.Thread(target=handle, name="hangups", daemon=True).start()
+    signal.signal(hangup, lambda number, frame: received.put(number))  # noqa: ARG005
+
+
+def _has_terminal() -> bool:
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 def wait_for(stopping: threading.Event) -> None:

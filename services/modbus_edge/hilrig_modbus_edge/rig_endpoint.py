@@ -131,6 +131,10 @@ class RigEndpoint:
                 server.log_tcp_figures()
             self._publish_request_log()
 
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of clients with a certificate; see `RigServer.close_certificate`."""
+        return self._server.close_certificate(name, reason)
+
     def report(self) -> RigReport:
         """Return the part of the health report that describes the rig."""
         status = self.device.lease_status()

@@ -51,6 +51,7 @@ class Client:
     certificate: str = ""
     """Name in its certificate; empty: it has none."""
     may_write: bool = True
+    """Whether the role in its certificate allows writes."""
     controller: ConnectedController = field(init=False)
     """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
@@ -67,6 +68,11 @@ class Client:
     """`served` when its newest bytes arrived: they cannot be based on a newer one."""
     other_basis: ServedState | None = None
     """`ConnectedController.served` when its newest bytes arrived: the basis of a client that was itself served none."""
+
+    @property
+    def label(self) -> str:
+        """Address, and the name in its certificate if it has one: for texts."""
+        return f"{self.address} (CN={self.certificate})" if self.certificate else self.address
 
     def record_request(self, now_ns: int) -> None:
         """Record that a request arrived."""

@@ -115,13 +115,20 @@ class RigServer:
             if now_ns - connection.client.last_request_ns >= self._idle_ns:
                 connection.close(f"no request for {self._idle_ns / 1e9:g} s (edge.idle_timeout_s)")
 
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of the clients with this name in their certificate; return their number."""
+        found = [connection for connection in self.connections if connection.client.certificate == name]
+        for connection in found:
+            connection.close(reason)
+        return len(found)
+
     def close(self, reason: str) -> None:
         """Stop listening and close every connection."""
         for acceptor in self._acceptors:
             acceptor.cancel()
         for server in self._tls_servers:
             server.close()
-        for handshake in list(self._admission.pending_handshakes):
+        for handshake in self._admission.pending_handshakes:
             handshake.close()
         for connection in list(self.connections):
             connection.close(reason)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from hilrig_modbus_edge.server.admission import Admission
-from hilrig_runtime.config.lab import TlsConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.errors import InputError
 
 Role = Literal["operator", "observer", "refuse"]
@@ -81,7 +81,7 @@ class TlsHandshake(asyncio.Protocol):
         self._admission = admission
         self._policy = policy
         self._serve = serve
-        self.host = ""
+        self.peer = ("", 0)
         self._early = bytearray()
         self._task: asyncio.Task[None] | None = None
 
@@ -91,8 +91,8 @@ class TlsHandshake(asyncio.Protocol):
         self._transport = transport
         peer = self._admission.admit(transport)
         if peer is not None:
-            self.host = peer[0]
-            self._admission.pending_handshakes.add(self)
+            self.peer = peer
+            self._admission.begin_handshake(self)
             self._task = asyncio.get_running_loop().create_task(self._complete(*peer))
 
     def data_received(self, data: bytes) -> None:
@@ -136,8 +136,9 @@ class TlsHandshake(asyncio.Protocol):
                 "its certificate has no role that may connect; use a certificate with the role operator or observer",
             )
             secured.abort()
-            return
-        self._serve(secured, host, port, role == "operator", self._policy.name_of(certificate), bytes(self._early))
+        elif self._admission.admit(secured) is not None:
+            name = self._policy.name_of(certificate)
+            self._serve(secured, host, port, role == "operator", name, bytes(self._early))
 
 
 def _reason(error: Exception) -> str:

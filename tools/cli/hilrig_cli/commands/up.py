@@ -30,7 +30,7 @@ def up(
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.logging_setup import start_logging
-    from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_runtime.process.shutdown import call_on_hangup, stop_on_signals
     from hilrig_sim.parameters import lab_parameters
 
     lab = load_lab(config)
@@ -52,6 +52,7 @@ def up(
                 say(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{suffix}")
             say(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
             say("running; press Ctrl-C to stop")
+        call_on_hangup(supervisor.reload, stopping)
         viewer = None
         if view and not stopping.is_set():
             command = [sys.executable, "-m", "hilrig_cli", "live", lab.rigs[0].name]
