@@ -16,6 +16,8 @@ from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, call_on_hangup, for
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, lower_priority, set_short_slice
 
 ROUTER_RETRY_S: Final = 0.5
+DEFAULT_OPEN_FILES: Final = 1024
+"""Limit of open files on systems that do not report one."""
 
 logger = logging.getLogger(__name__)
 
@@ -87,15 +89,21 @@ def _set_scheduling(name: str, lab: LabConfig) -> None:
         logger.debug("no permission for a real-time scheduling policy: other programs may delay this one")
 
 
-def allow_open_files() -> None:
-    """Raise the limit of open files to the hard limit: each connection needs one, and the usual soft limit is 1,024."""
-    if sys.platform != "win32":
-        import resource
+def allow_open_files() -> int:
+    """Raise the limit of open files to the hard limit, and return it.
 
-        _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-        # Some systems report no limit, but accept less.
-        with contextlib.suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
+    Each connection needs one, and the usual soft limit is 1,024.
+    """
+    if sys.platform == "win32":
+        return DEFAULT_OPEN_FILES
+    import resource
+
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    # Some systems report no limit, but accept less.
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
+    soft_limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if soft_limit == resource.RLIM_INFINITY else soft_limit
 
 
 def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:
