@@ -118,8 +118,8 @@ def test_half_sent_requests_take_no_place(tmp_path: Path, secured: bool) -> None
     with ExitStack() as closing:
         context = None
         if secured:
-            authority = make_bus_folder(tmp_path, ["console"])
-            context = TlsFiles(tmp_path / "console.pem", tmp_path / "console.key").context()
+            authority = make_bus_folder(tmp_path / "certs", ["console"])
+            context = TlsFiles(tmp_path / "certs/console.pem", tmp_path / "certs/console.key").context()
             trusting = ssl.create_default_context(cadata=authority.certificate_pem.decode())
         server = closing.enter_context(running(context))
         for number in range(60):

@@ -35,6 +35,15 @@ _THREAD_LIMIT_MESSAGE: Final = "can't start new thread"
 """Text of Python's RuntimeError when the system refuses a new thread."""
 
 
+class ErrorOutput:
+    """Output of the errors that end this process; a service that logs JSON replaces `write`."""
+
+    @staticmethod
+    def write(line: str) -> None:
+        """Print one line on standard error."""
+        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+
 def stop_on_signals(*, stop_with_parent: bool = False) -> threading.Event:
     """Return an event that the first SIGINT or SIGTERM sets, and on request the end of the parent process.
 
@@ -125,7 +134,7 @@ def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
         stopping.wait()
         # A daemon thread: it ends with the process if closing succeeds.
         threading.Event().wait(timeout_s)
-        print("hilrig: shutdown timed out; exiting anyway", file=sys.stderr)
+        ErrorOutput.write("error: shutdown timed out; exiting anyway")
         os._exit(3)
 
     threading.Thread(target=watch, name="close-guard", daemon=True).start()
@@ -155,31 +164,27 @@ def _run_and_report(main: Callable[[], int | None]) -> int:
             sys.stdout.flush()
     except HilrigError as error:
         for line in str(error).splitlines():
-            print(f"hilrig: error: {printable(line)}", file=sys.stderr)
+            ErrorOutput.write(f"error: {printable(line)}")
         return error.exit_code
     except KeyboardInterrupt:
         return 130
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and str(error) != _THREAD_LIMIT_MESSAGE:
             raise
-        print(
-            "hilrig: error: out of memory or threads: raise the limits (ulimit -v, ulimit -u; mem_limit and pids_limit "
-            "of a container), or stop other programs",
-            file=sys.stderr,
+        ErrorOutput.write(
+            "error: out of memory or threads: raise the limits (ulimit -v, ulimit -u; mem_limit and pids_limit of a "
+            "container), or stop other programs"
         )
         return OperationError.exit_code
     except OSError as error:
         if error.errno in _FILE_LIMIT_ERRORS:
-            print(
-                "hilrig: error: too many open files: raise the limit (ulimit -n, or LimitNOFILE of a service)",
-                file=sys.stderr,
-            )
+            ErrorOutput.write("error: too many open files: raise the limit (ulimit -n, or LimitNOFILE of a service)")
             return OperationError.exit_code
         if error.errno not in _DISK_ERRORS:
             raise
         _drop_output()
         target = error.filename or "standard output"
-        print(f"hilrig: error: {printable(str(target))}: can't be written: {error.strerror}", file=sys.stderr)
+        ErrorOutput.write(f"error: {printable(str(target))}: can't be written: {error.strerror}")
         return OperationError.exit_code
 
 

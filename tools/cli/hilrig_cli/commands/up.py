@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hilrig_cli.commands.services import LogFormat, StopWithParent
-from hilrig_cli.options import Config, log
+from hilrig_cli.options import Config
 
 
 def up(
@@ -33,14 +33,12 @@ def up(
     from hilrig_runtime.process.shutdown import call_on_hangup, stop_on_signals
     from hilrig_sim.parameters import lab_parameters
 
+    start_logging("up", "1", log_format)
+    report: Callable[[str], None] = logging.getLogger(__name__).info
+    say: Callable[[str], None] = partial(print, flush=True) if log_format == "text" else report
     lab = load_lab(config)
     lab_parameters(lab, str(config or "defaults"))
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
-    say: Callable[[str], None] = partial(print, flush=True)
-    report: Callable[[str], None] = log
-    if log_format != "text":
-        start_logging("up", "1", log_format)
-        say = report = logging.getLogger(__name__).info
 
     processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
     with running_lab(lab, config, report, stopping, processes, ["--log-format", log_format]) as supervisor:
