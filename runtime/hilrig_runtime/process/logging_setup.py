@@ -47,7 +47,7 @@ def start_logging(service: str, instance: str, log_format: str) -> None:
         handler.setFormatter(JsonFormatter(service, instance))
         logging.captureWarnings(True)
         ErrorOutput.write = staticmethod(_log_final_error)  # type: ignore[method-assign]
-        sys.excepthook = lambda kind, error, trace: logger.critical(str(error), exc_info=(kind, error, trace))  # type: ignore[arg-type]
+        sys.excepthook = lambda kind, error, trace: logger.critical(str(error), exc_info=(kind, error, trace))
         threading.excepthook = _log_crash
     else:
         source = service if instance == "1" else f"{service} {instance}"
