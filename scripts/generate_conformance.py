@@ -340,6 +340,7 @@ SECURITY_RULES: tuple[tuple[str, str], ...] = (
         "test_unfinished_handshakes_take_no_place",
     ),
     ("a client cannot renegotiate", "test_client_cannot_renegotiate"),
+    ("a connection is closed when the client's certificate expires", "test_connection_ends_with_its_certificate"),
 )
 """Rule of Modbus/TCP Security, and its test function in `tests/rig/test_modbus_tls.py`."""
 

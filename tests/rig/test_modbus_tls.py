@@ -142,6 +142,19 @@ def test_invalid_certificate_is_refused_with_reason(rig: EdgeRig, lab: Lab, name
     assert talk(rig, lab.client("operator"), READ)
 
 
+def test_connection_ends_with_its_certificate(rig: EdgeRig, lab: Lab) -> None:
+    soon = datetime.now(UTC) + timedelta(seconds=1.3) - timedelta(days=1)
+    lab.write("short", issue_client(lab.authority, "short", "operator", soon, 1))
+    with connected(rig, lab.client("short")) as secured, connected(rig, lab.client("operator")) as other:
+        assert ask(secured, WRITE) == bytes.fromhex("06 00 00 03 E8")
+        assert ask(other, READ)
+        assert secured.recv(1) == b""
+        assert "its certificate has expired" in rig.event(Event.LEASE_LOST).text
+        assert ask(other, READ)
+    with pytest.raises(OSError):  # noqa: PT011  # depends on the TLS library of the client
+        talk(rig, lab.client("short"), READ)
+
+
 UTF8, PRINTABLE = b"\x0c", b"\x13"
 OPERATOR, OBSERVER = b"\x08operator", b"\x08observer"
 

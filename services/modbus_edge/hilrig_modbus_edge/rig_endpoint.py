@@ -122,6 +122,7 @@ class RigEndpoint:
         if server.connections:
             self.device.refresh_state()
             server.close_idle(now_ns)
+            server.close_expired(self._clock.wall_ns())
         count = server.request_log.count
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
             late_ns = max(0, now_ns - self.request_log_due_ns)
