@@ -111,7 +111,7 @@ class EdgeService:
                 "reset_rig": self._reset_rig,
                 "revoke_client": self._revoke_client,
             }
-            service.reload = partial(self._loop.call_soon_threadsafe, self._reload)
+            service.reload = self._reload
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
             handler = partial(handle_control_request, handlers)
             self._closing.enter_context(self._executor.serve(service.bus, key, handler))
@@ -190,13 +190,16 @@ class EdgeService:
         return ControlReply(text=f"{name} may only read; connections closed: {closed}")
 
     def _reload(self) -> None:
-        """Read [edge.tls.clients] again, because of SIGHUP."""
+        """Read [edge.tls.clients] again, because of SIGHUP; in another thread, because a large file takes a while."""
         try:
-            self._use(self._service.lab.read_again().edge.tls)
+            tls = self._service.lab.read_again().edge.tls
         except InputError as error:
             logger.error("[edge.tls.clients] not read again, the previous one stays in force: %s", error)
             return
-        logger.info("[edge.tls.clients] read again; other changes of lab.toml take effect at the next start")
+        # The event loop may be closed already.
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._use, tls)
+            logger.info("[edge.tls.clients] read again; other changes of lab.toml take effect at the next start")
 
     def _use(self, tls: TlsConfig | None) -> None:
         self._tls = tls
