@@ -77,7 +77,7 @@ class MetricsServer(ThreadingHTTPServer):
                     _end(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log an internal error; a client that disconnects is none."""
+        """Log an internal error, but no client that disconnects."""
         del request
         if not isinstance(error := sys.exception(), OSError):
             logger.error("request of %s failed", client_address[0], exc_info=error)

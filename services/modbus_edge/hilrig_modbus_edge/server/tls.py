@@ -24,7 +24,7 @@ Role = Literal["operator", "observer", "refuse"]
 
 
 class ClientCertificate(NamedTuple):
-    """What the edge uses of a client's certificate."""
+    """Properties of a client's certificate."""
 
     name: str
     """Common name."""
