@@ -46,12 +46,14 @@ class EventEmitter:
         text: str,
         controller: str,
         *,
+        certificate: str = "",
         reason: str = "",
         holder: str = "",
     ) -> None:
         """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
+        event.controller_data.certificate = certificate
         event.controller_data.reason = reason
         event.controller_data.holder = holder
         self.emit(event)
@@ -92,33 +94,35 @@ class LeaseEventReporter:
         self._rig = rig
         self._events = events
         self._acquisitions: RateLimiter[str] = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._denials: RepeatReporter[tuple[str, str], tuple[str, Refusal]] = RepeatReporter(
+        self._denials: RepeatReporter[tuple[str, str], tuple[Client, Refusal]] = RepeatReporter(
             LEASE_EVENT_PERIOD_NS, self._emit_denied
         )
-        self._pending_acquire: tuple[str, int] | None = None
-        """Address of the lease holder and time of the acquisition (ns), if it was suppressed."""
+        self._pending_acquire: tuple[Client, int] | None = None
+        """Connection of the lease holder and time of the acquisition (ns), if it was suppressed."""
 
     def lease_acquired(self, client: Client, now_ns: int) -> None:
         """Report that a client acquired the lease; ns, monotonic clock."""
         count = self._acquisitions.record(client.host, now_ns)
-        self._pending_acquire = None if count else (client.address, now_ns)
+        self._pending_acquire = None if count else (client, now_ns)
         if count:
-            self._emit_acquired(client.address, count)
+            self._emit_acquired(client, count)
 
-    def lease_released(self, address: str, reason: str, *, disconnected: bool) -> None:
+    def lease_released(self, client: Client, reason: str, *, disconnected: bool) -> None:
         """Report that the holder has no lease any more; `disconnected`: its last writing connection was closed."""
         if self._pending_acquire is not None:
             self._pending_acquire = None
             if disconnected:
                 return
-            self._emit_acquired(address)
+            self._emit_acquired(client)
         verb = "released" if disconnected else "lost"
-        text = f"{address} {verb} the lease of {self._rig}: {reason}"
-        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, address, reason=reason)
+        text = f"{client.label} {verb} the lease of {self._rig}: {reason}"
+        self._events.emit_for_controller(
+            Event.LEASE_LOST, Event.INFO, text, client.address, certificate=client.certificate, reason=reason
+        )
 
     def lease_denied(self, client: Client, refusal: Refusal, now_ns: int) -> None:
         """Report a denied write; ns, monotonic clock."""
-        self._denials.record((client.host, refusal.cause), (client.address, refusal), now_ns)
+        self._denials.record((client.host, refusal.cause), (client, refusal), now_ns)
 
     def flush_denials(self) -> None:
         """Report the denied writes that were not reported, because a session starts or ends."""
@@ -131,19 +135,27 @@ class LeaseEventReporter:
         """
         self._denials.check(now_ns)
         if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
-            address, self._pending_acquire = self._pending_acquire[0], None
-            self._emit_acquired(address)
+            client, self._pending_acquire = self._pending_acquire[0], None
+            self._emit_acquired(client)
 
-    def _emit_denied(self, denied: tuple[str, Refusal], count: int) -> None:
-        address, refusal = denied
-        text = f"{address}: write to {self._rig} denied: {refusal.reason}{repeat_suffix(count)}"
+    def _emit_denied(self, denied: tuple[Client, Refusal], count: int) -> None:
+        client, refusal = denied
+        text = f"{client.label}: write to {self._rig} denied: {refusal.reason}{repeat_suffix(count)}"
         self._events.emit_for_controller(
-            Event.LEASE_REFUSED, Event.WARNING, text, address, reason=refusal.reason, holder=refusal.holder
+            Event.LEASE_REFUSED,
+            Event.WARNING,
+            text,
+            client.address,
+            certificate=client.certificate,
+            reason=refusal.reason,
+            holder=refusal.holder,
         )
 
-    def _emit_acquired(self, address: str, count: int = 1) -> None:
-        text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
-        self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
+    def _emit_acquired(self, client: Client, count: int = 1) -> None:
+        text = f"{client.label} acquired the lease of {self._rig}{repeat_suffix(count)}"
+        self._events.emit_for_controller(
+            Event.LEASE_GRANTED, Event.INFO, text, client.address, certificate=client.certificate
+        )
 
 
 class StallReporter:

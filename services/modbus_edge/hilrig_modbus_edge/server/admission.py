@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.addresses import format_address, plain_host
 from hilrig_runtime.counters import Counters
+from hilrig_runtime.pending_connections import PendingConnections
 from hilrig_runtime.timing.rate_limiter import RepeatReporter
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
@@ -40,9 +41,10 @@ class Limits:
 
 
 class PendingHandshake(Protocol):
-    """A connection that was admitted and whose TLS handshake is not complete."""
+    """A connection whose TLS handshake is not complete."""
 
-    host: str
+    peer: tuple[str, int]
+    """Host and port."""
 
     def close(self) -> None:
         """Abort the handshake and close the connection."""
@@ -57,27 +59,33 @@ class Admission:
         limits: Limits,
         monotonic_ns: Callable[[], int],
         counters: Counters,
-        make_room: Callable[[str], bool],
+        make_room: Callable[[str, bool], bool],
     ) -> None:
-        self.pending_handshakes: set[PendingHandshake] = set()
-        """They count as connections: otherwise one host could block all others with incomplete handshakes."""
+        self.pending_handshakes: PendingConnections[PendingHandshake] = PendingConnections(
+            limits.connections, limits.connections_per_host
+        )
+        """They are limited like connections, but do not count as such: they take no place of a controller."""
         self._device = device
         self._limits = limits
         self._monotonic_ns = monotonic_ns
         self._counters = counters
         self._make_room = make_room
-        """Closes an idle connection of a host, or, with an empty host, of any; returns whether there was one."""
+        """Returns whether a host, or, if that is empty, any, has an idle connection; with the flag it is closed."""
         self._refused: RepeatReporter[tuple[str, str], tuple[str, str]] = RepeatReporter(
             REFUSED_EVENT_PERIOD_NS, self._report_refused
         )
 
-    def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
-        """Return host and port of an admitted connection; else close the connection and return None."""
+    def admit(self, transport: asyncio.Transport, *, before_handshake: bool = False) -> tuple[str, int] | None:
+        """Return host and port of an admitted connection; else close the connection and return None.
+
+        With TLS it is called again after the handshake, because others may have been admitted since, and because a
+        client that may not connect must not take the place of an idle connection.
+        """
         peer = transport.get_extra_info("peername")
         # A peer that has already disconnected has no name.
         if peer:
             host, port = plain_host(peer[0]), peer[1]
-            reason = self.rejection_reason(host)
+            reason = self.rejection_reason(host, close_now=not before_handshake)
             if not reason:
                 set_socket_options(transport.get_extra_info("socket"))
                 return host, port
@@ -85,23 +93,32 @@ class Admission:
         transport.abort()
         return None
 
-    def rejection_reason(self, host: str) -> str:
-        """Return why a host may not connect now, human-readable; empty: it may."""
-        limits, device, pending = self._limits, self._device, self.pending_handshakes
+    def rejection_reason(self, host: str, *, close_now: bool) -> str:
+        """Return why a host may not connect now, human-readable; empty: it may.
+
+        If a limit is reached, an idle connection makes room for it: it is closed now, or only considered.
+        """
+        limits, device = self._limits, self._device
         if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
             return "its address is not in the allow-list; add it to `allow` of the rig in lab.toml"
-        of_host = device.connections_of(host) + sum(one.host == host for one in pending)
-        if of_host >= limits.connections_per_host and not self._make_room(host):
+        if device.connections_of(host) >= limits.connections_per_host and not self._make_room(host, close_now):
             return (
                 f"the host has its maximum of {limits.connections_per_host} connections; close unused ones, or raise "
                 "edge.max_connections_per_host"
             )
-        if len(device.clients) + len(pending) >= limits.connections and not self._make_room(""):
+        if len(device.clients) >= limits.connections and not self._make_room("", close_now):
             return (
                 f"the rig has its maximum of {limits.connections} connections; close unused ones, or raise "
                 "edge.max_connections"
             )
         return ""
+
+    def begin_handshake(self, handshake: PendingHandshake) -> None:
+        """Track an incomplete handshake; close an older one if there are too many."""
+        oldest = self.pending_handshakes.add(handshake, handshake.peer[0])
+        if oldest is not None:
+            oldest.close()
+            self.refuse(*oldest.peer, "TLS handshake not completed before too many others were started")
 
     def refuse(self, host: str, port: int, reason: str) -> None:
         """Count a refused connection and report it, rate-limited."""

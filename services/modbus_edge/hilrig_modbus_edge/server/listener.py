@@ -21,7 +21,7 @@ from hilrig_modbus_edge.server.event_loop import (
 )
 from hilrig_modbus_edge.server.exception_log import LOG_PERIOD_NS, ExceptionLog
 from hilrig_modbus_edge.server.tcp_figures import tcp_figures
-from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
+from hilrig_modbus_edge.server.tls import ClientCertificate, TlsHandshake, TlsPolicy
 from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError
@@ -32,6 +32,9 @@ BACKLOG: Final = 128
 """Connections that the system queues until they are accepted."""
 ALERT_NS: Final = LOG_PERIOD_NS + 2_000_000_000
 """Time for which a log message is also an alert of the rig, ns: until the next one if its cause persists."""
+
+NO_CERTIFICATE: Final = ClientCertificate("", may_write=True, expiry_ns=0)
+"""Of a connection without TLS."""
 
 logger = logging.getLogger(__name__)
 
@@ -80,13 +83,13 @@ class RigServer:
         transport: asyncio.Transport,
         host: str,
         port: int,
-        may_write: bool = True,
-        certificate: str = "",
+        certificate: ClientCertificate = NO_CERTIFICATE,
         early: bytes = b"",
     ) -> None:
-        """Serve an admitted client; `certificate`: name in its certificate, `early`: data that it has already sent."""
-        client = self.device.connect(host, port, may_write=may_write, certificate=certificate)
+        """Serve an admitted client; `early`: data that it has already sent."""
+        client = self.device.connect(host, port, may_write=certificate.may_write, certificate=certificate.name)
         connection = Connection(self, transport, client)
+        connection.expiry_ns = certificate.expiry_ns
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
@@ -136,19 +139,35 @@ class RigServer:
         idle_ns = now_ns - connection.client.last_request_ns
         return idle_ns if idle_ns >= self._idle_ns else 0
 
-    def _make_room(self, host: str) -> bool:
-        """Close the connection that was idle for the longest time, if it was for the idle timeout.
+    def _make_room(self, host: str, close_now: bool) -> bool:
+        """Return whether a connection was idle for the idle timeout, and close the one that was for the longest time.
 
         Args:
             host: only connections of this host; empty: of all hosts.
+            close_now: close it; otherwise it is only considered.
         """
         now_ns = self.monotonic_ns()
         candidates = [connection for connection in self.connections if host in ("", connection.client.host)]
         longest = min(candidates, key=lambda connection: connection.client.last_request_ns, default=None)
         if not self._idle_ns or longest is None or not self._idle_since(longest, now_ns):
             return False
-        longest.make_room(f"no request for {self._idle_since(longest, now_ns) / 1e9:.0f} s, and its place is needed")
+        if close_now:
+            idle_s = self._idle_since(longest, now_ns) / 1e9
+            longest.make_room(f"no request for {idle_s:.0f} s, and its place is needed")
         return True
+
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of the clients with this name in their certificate; return their number."""
+        found = [connection for connection in self.connections if connection.client.certificate == name]
+        for connection in found:
+            connection.close(reason)
+        return len(found)
+
+    def close_expired(self, wall_ns: int) -> None:
+        """Close the connections whose certificate has expired; `wall_ns`: wall clock."""
+        for connection in list(self.connections):
+            if 0 < connection.expiry_ns <= wall_ns:
+                connection.close("its certificate has expired; renew it with hilrig certs")
 
     def close(self, reason: str) -> None:
         """Stop listening and close every connection."""
@@ -156,7 +175,7 @@ class RigServer:
             acceptor.cancel()
         for server in self._tls_servers:
             server.close()
-        for handshake in list(self._admission.pending_handshakes):
+        for handshake in self._admission.pending_handshakes:
             handshake.close()
         for connection in list(self.connections):
             connection.close(reason)
