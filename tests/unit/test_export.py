@@ -12,9 +12,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from hilrig_recorder.mcap_format.file_names import recovering_path
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.export.export import TABLES, TEMPORARY_SUFFIX, export_foxglove, export_tables, table
+from hilrig_replay.export.export import TABLES, export_foxglove, export_tables, table
 from hilrig_replay.geometry.quaternion import rotate
 from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
 from hilrig_replay.io.run import open_run
@@ -89,7 +90,7 @@ def test_documented_stage_formulas_give_the_stages(recording: Path, tmp_path: Pa
 
 
 def test_leftover_of_a_killed_export_is_replaced(recording: Path, tmp_path: Path) -> None:
-    (tmp_path / f"fox.mcap{TEMPORARY_SUFFIX}").write_bytes(b"incomplete")
+    recovering_path(tmp_path / "fox.mcap").write_bytes(b"incomplete")
     out = export_foxglove(open_run(recording), tmp_path / "fox.mcap")
     assert [path.name for path in tmp_path.iterdir()] == [out.name]
 

@@ -75,5 +75,11 @@ def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
     store.tick(0)
     assert store.open(recording)
     assert [path.name for path in folder.iterdir()] == ["s.2.mcap.part"]
-    store.close(recording, "ended", "")
+    # The session ends because its owner is silent, and continues later, in a folder that was replaced again.
+    store.close(recording, "keeper lost", "")
+    folder.rename(tmp_path / "moved again")
+    again = Recording("rig1", "s", "", "edge/1", 1, 0, store)
+    assert store.open(again)
+    assert [path.name for path in folder.iterdir()] == ["s.3.mcap.part"]
+    store.close(again, "ended", "")
     store.release()

@@ -146,7 +146,8 @@ def _print_json(folder: Path, entries: "list[RunEntry]", total: int) -> None:
     runs = []
     for entry in entries:
         values = asdict(entry)
-        del values["mtime_ns"], values["measured"]
+        del values["mtime_ns"], values["measured"], values["segment"]
+        values["segments"] = [str(folder / path) for path in entry.paths]
         values["path"] = str(folder / entry.path)
         values["start"] = _date(entry.start_wall_ns, "%Y-%m-%dT%H:%M:%SZ")
         runs.append(values)

@@ -333,7 +333,11 @@ function showRuns(list) {
       links.append(html("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
         "aria-label": `Report of ${run.name}`}, "Report"));
     }
-    if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
+    const files = run.open ? [] : run.segments.length ? run.segments : [run.path];
+    files.forEach((path, number) => {
+      const label = files.length > 1 ? ` ${number + 1}` : "";
+      links.append(html("a", {href: `recordings/${pathOf(path)}`, download: "", "aria-label": `Recording ${run.name}${label}`}, `MCAP${label}`));
+    });
     if (run.error) {
       row.append(html("td", {class: "long", colspan: "9"}, run.error), links);
       return row;

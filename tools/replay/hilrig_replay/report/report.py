@@ -16,6 +16,7 @@ from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.io.segments import RunFiles, as_files
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
@@ -86,7 +87,7 @@ class Report:
 
 
 def build_report(
-    paths: Sequence[Path],
+    runs: Sequence[Path | RunFiles],
     *,
     verified: bool = False,
     task: TaskConfig | None = None,
@@ -96,7 +97,7 @@ def build_report(
     """Build the report of one run, or of several with a ranking; unreadable recordings are listed in the report.
 
     Args:
-        paths: recordings.
+        runs: recordings, each of one file or several segments.
         verified: re-simulate each run and report whether the result is identical.
         task: grading task for all runs; None: the task in each recording's lab.toml.
         on_progress: called with the completed share of the runs, 0 to 1.
@@ -107,15 +108,15 @@ def build_report(
     """
     pages: list[_Page] = []
     left_out: list[str] = []
-    for done, one in enumerate(_pages(paths, verified, task, workers), start=1):
+    for done, one in enumerate(_pages(runs, verified, task, workers), start=1):
         if isinstance(one, _Page):
             pages.append(one)
-        elif len(paths) == 1:
+        elif len(runs) == 1:
             raise one
         else:
             left_out.append(str(one))
         if on_progress is not None:
-            on_progress(done / len(paths))
+            on_progress(done / len(runs))
     if not pages:
         raise InputError("no readable recording:\n" + "\n".join(left_out))
     pages.sort(key=_rank)
@@ -160,11 +161,13 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
 
 
 def _pages(
-    paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
+    runs: Sequence[Path | RunFiles], verified: bool, task: TaskConfig | None, workers: int | None
 ) -> Iterator[_Page | HilrigError]:
-    """Page of each run, or the reason why it is missing, in the order of `paths`."""
+    """Page of each run, or the reason why it is missing, in the order of `runs`."""
+    files = list(map(as_files, runs))
+    paths = [run[0] for run in files]
     names = display_names(paths)
-    tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
+    tasks = files, [names[path] for path in paths], repeat(verified), repeat(task)
     if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
         yield from map(_page_or_error, *tasks)
     else:
@@ -172,10 +175,10 @@ def _pages(
             yield from executor.map(_page_or_error, *tasks)
 
 
-def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | HilrigError:
+def _page_or_error(files: RunFiles, name: str, verified: bool, task: TaskConfig | None) -> _Page | HilrigError:
     try:
-        with isolated(path):
-            return _page(open_run(path), name, verified, task)
+        with isolated(files[0]):
+            return _page(open_run(files), name, verified, task)
     except HilrigError as error:
         # The exceptions of recordings can't be sent between processes.
         return OperationError(str(error)) if isinstance(error, OperationError) else InputError(str(error))
@@ -199,7 +202,7 @@ def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page
         )
     # Frees the samples once they are drawn: a group may have many runs.
     summary = replace(summary, name=name, latency=summary.latency.without_table())
-    return _Page(summary, tuple(figures), verify(run.path) if verified else None)
+    return _Page(summary, tuple(figures), verify(run.file.paths) if verified else None)
 
 
 def _run(page: _Page) -> str:
