@@ -317,7 +317,7 @@ def test_file_truncated_by_others_is_not_finished(tmp_path: Path) -> None:
     fill(writer, 10)
     writer.close_chunk()
     os.truncate(writer.temporary_path, writer.size // 2)
-    with pytest.raises(OSError, match="can't be read back"):
+    with pytest.raises(OSError, match="truncated while it was being written"):
         writer.finish()
     writer.discard()
 

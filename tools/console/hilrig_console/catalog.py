@@ -174,7 +174,7 @@ def _search_text(entry: RunEntry) -> str:
 
 def _row(entry: RunEntry) -> dict[str, Any]:
     row = asdict(entry)
-    for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab", "segment"):
+    for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab", "segment", "span"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = recording_stem(Path(entry.path).name)

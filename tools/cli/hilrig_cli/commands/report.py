@@ -62,7 +62,13 @@ def report(
     if as_json:
         print(
             json.dumps(
-                {"page": str(out), "runs": result.runs, "left_out": result.left_out, "alike": result.same_torques}
+                {
+                    "page": str(out),
+                    "runs": result.runs,
+                    "left_out": result.left_out,
+                    "alike": result.same_torques,
+                    "overlaps": result.overlaps,
+                }
             )
         )
     else:
@@ -71,5 +77,7 @@ def report(
             print(f"skipped: {printable(reason)}", file=sys.stderr)
         for pair in result.same_torques:
             print(f"same torques: {printable(pair)}", file=sys.stderr)
+        for sentence in result.overlaps:
+            print(printable(sentence), file=sys.stderr)
     if result.left_out:
         raise typer.Exit(1)

@@ -56,7 +56,7 @@ def verify(
             print(printable(str(error)), file=sys.stderr)
             continue
         # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
-        with suppress(OSError):
+        with suppress(OSError, HilrigError):
             write_verdict(files, verification.same, verification.sentence())
         verifications.append(verification)
         if not as_json:

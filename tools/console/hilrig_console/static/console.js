@@ -346,7 +346,7 @@ function showRuns(list) {
     const fit = html("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
     const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1), fixed(run.age_p99_ms, 1)];
     row.append(html("td", {}, run.controller || "none"), ...figures.map((text) => html("td", {class: "n"}, text)),
-      html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, run.open ? "recording" : run.ended), links);
+      html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, [run.open ? "recording" : run.ended, ...run.overlaps.map((session) => `overlaps with ${session}`)].join("; ")), links);
     return row;
   }));
 }

@@ -19,9 +19,11 @@ from hilrig_recorder.mcap_format.records import DamagedError, decode_chunk_index
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.data_quality import Reason
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.overlap import NO_SPAN, Span, overlapping
 from hilrig_replay.io.extent import Extent, extent_of, state_range
 from hilrig_replay.io.isolation import EvaluationError, isolated
 from hilrig_replay.io.joined_recording import open_segments
+from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.paths import walk_recordings
 from hilrig_replay.io.recording_file import DamagedRecordingError
 from hilrig_replay.io.run import open_run
@@ -71,6 +73,10 @@ class RunEntry:
     """Place of the file in its session."""
     segments: tuple[str, ...] = ()
     """Paths of all files, if there are several."""
+    span: Span = NO_SPAN
+    """When the session was recorded."""
+    overlaps: tuple[str, ...] = ()
+    """Sessions of the same rig at the same time: a manual recording, or of controllers in it."""
     controller: str = ""
     start_wall_ns: int = 0
     """Time of the first state by the clock of its sender, ns since 1970-01-01 UTC."""
@@ -139,6 +145,8 @@ class RunIndex:
             self._known[entry.paths] = entry
         runs = [self._run(paths, known) for paths in self._grouped()]
         self._changed |= len(known) != len(self._known)
+        overlaps = overlapping([run.span for run in runs])
+        runs = [replace(run, overlaps=sessions) for run, sessions in zip(runs, overlaps, strict=True)]
         entries = [
             entry if entry.error else replace(entry, verified=read_verdict(self._files(entry))) for entry in runs
         ]
@@ -205,6 +213,7 @@ class RunIndex:
                 values = dict(zip(names, row, strict=True))
                 values["unfit_reasons"] = tuple(Reason(**reason) for reason in values["unfit_reasons"])
                 values["segment"], values["segments"] = Segment(*values["segment"]), tuple(values["segments"])
+                values["span"], values["overlaps"] = Span(*values["span"]), tuple(values["overlaps"])
                 entries.append(RunEntry(**values))
             return {entry.paths: entry for entry in entries}
         except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
@@ -261,11 +270,13 @@ def write_verdict(run: Path | RunFiles, verified: bool, detail: str = "") -> Non
     """Write the result of a verification to a file next to the (first) recording of the run.
 
     Raises:
-        OSError: the file can't be written.
+        OSError: the recording can't be read.
+        HilrigError: the file can't be written, or is itself a recording.
     """
     files = as_files(run)
     verdict = {"verified": verified, **_identity(files), "detail": detail}
-    _verdict_path(files).write_text(json.dumps(verdict) + "\n")
+    with output_file(_verdict_path(files)) as temporary:
+        temporary.write_text(json.dumps(verdict) + "\n")
 
 
 def read_verdict(run: Path | RunFiles) -> bool | None:
@@ -314,6 +325,9 @@ def _joined(folder: Path, entries: list[RunEntry]) -> RunEntry:
         first,
         start_wall_ns=extent.start_wall_ns,
         duration_s=extent.duration_s,
+        span=first.span._replace(
+            end_ns=last.span.end_ns, incarnations=[*first.span.incarnations, *last.span.incarnations]
+        ),
         ended=IN_PROGRESS if is_open else last.ended,
         reason=last.reason,
         **total,
@@ -332,15 +346,19 @@ def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
     entry = _with_session(blank, session, summary.segment)
     first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
     extent = Extent(first_ns or entry.start_wall_ns, (last_ns - first_ns) / 1e9)
+    span = Span(entry.session, entry.rig, not entry.controller, entry.start_wall_ns, int(trailer.get("end_wall_ns", 0)))
     # Damage of a chunk is reported when the recording is measured.
     with contextlib.suppress(DamagedError):
         chunks, channel = summary.chunk_indexes, summary.state_channel
         states = state_range(reader, _with(channel, chunks), _with(channel, reversed(chunks)), channel)
-        extent = extent if states is None else extent_of(states)
+        if states is not None:
+            extent = extent_of(states)
+            span = span._replace(incarnations=[one.incarnation for one in states])
     return replace(
         entry,
         start_wall_ns=extent.start_wall_ns,
         duration_s=extent.duration_s,
+        span=span,
         messages=statistics.message_count,
         ended=trailer.get("ended", ""),
         reason=trailer.get("reason", ""),

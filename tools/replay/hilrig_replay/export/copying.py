@@ -1,6 +1,6 @@
 """Copies a recording, of one file or several, into a new file with the channels of this version."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
 from hilrig_recorder.mcap_format.records import Message
@@ -9,12 +9,10 @@ from hilrig_replay.io.recording_file import RecordingFile
 from hilrig_schemas.topics import RECORDED
 
 
-def copy_metadata(recording: RecordingFile, writer: RecordingWriter, session: Mapping[str, str] = {}) -> None:
-    """Write the metadata, with `session` added to that of the session, and the attachments."""
+def copy_metadata(recording: RecordingFile, writer: RecordingWriter) -> None:
+    """Write the metadata and the attachments."""
     for name, values in recording.metadata.items():
-        added = session if name == "hilrig.session" else {}
-        is_repeated = name.startswith(("hilrig.session", "hilrig.config"))
-        writer.add_metadata(name, {**values, **added}, is_repeated=is_repeated)
+        writer.add_metadata(name, values, is_repeated=name.startswith(("hilrig.session", "hilrig.config")))
     for item in recording.attachment_records:
         writer.add_attachment(
             item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time

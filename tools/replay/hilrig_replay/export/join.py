@@ -34,9 +34,8 @@ def join(paths: Sequence[Path], path: Path) -> int:
     for before, source in pairwise(first):
         _check_order(before, source)
     recording = open_segments(first)
-    last = max(read_segment(source).last for source in first)
     with new_file(path) as writer:
-        copy_metadata(recording, writer, {"last_part": str(last)})
+        copy_metadata(recording, writer)
         for message in own_messages(recording):
             writer.add(encode_message(*message))
         writer.finish()

@@ -135,6 +135,9 @@ def _merged(records: Sequence[_Metadata], repeated: int) -> _Metadata:
         elif (content := tuple(values.items())) not in found[kind]:
             found[kind].add(content)
             merged[kind if len(found[kind]) == 1 else f"{kind}.{len(found[kind])}"] = dict(values)
+    if "hilrig.session" in merged:
+        last = records[-1].get("hilrig.session", {})
+        merged["hilrig.session"]["last_part"] = last.get("last_part", last.get("part", "1"))
     if summaries := [one["hilrig.summary"] for one in records if "hilrig.summary" in one]:
         counts = {key: sum(int(one.get(key, 0)) for one in summaries) for key in _COUNTS}
         counts["messages"] = max(0, counts["messages"] - repeated)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
+from hilrig_replay.analysis.overlap import overlapping
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
@@ -84,6 +85,8 @@ class Report:
     """Reason why a recording is not in the report, one sentence per recording."""
     same_torques: tuple[str, ...]
     """Pairs of runs with the same torques, one sentence per pair."""
+    overlaps: tuple[str, ...]
+    """Manual recordings of other runs, which are not graded; one sentence per recording."""
 
 
 def build_report(
@@ -119,11 +122,31 @@ def build_report(
             on_progress(done / len(runs))
     if not pages:
         raise InputError("no readable recording:\n" + "\n".join(left_out))
-    pages.sort(key=_rank)
+    pages = sorted(_marked(pages), key=_rank)
     verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
     values = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
     pairs = _same_torques(pages)
-    return Report(_html(pages, left_out, pairs), values, tuple(left_out), pairs)
+    overlaps = tuple(
+        f"{page.summary.name}: recorded manually at the time of {', '.join(page.summary.overlaps)}: not graded"
+        for page in pages
+        if _is_second_recording(page)
+    )
+    return Report(_html(pages, left_out, pairs, overlaps), values, tuple(left_out), pairs, overlaps)
+
+
+def _marked(pages: Sequence[_Page]) -> list[_Page]:
+    """The pages with the sessions that overlap; a manual recording of a controller's session is not graded."""
+    marked = []
+    for page, sessions in zip(pages, overlapping([page.summary.span for page in pages]), strict=True):
+        summary = replace(page.summary, overlaps=sessions)
+        if sessions and summary.span.is_manual:
+            summary = replace(summary, grade=None, placement=None)
+        marked.append(replace(page, summary=summary))
+    return marked
+
+
+def _is_second_recording(page: _Page) -> bool:
+    return bool(page.summary.overlaps) and page.summary.span.is_manual
 
 
 def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
@@ -139,7 +162,7 @@ def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
     )
 
 
-def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str]) -> str:
+def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str], overlaps: Sequence[str]) -> str:
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = f"Run {summary.session}"
@@ -151,7 +174,11 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str])
             f'<span class="quiet">· {as_html(_session_and_origin(page.summary))}</span></summary>{_run(page)}</details>'
             for number, page in enumerate(pages, start=1)
         )
-        notes = _list_section("Skipped recordings", left_out) + _list_section("Runs with the same torques", pairs)
+        notes = (
+            _list_section("Skipped recordings", left_out)
+            + _list_section("Runs with the same torques", pairs)
+            + _list_section("Second recordings of a session", overlaps)
+        )
         body = f"<h1>{title}</h1>{_overview(pages)}{notes}{details}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
@@ -225,7 +252,8 @@ def _origin(summary: RunSummary) -> str:
 def _session_and_origin(summary: RunSummary) -> str:
     # For a renamed file, also the session under which it was recorded.
     session = "" if summary.name == summary.session else f"{summary.session} · "
-    return session + _origin(summary)
+    overlaps = f" · overlaps with {', '.join(summary.overlaps)}" if summary.overlaps else ""
+    return session + _origin(summary) + overlaps
 
 
 def _facts(page: _Page) -> str:
@@ -362,6 +390,8 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 def _rank(page: _Page) -> tuple[float, ...]:
     task, grade = page.summary.placement, page.summary.grade
+    if _is_second_recording(page):
+        return (2.0,)
     # Without a controller the tool path is the shortest, so that such a run comes last among equals.
     path_m = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:
