@@ -278,7 +278,7 @@ class SessionTracker:
         if rig is None or len(rig.recordings) >= MAX_RECORDINGS_PER_RIG:
             self._reject(f"{owner}: more sessions than {MAX_RECORDINGS_PER_RIG} of a rig, or too many rigs")
             return
-        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns, self._store)
+        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns)
         if not self._store.open(recording):
             self._block(session, now_ns + RETRY_PERIOD_NS)
             return

@@ -2,7 +2,7 @@
 
 import errno
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Final
@@ -114,14 +114,9 @@ class FileStore:
             recording.horizon_ns = horizon_by_channel(tail)
         return not self._reserve.is_exhausted and self._open(recording, segment) is not None
 
-    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
-        """Write encoded messages to the file of a recording."""
-        file = self._files.get(recording)
-        if file is not None:
-            file.write(records)
-
     def close(self, recording: Recording, end: str, reason: str) -> None:
         """Finish the file of a recording in the background."""
+        recording.file = None
         file = self._files.pop(recording, None)
         if file is not None:
             self._finish(file, end, reason)
@@ -213,6 +208,7 @@ class FileStore:
         if len(self._newest) > MAX_SESSIONS:
             del self._newest[next(iter(self._newest))]
         file = self._files[recording] = SegmentFile(recording, writer, self._clock, self._on_failure)
+        recording.file = file
         self._sync_worker.follow(writer)
         self._request_config(recording.rig)
         self._alerts.pop(recording.rig, None)
@@ -270,6 +266,7 @@ class FileStore:
 
     def _finish_failed(self, file: SegmentFile, error: OSError) -> None:
         recording = file.recording
+        recording.file = None
         del self._files[recording]
         end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
         reason = f"{error.strerror}; the recording ends here"
