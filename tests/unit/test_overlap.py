@@ -10,9 +10,9 @@ from hilrig_replay.report.report import build_report
 from support.labs import hilrig
 from support.recordings import START_WALL_NS, Script, make, write
 
-TASK = "[[task.poses]]\nname = 'a'\nx = 0.4\ny = 0.2\n"
-CONTROLLER = Span("controller", "rig1", False, 100, 200, [7])
-MANUAL = Span("manual", "rig1", True, 150, 300, [7, 7])
+TASK = "[[task.poses]]\nname = 'a'\nposition_mm = [400, 200, 0]\n"
+CONTROLLER = Span("controller", "rig1", False, 100, 200, (7,))
+MANUAL = Span("manual", "rig1", True, 150, 300, (7, 7))
 
 
 @pytest.mark.parametrize(
@@ -20,12 +20,12 @@ MANUAL = Span("manual", "rig1", True, 150, 300, [7, 7])
     [
         (MANUAL, True),
         (MANUAL._replace(start_ns=50, end_ns=101), True),
-        (MANUAL._replace(incarnations=[6, 7]), True),
+        (MANUAL._replace(incarnations=(6, 7)), True),
         (MANUAL._replace(start_ns=200), False),
         (MANUAL._replace(start_ns=0, end_ns=100), False),
         (MANUAL._replace(rig="rig2"), False),
         # The rig of another computer has the same name.
-        (MANUAL._replace(incarnations=[8]), False),
+        (MANUAL._replace(incarnations=(8,)), False),
         # Sessions of controllers overlap only by their pre-roll.
         (MANUAL._replace(is_manual=False), False),
     ],

@@ -309,6 +309,8 @@ def chunk_records(raw: bytes, wanted: Container[int] | None = None) -> Iterator[
                 raise DamagedError(f"message of {length} bytes, expected at least {MESSAGE_FIXED_BYTES}", at)
             if wanted is None or channel_id in wanted:
                 yield Message(channel_id, sequence, log_time, publish_time, raw[at + payload_at : following])
+        elif opcode == 0:
+            raise DamagedError("opcode 0 in a chunk", at)
         elif wanted is None:
             record = decode_record(opcode, raw[at + head_size : following], at)
             if isinstance(record, Schema | Channel):

@@ -214,6 +214,7 @@ class RunIndex:
                 values["unfit_reasons"] = tuple(Reason(**reason) for reason in values["unfit_reasons"])
                 values["segment"], values["segments"] = Segment(*values["segment"]), tuple(values["segments"])
                 values["span"], values["overlaps"] = Span(*values["span"]), tuple(values["overlaps"])
+                values["span"] = values["span"]._replace(incarnations=tuple(values["span"].incarnations))
                 entries.append(RunEntry(**values))
             return {entry.paths: entry for entry in entries}
         except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
@@ -326,7 +327,7 @@ def _joined(folder: Path, entries: list[RunEntry]) -> RunEntry:
         start_wall_ns=extent.start_wall_ns,
         duration_s=extent.duration_s,
         span=first.span._replace(
-            end_ns=last.span.end_ns, incarnations=[*first.span.incarnations, *last.span.incarnations]
+            end_ns=last.span.end_ns, incarnations=(*first.span.incarnations, *last.span.incarnations)
         ),
         ended=IN_PROGRESS if is_open else last.ended,
         reason=last.reason,
@@ -353,7 +354,7 @@ def _finished_entry(blank: RunEntry, reader: RecordReader) -> RunEntry:
         states = state_range(reader, _with(channel, chunks), _with(channel, reversed(chunks)), channel)
         if states is not None:
             extent = extent_of(states)
-            span = span._replace(incarnations=[one.incarnation for one in states])
+            span = span._replace(incarnations=tuple(one.incarnation for one in states))
     return replace(
         entry,
         start_wall_ns=extent.start_wall_ns,

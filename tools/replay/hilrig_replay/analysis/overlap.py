@@ -17,7 +17,7 @@ class Span(NamedTuple):
     start_ns: int = 0
     """Start of the session, without the pre-roll; wall clock, ns."""
     end_ns: int = 0
-    incarnations: Sequence[int] = ()
+    incarnations: tuple[int, ...] = ()
     """Those of the first and the last state: labs of the same name on several computers are not the same rig."""
 
 

@@ -160,7 +160,7 @@ def _span(run: Run) -> Span:
         is_manual=not run.controller,
         start_ns=run.number("session", "start_wall_ns") or 0,
         end_ns=run.number("summary", "end_wall_ns") or 0,
-        incarnations=[] if states is None else [one.incarnation for one in states],
+        incarnations=() if states is None else tuple(one.incarnation for one in states),
     )
 
 

@@ -204,12 +204,16 @@ def open_recording(path: Path) -> RecordingFile:
         raise InputError(f"{path}: {unfinished}{error}: run `hilrig recover {path}` to complete it") from error
     except DamagedError as error:
         raise DamagedRecordingError(path, str(error)) from error
+    chunks = contents.chunks.drain()
+    chunks = chunks[np.argsort(chunks["offset"], kind="stable")]
+    ends = chunks["offset"] + chunks["length"]
+    if (ends[:-1] > chunks["offset"][1:]).any():
+        raise DamagedRecordingError(path, "chunk indexes overlap, or two are of the same chunk")
     topics = _topics(path, contents)
     counts = dict.fromkeys(RECORDED, 0)
     for channel, count in contents.counts.items():
         if channel in topics:
             counts[topics[channel]] += count
-    chunks = contents.chunks.drain()
     return RecordingFile(
         path=path,
         metadata=contents.metadata,
@@ -218,7 +222,7 @@ def open_recording(path: Path) -> RecordingFile:
         start_ns=contents.start_ns,
         end_ns=contents.end_ns,
         topics=topics,
-        _chunks=chunks[np.argsort(chunks["offset"], kind="stable")],
+        _chunks=chunks,
     )
 
 
