@@ -33,8 +33,8 @@ from hilrig_runtime.security.x509 import (
     role_of,
 )
 from hilrig_schemas import Event
-from support.edge_rig import EdgeRig, free_ports, running_edge
-from support.labs import hilrig
+from support.edge_rig import EdgeRig, running_edge
+from support.labs import free_ports, hilrig
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -84,7 +84,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 @pytest.fixture
 def rig(lab: Lab) -> Iterator[EdgeRig]:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port)) as rig:
         yield rig
 
@@ -121,13 +121,13 @@ def test_observer_and_unknown_roles_are_read_only(rig: EdgeRig, lab: Lab, name: 
 
 @pytest.mark.parametrize(("no_role", "answer"), [("operator", "06 00 00 03 E8"), ("observer", "86 01")])
 def test_permission_without_role_is_configurable(lab: Lab, no_role: str, answer: str) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role=no_role)) as rig:
         assert talk(rig, lab.client("plain"), WRITE) == [bytes.fromhex(answer)]
 
 
 def test_clients_without_role_can_be_refused(lab: Lab) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role="refuse")) as rig:
         with pytest.raises(OSError):  # noqa: PT011  # which one depends on the timing
             talk(rig, lab.client("plain"), READ)
@@ -318,7 +318,7 @@ def test_client_without_tls_is_refused_without_delay(rig: EdgeRig, lab: Lab) -> 
 
 
 def test_unfinished_handshakes_count_as_connections(lab: Lab) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port), max_connections_per_host=2) as rig:
         with ExitStack() as idlers:
             for _ in range(2):
@@ -363,7 +363,7 @@ def test_requests_right_after_handshake_are_answered(rig: EdgeRig, lab: Lab) -> 
 
 
 def test_only_tls_listens_without_plain(lab: Lab) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port), plain=False) as rig:
         assert talk(rig, lab.client("operator"), READ)
         with pytest.raises(ConnectionRefusedError):
@@ -444,7 +444,7 @@ def test_certs_creates_certificates_of_edge_and_clients(tmp_path: Path) -> None:
     # A later client is signed by the same authority; no other file is changed.
     added = hilrig("certs", folder, "--client", "carol=observer", "--json")
     assert [Path(path).name for path in json.loads(added.stdout)["written"]] == ["carol.pem", "carol.key"]
-    [port] = free_ports(1)
+    port = free_ports(1)
     files = Lab(folder, make_authority("unused", NOW, 1))
     with running_edge(tls=files.tls(port)) as rig:
         assert talk(rig, files.client("alice"), WRITE) == [bytes.fromhex("06 00 00 03 E8")]

@@ -816,3 +816,22 @@ def test_one_read_contains_one_step(bench: Bench) -> None:
         floats = struct.unpack_from(">12f", data, 24)
         assert struct.unpack_from(">I", data, 4) == (step,)
         assert (floats[2], floats[6], floats[8:]) == (step, step, (step,) * 4)
+
+
+def test_states_that_stop_are_an_event_and_their_return_is_one() -> None:
+    bench = Bench()
+
+    def run(duration_ms: int, *, states: bool) -> None:
+        for step in range(duration_ms // 20):
+            if states:
+                bench.state(step)
+            bench.wait(20)
+
+    run(100, states=True)
+    run(14_000, states=False)
+    assert bench.kinds() == ["STATE_LOST"]
+    assert bench.events[0].text.startswith("no states since ")
+    run(2_000, states=True)
+    assert bench.kinds() == ["STATE_LOST", "STATE_BACK"]
+    assert bench.events[1].text.endswith(" UTC, after 14.0 s")
+    assert bench.events[1].watchdog_data.silent_ns == pytest.approx(14_000 * MS, abs=40 * MS)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnMessage, Publisher, Reply
 from hilrig_runtime.errors import HilrigError
 from hilrig_schemas.topics import Traffic
 
@@ -90,7 +90,6 @@ class MemoryBus(Bus):
         self,
         key_expr: str,
         on_message: OnMessage,
-        on_loss: OnLoss,  # noqa: ARG002
         cache_depth: int = CACHE_DEPTH,  # noqa: ARG002
     ) -> Handle:
         """See `Bus.subscribe_recording`; nothing is lost."""

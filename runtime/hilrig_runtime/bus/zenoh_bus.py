@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import zenoh
 
-from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnMessage, Publisher, Reply
 from hilrig_runtime.bus.reliable import ReliableSubscriber, declare_recording_publisher
 from hilrig_runtime.bus.zenoh_config import (
     FIRST_INSTANCE,
@@ -119,11 +119,9 @@ class ZenohBus(Bus):
         """See `Bus.subscribe_newest`."""
         return _NewestReader(self.session, key_expr, on_message, depth)
 
-    def subscribe_recording(
-        self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
-    ) -> Handle:
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, cache_depth: int = CACHE_DEPTH) -> Handle:
         """See `Bus.subscribe_recording`."""
-        return ReliableSubscriber(self.session, key_expr, on_message, on_loss, cache_depth)
+        return ReliableSubscriber(self.session, key_expr, on_message, cache_depth)
 
     def declare_queryable(self, key: str, handler: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.declare_queryable`."""

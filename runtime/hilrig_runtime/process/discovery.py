@@ -59,16 +59,16 @@ def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
     It must stop if an older service of its kind has its instance name or one of its rigs. If both started in the same
     nanosecond, the name decides, so that exactly one keeps running.
     """
-    for other in others:
+    taken = []
+    for other in sorted(others, key=lambda info: (info.instance, info.incarnation)):
         if other.service != own.service or (other.incarnation, other.instance) >= (own.incarnation, own.instance):
             continue
         where = f"{other.service}/{other.instance} on {other.host}"
         if other.instance == own.instance:
             return f"{where} has the same instance name; choose another --instance"
-        shared = sorted(set(own.rigs) & set(other.rigs))
-        if shared:
-            return f"{where} already serves {list_names(shared)}; each rig has one {own.service} (--rigs)"
-    return ""
+        if shared := sorted(set(own.rigs) & set(other.rigs)):
+            taken.append(f"{where} already serves {list_names(shared)}")
+    return f"{'; '.join(taken)}; each rig has one {own.service} (--rigs)" if taken else ""
 
 
 def worst_offset(others: Iterable[tuple[ServiceInfo, int]], own_incarnation: int, sent_ns: int) -> ClockOffset:

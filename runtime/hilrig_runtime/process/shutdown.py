@@ -112,7 +112,8 @@ def run_main(main: Callable[[], int | None]) -> int:
         # typer and rich turn a closed pipe into exit code 1, which means "check failed" here.
         if not isinstance(end.__context__, BrokenPipeError):
             raise
-    _drop_output()
+    # An error message that could not be written is still in the buffer of standard error.
+    _drop_output(1, 2)
     return EXIT_SIGPIPE
 
 
@@ -147,7 +148,7 @@ def _run_and_report(main: Callable[[], int | None]) -> int:
             return OperationError.exit_code
         if error.errno not in _DISK_ERRORS:
             raise
-        _drop_output()
+        _drop_output(1)
         target = error.filename or "standard output"
         print(f"hilrig: error: {printable(str(target))}: can't be written: {error.strerror}", file=sys.stderr)
         return OperationError.exit_code
@@ -163,6 +164,8 @@ def _open_output() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _drop_output() -> None:
-    """Discard buffered output, so that the process ends without another error."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+def _drop_output(*descriptors: int) -> None:
+    """Discard the buffered output of `descriptors`, so that the process ends without another error."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in descriptors:
+        os.dup2(null, descriptor)

@@ -33,6 +33,8 @@ class Event(_message.Message):
         RIG_ADDED: _ClassVar[Event.Kind]
         RIG_REMOVED: _ClassVar[Event.Kind]
         INACCURATE_STEP: _ClassVar[Event.Kind]
+        STATE_LOST: _ClassVar[Event.Kind]
+        STATE_BACK: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -55,6 +57,8 @@ class Event(_message.Message):
     RIG_ADDED: Event.Kind
     RIG_REMOVED: Event.Kind
     INACCURATE_STEP: Event.Kind
+    STATE_LOST: Event.Kind
+    STATE_BACK: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]

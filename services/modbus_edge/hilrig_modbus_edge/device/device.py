@@ -13,7 +13,7 @@ from pymodbus.constants import ExcCodes
 from hilrig_modbus_edge.device.client import Client, ConnectedController, address_of, controller_of
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
-from hilrig_modbus_edge.device.events import EventEmitter
+from hilrig_modbus_edge.device.events import STATE_TIMEOUT_NS, EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
@@ -39,6 +39,7 @@ from hilrig_modbus_edge.registers.map import (
     struct_of,
 )
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
+from hilrig_runtime.process.outage import OutageDetector
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.rate_limiter import repeat_suffix
 from hilrig_schemas import Event, LeaseStatus
@@ -68,6 +69,8 @@ class Device:
         self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
         self._monotonic_ns = clock.monotonic_ns
+        self._wall_ns = clock.wall_ns
+        self._state_outages = OutageDetector(STATE_TIMEOUT_NS)
         self._session = SessionState()
         self._states = StateReader(rig, clock, output, states)
         self._sender = sender
@@ -270,7 +273,13 @@ class Device:
     # -- time
 
     def check(self, now_ns: int) -> None:
-        """Do everything that is due: trip, lease expiry, end of session, repetition, schedule; ns, monotonic clock."""
+        """Do everything that is due: trip, lease expiry, end of session, repetition, schedule, outages.
+
+        `now_ns`: monotonic clock.
+        """
+        outage = self._state_outages.check(self._states.last_arrived_ns, now_ns)
+        if outage is not None:
+            self._events.emit_state_outage(outage, self._wall_ns() - now_ns)
         self._write_access.check(now_ns)
         self._sender.repeat_if_due(now_ns)
         self.impairment.check(now_ns)

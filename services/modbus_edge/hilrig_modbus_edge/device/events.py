@@ -7,11 +7,14 @@ from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
+from hilrig_runtime.process.outage import Outage, describe_outage
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two lease events of one kind and host, ns."""
+STATE_TIMEOUT_NS: Final = 500 * MS
+"""Time without a state after which the states are lost, ns."""
 STALL_EVENT_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two events about stalls of the edge, ns."""
 
@@ -49,6 +52,17 @@ class EventEmitter:
         event.controller_data.controller = controller
         event.controller_data.reason = reason
         event.controller_data.holder = holder
+        self.emit(event)
+
+    def emit_state_outage(self, outage: Outage, wall_offset_ns: int) -> None:
+        """Publish that states stopped or arrive again; `wall_offset_ns`: wall clock minus monotonic clock."""
+        text = describe_outage("states", outage, wall_offset_ns)
+        if outage.has_ended:
+            event = self.event(Event.STATE_BACK, Event.INFO, text)
+        else:
+            text += ": controllers read the last one; is the simulation running, and its link up (hilrig doctor)?"
+            event = self.event(Event.STATE_LOST, Event.WARNING, text)
+        event.watchdog_data.silent_ns, event.watchdog_data.timeout_ns = outage.silent_ns, STATE_TIMEOUT_NS
         self.emit(event)
 
 

@@ -84,7 +84,8 @@ class RigServer:
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
-        connection.feed(early)
+        if early:
+            connection.data_received(early)
 
     def report_malformed(self, client: Client, defect: str) -> None:
         """Count a connection that is closed because of malformed data, and log it, rate-limited."""

@@ -62,6 +62,13 @@ class Recording:
     missing_announcements: int = 0
     """Consecutive session announcements of the owner that did not contain this session."""
 
+    def count_loss(self, lost: LossCounters) -> None:
+        """Add lost messages and batches to the counters of the file."""
+        self.counters.lost_transport += lost.lost_transport
+        self.counters.lost_recorder += lost.lost_recorder
+        self.counters.lost_batches += lost.lost_batches
+        self.counted_losses += lost.lost_transport + lost.lost_recorder
+
     def write(self, records: Sequence[bytes], not_before_ns: int = 0) -> None:
         """Write those messages that belong to this file and arrived at `not_before_ns` (wall clock) or later."""
         if self.seen is not None or self.end_wall_ns is not None or not_before_ns:
@@ -116,6 +123,9 @@ class RecordingStore(Protocol):
 
     def record_source(self, recording: Recording, source: str, incarnation: int) -> None:
         """Record in the file that an instance of a service contributes to the recording."""
+
+    def report_outage(self, recordings: Sequence[Recording], text: str, *, has_ended: bool) -> None:
+        """Report to the operator, and in these recordings, that messages stopped or arrive again."""
 
     def report_rejected(self, message: str) -> None:
         """Report input that is not recorded to the operator."""
