@@ -126,7 +126,7 @@ def test_chunk_never_expands_beyond_its_stated_size(compression: str) -> None:
 
 
 def test_chunk_that_states_too_large_a_size_is_damaged() -> None:
-    content = struct.pack("<QQQII4sQ", 0, 0, MAX_CHUNK_BYTES + 1, 0, 4, b"zstd", 3) + b"abc"
+    content = struct.pack("<QQQII4sQ", 0, 0, MAX_CHUNK_BYTES + 1, 0, 4, b"zstd", 200_000) + bytes(200_000)
     with pytest.raises(DamagedError, match=f"at most {MAX_CHUNK_BYTES}, at offset 8"):
         decode_chunk(content, 8)
 

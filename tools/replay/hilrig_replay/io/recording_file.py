@@ -206,9 +206,6 @@ def open_recording(path: Path) -> RecordingFile:
         raise DamagedRecordingError(path, str(error)) from error
     chunks = contents.chunks.drain()
     chunks = chunks[np.argsort(chunks["offset"], kind="stable")]
-    ends = chunks["offset"] + chunks["length"]
-    if (ends[:-1] > chunks["offset"][1:]).any():
-        raise DamagedRecordingError(path, "chunk indexes overlap, or two are of the same chunk")
     topics = _topics(path, contents)
     counts = dict.fromkeys(RECORDED, 0)
     for channel, count in contents.counts.items():
