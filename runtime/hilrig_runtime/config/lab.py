@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.config.bus import BusConfig
+from hilrig_runtime.config.controller import ClientConfig, ControllerAddress, RegistersConfig, parse_controller
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
@@ -175,6 +176,13 @@ class RigSettings(Section):
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
     allow: tuple[Network, ...] = ()
     """Networks whose hosts may connect, as "192.168.7.0/24"; empty: all."""
+    controller: ControllerAddress | None = None
+    """Address of a controller that is a Modbus server, "HOST" or "HOST:PORT" (default port 502): the edge is its
+    client, and the rig's own server is read-only."""
+    unit: Annotated[int, Field(strict=True, ge=0, le=255)] = 1
+    """Unit identifier of that controller."""
+    registers: RegistersConfig = RegistersConfig()
+    client: ClientConfig = ClientConfig()
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None
     """Scene of this rig; default: the lab's."""
@@ -186,6 +194,22 @@ class RigSettings(Section):
         if self.name in RESERVED_RIG_NAMES or self.name in SERVICES:
             raise ValueError(f"{self.name!r} is a reserved name; choose another rig name")
         return self
+
+    @model_validator(mode="after")
+    def _controller_settings_are_used(self) -> "RigSettings":
+        defaults = (1, RegistersConfig(), ClientConfig())
+        if self.controller is None and (self.unit, self.registers, self.client) != defaults:
+            raise ValueError("unit, registers and client have no effect without controller; add it, or remove them")
+        if self.client.combined_request and self.registers.torque_block.table != "holding":
+            raise ValueError(
+                "client.combined_request: function 23 reads holding registers, and the torques are "
+                f"{self.registers.torque_block}"
+            )
+        return self
+
+    def describe_controller(self) -> str:
+        """Return the address of its controller, and which registers the edge writes and reads there."""
+        return f"client of {self.controller}, unit {self.unit}: {self.registers.describe()}"
 
 
 class RigsTable(Section):
@@ -253,6 +277,32 @@ class LabConfig(Section):
                 raise ValueError(f"rig {rig!r}: port {port} is already used by another rig")
             if port > 65535:
                 raise ValueError(f"rig {rig!r}: no port available from {self.edge.first_port} to 65535")
+        return self
+
+    @model_validator(mode="after")
+    def _controllers_are_distinct(self) -> "LabConfig":
+        served = {*self.ports.values(), *self.tls_ports.values()}
+        rig_of: dict[tuple[str, int], str] = {}
+        for rig in self.rigs:
+            if rig.controller is None:
+                continue
+            host, port = parse_controller(rig.controller)
+            other = rig_of.setdefault((host.lower(), port), rig.name)
+            if other != rig.name:
+                raise ValueError(
+                    f"rigs {other!r} and {rig.name!r}: both are clients of the controller {rig.controller}; a "
+                    "controller has one rig"
+                )
+            if port in served and host in ("localhost", "127.0.0.1", "::1", self.edge.host):
+                raise ValueError(
+                    f"rig {rig.name!r}: its controller {rig.controller} is the address of a rig of this lab"
+                )
+            lead_ms = rig.client.read_lead_ms
+            if lead_ms is not None and lead_ms >= self.sim.step_ms:
+                raise ValueError(
+                    f"rig {rig.name!r}: client.read_lead_ms must be < sim.step_ms ({self.sim.step_ms:g}), got "
+                    f"{lead_ms:g}"
+                )
         return self
 
     @model_validator(mode="after")

@@ -35,6 +35,8 @@ class Event(_message.Message):
         INACCURATE_STEP: _ClassVar[Event.Kind]
         STATE_LOST: _ClassVar[Event.Kind]
         STATE_BACK: _ClassVar[Event.Kind]
+        CONTROLLER_FAULT: _ClassVar[Event.Kind]
+        CONTROLLER_BACK: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -59,6 +61,8 @@ class Event(_message.Message):
     INACCURATE_STEP: Event.Kind
     STATE_LOST: Event.Kind
     STATE_BACK: Event.Kind
+    CONTROLLER_FAULT: Event.Kind
+    CONTROLLER_BACK: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]

@@ -72,6 +72,17 @@ class EdgeService:
         service.health.rig_reports = lambda: [endpoint.report() for endpoint in self._endpoints.values()]
         service.addresses = self._address_of
         self._closing = ExitStack()
+        self._notify_exchanges()
+
+    def _notify_exchanges(self) -> None:
+        """Let the bus wake the event loop when states arrive, if a rig is a client of its controller."""
+        if any(endpoint.exchange is not None for endpoint in self._endpoints.values()):
+            self._states.notify = partial(self._loop.call_soon_threadsafe, self._on_states)
+
+    def _on_states(self) -> None:
+        for endpoint in self._endpoints.values():
+            if endpoint.exchange is not None:
+                endpoint.exchange.on_states()
 
     def _new_endpoint(self, rig: RigSettings) -> RigEndpoint:
         return RigEndpoint(rig, self._service, self._states, self._scheduler, self._announce_sessions)
@@ -133,6 +144,7 @@ class EdgeService:
                 endpoint.bind_single(rig.port)
             undo.pop_all()
         self._endpoints[rig.name] = endpoint
+        self._notify_exchanges()
         self._declare_queries(endpoint)
         endpoint.device.start()
         listening = self._loop.create_task(endpoint.listen())
@@ -250,6 +262,7 @@ class EdgeService:
         return deadline_ns + (state.arrived_ns - deadline_ns) % step_ns - step_ns // 2
 
     def _close(self) -> None:
+        self._states.notify = None
         self._closing.close()
         for endpoint in self._endpoints.values():
             endpoint.stop("edge stopped")

@@ -109,11 +109,19 @@ class WriteAccess:
         self.stalls = StallReporter(events)
         self._writers = Writers()
         self._session_count = 0
+        self._reserved_for: Client | None = None
+        """The only client that may write; None: any."""
+        self._session_note = ""
         self._last_writer = ""
         """Address of the newest writing connection."""
         self._controller_change_ns = 0
         """Earliest time at which another controller may end a session, ns, monotonic clock."""
         self._watchdog_timer: TimerHandle | None = None
+
+    def reserve(self, client: Client, session_note: str) -> None:
+        """Let only `client` write; `session_note` is added to the event of each session's start."""
+        self._reserved_for = client
+        self._session_note = session_note
 
     def authorize_write(self, client: Client, begin: int, end: int, now_ns: int) -> None:
         """Authorize a valid write of the items of `Writers` from `begin` to before `end`; ns, monotonic clock.
@@ -148,6 +156,14 @@ class WriteAccess:
                 "read-only: the client certificate lacks the role operator; use a certificate with that role",
                 ExcCodes.ILLEGAL_FUNCTION,
             )
+        reserved_for = self._reserved_for
+        if reserved_for not in (None, client):
+            return Refusal(
+                f"the edge is a client of {reserved_for.address}, which alone commands {self._rig}; to write to the "
+                "rig, remove its controller from lab.toml",
+                ExcCodes.DEVICE_BUSY,
+                reserved_for.address,
+            )
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
             return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
@@ -180,7 +196,8 @@ class WriteAccess:
             watchdog.fed_ns = now_ns
             return
         if watchdog.feed(now_ns):
-            text = f"watchdog of {self._rig} re-armed: {client.address} writes again"
+            verb = "writes" if self._reserved_for is None else "answers"
+            text = f"watchdog of {self._rig} re-armed: {client.address} {verb} again"
             event = self._events.event(Event.WATCHDOG_REARM, Event.INFO, text)
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._events.emit(event)
@@ -217,10 +234,14 @@ class WriteAccess:
         self._lease_events.check(now_ns)
         self.stalls.check(now_ns)
         if self.lease.expired(now_ns):
-            self._release_lease(f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)")
+            self._release_lease(self._lease_end())
         session = self._session.current
         if session is not None and session.expired(now_ns, self._settings.grace_ns):
-            self._end_session("no lease holder for the grace time (edge.session_grace_ms)")
+            self._end_session(
+                "no lease holder for the grace time (edge.session_grace_ms)"
+                if self._reserved_for is None
+                else f"{self._lease_end()} (edge.session_grace_ms)"
+            )
 
     def release(self, reason: str) -> str:
         """Revoke the lease, on request of an operator; return the previous holder, empty: none.
@@ -255,6 +276,9 @@ class WriteAccess:
             session=self._session.id,
             watchdog_tripped=self.watchdog.tripped,
             watchdog_timeout_ns=self.watchdog.timeout_ns,
+            client_of="" if self._reserved_for is None else self._reserved_for.address,
+            controller_fault="" if self._reserved_for is None else self._reserved_for.fault,
+            skipped_states=0 if self._reserved_for is None else self._reserved_for.skipped_states,
         )
 
     @property
@@ -299,9 +323,17 @@ class WriteAccess:
         # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
         self._commands.echo = 0
-        event = self._events.event(Event.SESSION_START, Event.INFO, f"session {identity} started by {client.address}")
+        text, reason = f"session {identity} started by {client.address}", "lease acquired"
+        if self._reserved_for is not None:
+            text, reason = (
+                f"session {identity} started as client of {client.address}",
+                "torques read from the controller",
+            )
+        if self._session_note:
+            text, reason = f"{text}: {self._session_note}", f"{reason}: {self._session_note}"
+        event = self._events.event(Event.SESSION_START, Event.INFO, text)
         event.session_data.controller = client.address
-        event.session_data.reason = "lease acquired"
+        event.session_data.reason = reason
         self._events.emit(event)
         self._output.sessions_changed()
         self._impairment.start_session()
@@ -327,7 +359,11 @@ class WriteAccess:
         self._commands.zero()
         self._commands.publish_internal()
         holder = self.lease.holder
-        if holder is None:
+        missing, rearming = "write", "write"
+        if self._reserved_for is not None:
+            missing, rearming = "torque of its program", "one"
+            cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
+        elif holder is None:
             cause = f"{self._last_writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:
             # It may have been unplugged after a read.
@@ -335,13 +371,21 @@ class WriteAccess:
         else:
             cause = f"{self._last_writer} reads but does not write"
         text = (
-            f"watchdog of {self._rig} tripped: no write for {silent_ns // MS} ms, torque set to zero: {cause}; "
-            "the next write re-arms it"
+            f"watchdog of {self._rig} tripped: no {missing} for {silent_ns // MS} ms, torque set to zero: {cause}; "
+            f"the next {rearming} re-arms it"
         )
         event = self._events.event(Event.WATCHDOG_TRIP, Event.WARNING, text)
         event.watchdog_data.silent_ns = silent_ns
         event.watchdog_data.timeout_ns = self.watchdog.timeout_ns
         self._events.emit(event)
+
+    def _lease_end(self) -> str:
+        """Reason for the end of the lease after its timeout."""
+        client = self._reserved_for
+        if client is None:
+            return f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)"
+        silent_s = (self._monotonic_ns() - client.last_request_ns) / 1e9
+        return f"no new torque was read for {silent_s:.1f} s: {client.fault or 'its requests take longer'}"
 
     def _schedule_check(self) -> None:
         """Schedule a check at the deadline of the watchdog.

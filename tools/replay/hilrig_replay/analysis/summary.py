@@ -128,8 +128,9 @@ def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
     Raises:
         InputError: the file is damaged, or its parameters or its task are invalid.
     """
-    collector = _Collector(run, parameters_of(run.parameters_json), task or recorded_task(run))
-    latency = measure(run, collector.add)
+    task = task or recorded_task(run)
+    collector = _Collector(run, parameters_of(run.parameters_json), task)
+    latency = measure(run, collector.add, task)
     return RunSummary(
         name=run.path.stem,
         session=run.session,
