@@ -43,6 +43,8 @@ class Recording:
     """Start of the session, wall clock of the owner, ns."""
     opened_ns: int
     """When the recording was opened, monotonic clock, ns."""
+    certificate: str = ""
+    """Name in the controller's certificate; empty: it has none."""
     file: "RecordingOutput | None" = field(default=None, repr=False)
     """Its open file, set by the store; None: it has failed or is closed."""
     counters: LossCounters = field(default_factory=LossCounters)

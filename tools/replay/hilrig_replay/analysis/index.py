@@ -78,6 +78,8 @@ class RunEntry:
     overlaps: tuple[str, ...] = ()
     """Sessions of the same rig at the same time: a manual recording, or of controllers in it."""
     controller: str = ""
+    certificate: str = ""
+    """Name in the controller's certificate; empty: it had none."""
     start_wall_ns: int = 0
     """Time of the first state by the clock of its sender, ns since 1970-01-01 UTC."""
     duration_s: float = 0.0
@@ -389,5 +391,6 @@ def _with_session(blank: RunEntry, session: dict[str, str], segment: Segment) ->
         session=segment.session,
         segment=segment,
         controller=session.get("controller", ""),
+        certificate=session.get("certificate", ""),
         start_wall_ns=int(session.get("start_wall_ns", 0)),
     )

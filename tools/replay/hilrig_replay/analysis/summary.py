@@ -72,6 +72,8 @@ class RunSummary:
     rig: str
     lab: str
     controller: str
+    certificate: str
+    """Name in the controller's certificate; empty: it had none."""
     start: str
     """Start time as recorded, UTC."""
     duration_s: float
@@ -104,6 +106,7 @@ class RunSummary:
             "rig": self.rig,
             "lab": self.lab,
             "controller": self.controller,
+            "certificate": self.certificate,
             "start": self.start,
             "duration_s": self.duration_s,
             "ended": self.ended,
@@ -137,6 +140,7 @@ def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
         rig=run.rig,
         lab=run.lab,
         controller=run.controller,
+        certificate=run.certificate,
         start=run.started,
         duration_s=run.duration_s,
         ended=run.ended,

@@ -246,7 +246,8 @@ def _run(number: int, page: _Page) -> str:
 
 def _origin(summary: RunSummary) -> str:
     # A session that was started by a controller has the controller's address.
-    started_by = f"controlled by {summary.controller}" if summary.controller else "recorded manually"
+    name = f"{summary.certificate} at " if summary.certificate else ""
+    started_by = f"controlled by {name}{summary.controller}" if summary.controller else "recorded manually"
     return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {started_by} · {summary.start}"
 
 
