@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_replay.analysis.index import RunIndex
-from hilrig_replay.analysis.overlap import Span, overlapping
+from hilrig_replay.grading.overlap import Span, overlapping
 from hilrig_replay.report.report import build_report
 from support.labs import hilrig
 from support.recordings import START_WALL_NS, Script, make, write

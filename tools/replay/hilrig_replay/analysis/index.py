@@ -19,7 +19,7 @@ from hilrig_recorder.mcap_format.records import DamagedError, decode_chunk_index
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.data_quality import Reason
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.analysis.overlap import NO_SPAN, Span, overlapping
+from hilrig_replay.grading.overlap import NO_SPAN, Span, overlapping
 from hilrig_replay.io.extent import Extent, extent_of, state_range
 from hilrig_replay.io.isolation import EvaluationError, isolated
 from hilrig_replay.io.joined_recording import open_segments

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.distribution import percentiles
 from hilrig_replay.analysis.latency import LatencyReport, measure
-from hilrig_replay.analysis.overlap import Span
 from hilrig_replay.analysis.similarity import TorqueSketch
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.grade import Grade, Grader
+from hilrig_replay.grading.overlap import Span
 from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import JointValues, Rows, joint_values

@@ -10,12 +10,12 @@ from typing import Any, Final
 from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.intervals import cells
-from hilrig_replay.analysis.overlap import overlapping
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
+from hilrig_replay.grading.overlap import overlapping
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import display_names
