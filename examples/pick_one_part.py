@@ -88,7 +88,7 @@ class Arm:
 
 
 def checked(answer):
-    """Return the response of the rig, or raise what it reports: 02 no such register, 06 another controller writes."""
+    """Return the response of the rig, or raise its exception: 02 no such register, 06 another controller writes."""
     if answer.isError():
         raise RuntimeError(f"the rig refuses a request: {answer}")
     return answer

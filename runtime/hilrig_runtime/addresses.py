@@ -1,4 +1,4 @@
-"""TCP addresses for people: how they are written, which ones reach a listening socket, why one can't be bound."""
+"""Human-readable TCP addresses: notation, those that reach a listening socket, the fix if one can't be bound."""
 
 import errno
 import socket
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 WILDCARDS: Final = frozenset({"", "0.0.0.0", "::"})
-"""Hosts that stand for all addresses of this host."""
+"""Hosts that mean all addresses of this host."""
 PRIVILEGED_PORTS: Final = 1024
 """On Linux, a lower port needs a permission."""
 _SIOCGIFADDR: Final = 0x8915

@@ -1,4 +1,4 @@
-"""Addresses for people: written with brackets, reachable instead of wildcards, and the fix by the error's number."""
+"""Human-readable addresses: with brackets, reachable instead of wildcards, and the fix by the error's number."""
 
 import errno
 import socket

@@ -58,7 +58,7 @@ class RateLimiter(Generic[KeyT]):
 
 
 class _Reported(NamedTuple, Generic[ItemT]):
-    """What a `RepeatReporter` knows of one key."""
+    """Entry of a `RepeatReporter` for one key."""
 
     reported_ns: int
     suppressed: int

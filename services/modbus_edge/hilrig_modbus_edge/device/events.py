@@ -129,7 +129,7 @@ class LeaseEventReporter:
         self._denials.flush()
 
     def check(self, now_ns: int) -> None:
-        """Report what is due: denied writes that were suppressed, and a suppressed acquisition.
+        """Do everything that is due: report denied writes that were suppressed, and a suppressed acquisition.
 
         Its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`.
         """

@@ -1,4 +1,4 @@
-"""Recognizes what a client sends that is not Modbus TCP, to name it in messages. Pure functions."""
+"""Recognizes other protocols in the data of a client that is not Modbus TCP, for messages. Pure functions."""
 
 from typing import Final, NamedTuple
 
@@ -12,14 +12,14 @@ _HEX: Final = frozenset(b"0123456789ABCDEFabcdef")
 
 
 class Foreign(NamedTuple):
-    """What was received instead of Modbus TCP."""
+    """Data that was received instead of Modbus TCP."""
 
     name: str
     fix: str
 
 
 def foreign_protocol(data: bytes | bytearray) -> Foreign | None:
-    """Return the protocol that the data begins with; None: it is none of those known."""
+    """Return the protocol that the data begins with; None: unknown."""
     if data[:1] == b":" and len(data) > 2 and _HEX.issuperset(data[1:].rstrip(b"\r\n")):
         return Foreign("Modbus ASCII", "select Modbus TCP in the client, not ASCII over TCP")
     if data[:2] == b"\x16\x03":

@@ -58,7 +58,7 @@ class ConnectionOwner(Protocol):
         Args:
             client: connection that sent it.
             protocol: name of its protocol; empty: unknown.
-            text: what was sent, and the fix.
+            text: description of the data, and the fix.
         """
 
 

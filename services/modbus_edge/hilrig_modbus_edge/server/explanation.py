@@ -1,4 +1,4 @@
-"""Explains an exception response: what the client asked for, why it was refused, and the fix. Pure functions."""
+"""Explains an exception response: the request, the cause of its refusal, and the fix. Pure functions."""
 
 from typing import Final
 
@@ -20,7 +20,7 @@ _TRADITIONAL: Final = 10_000
 
 
 def blocks_of(table: RegisterTable, *, writable: bool = False) -> list[Block]:
-    """Return the blocks without a gap of a table; `writable`: only what a client may write."""
+    """Return the blocks without a gap of a table; `writable`: only those that a client may write."""
     blocks: list[Block] = []
     for row in rows_of(table):
         if row.writable or not writable:
