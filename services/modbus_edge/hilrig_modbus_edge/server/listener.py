@@ -125,7 +125,7 @@ class RigServer:
                 self.request_log.record_connection(connection.client.address, *figures)
 
     def check(self, now_ns: int) -> None:
-        """Do everything that is due, about twice a second: reports, connections without a valid request; ns, monotonic clock."""
+        """Do everything that is due, twice a second: reports, connections without a request; ns, monotonic clock."""
         self._malformed.check(now_ns)
         self.exceptions.check(now_ns)
         self._admission.check(now_ns)
