@@ -1,6 +1,6 @@
 """Settings of a device, converted from lab.toml to nanoseconds."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -19,9 +19,19 @@ class DeviceSettings:
     watchdog_max_ns: int
     lease_ns: int
     lease: Literal["controller", "connection"]
+    unmapped_reads: Literal["refuse", "zeros"]
     grace_ns: int
     repeat_ns: int
     impairment: ImpairmentConfig
+
+    def of_reserved_rig(self, timeout_ns: int) -> "DeviceSettings":
+        """Return the settings of a rig that is reserved for a controller whose requests have this timeout, ns.
+
+        Lease timeout and grace time together are the grace time: a lost lease has no other meaning, because no other
+        controller can acquire it.
+        """
+        lease_ns = min(self.lease_ns, max(self.grace_ns, timeout_ns))
+        return replace(self, lease_ns=lease_ns, grace_ns=max(0, self.grace_ns - lease_ns))
 
     @classmethod
     def of(cls, edge: EdgeConfig, impairment: ImpairmentConfig) -> "DeviceSettings":
@@ -32,6 +42,7 @@ class DeviceSettings:
             watchdog_max_ns=round(edge.watchdog_max_ms * MS),
             lease_ns=round(edge.lease_timeout_ms * MS),
             lease=edge.lease,
+            unmapped_reads=edge.unmapped_reads,
             grace_ns=round(edge.session_grace_ms * MS),
             repeat_ns=round(edge.repeat_ms * MS),
             impairment=impairment,
