@@ -15,9 +15,11 @@ from hilrig_classroom.attempts import owner_of
 from hilrig_classroom.roster import Roster, Student, read_table
 from hilrig_replay.analysis.similarity import TorqueSketch, find_similar
 from hilrig_replay.analysis.summary import summarize
+from hilrig_replay.grading.overlap import Span, overlapping
 from hilrig_replay.io.isolation import isolated
-from hilrig_replay.io.paths import find_recordings
+from hilrig_replay.io.paths import find_runs
 from hilrig_replay.io.run import open_run
+from hilrig_replay.io.segments import RunFiles
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.process_pool import process_pool
@@ -37,10 +39,10 @@ class Goal:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One evaluated recording."""
+    """One evaluated run."""
 
-    file: str
-    """Path relative to the graded folder."""
+    files: tuple[str, ...]
+    """Its files, relative to the graded folder: one, or the segments of a session."""
     session: str
     rig: str
     started: str
@@ -59,7 +61,14 @@ class Attempt:
     """Points without a penalty."""
     penalty: float | None = 0.0
     """Share of the points that is lost because it is late; None: too late."""
+    span: Span | None = None
+    """Time of the run; None: it can't be read."""
     torques: TorqueSketch = field(default_factory=TorqueSketch, repr=False, compare=False)
+
+    @property
+    def file(self) -> str:
+        """The first of its files."""
+        return self.files[0]
 
     @property
     def points(self) -> float:
@@ -135,6 +144,7 @@ class ClassGrades:
 def _attempt_as_dict(attempt: Attempt) -> dict[str, Any]:
     return {
         "file": attempt.file,
+        "files": list(attempt.files),
         "session": attempt.session,
         "rig": attempt.rig,
         "started": attempt.started,
@@ -180,16 +190,19 @@ def grade_class(
             raise InputError(f"{wanted!r} is not in the roster; its ids are {', '.join(list(students)[:5])}, …")
     found: dict[str, list[Attempt]] = {student: [] for student in students}
     unassigned: list[tuple[str, str]] = []
-    paths = find_recordings([folder])
-    for done, attempt in enumerate(_attempts(paths, folder, assignment, roster, only, workers), start=1):
+    runs = find_runs([folder])
+    attempts = []
+    for done, attempt in enumerate(_attempts(runs, folder, assignment, roster, only, workers), start=1):
+        attempts.append(attempt)
+        if on_progress is not None:
+            on_progress(done / len(runs))
+    for attempt in _without_second_recordings(attempts):
         if attempt is not None:
             owner = owner_of(Path(attempt.file), attempt.rig, roster)
             if owner.student is None:
                 unassigned.append((attempt.file, attempt.problem or owner.problem))
             elif not only or owner.student.id == only:
                 found[owner.student.id].append(_with_points(attempt, assignment))
-        if on_progress is not None:
-            on_progress(done / len(paths))
     grades = [
         _grade(student, found[student.id], assignment, overrides.get(student.id))
         for student in roster.students
@@ -223,35 +236,49 @@ def read_overrides(path: Path) -> dict[str, Override]:
 
 
 def _attempts(
-    paths: Sequence[Path],
+    runs: Sequence[RunFiles],
     folder: Path,
     assignment: Assignment,
     roster: Roster,
     only: str,
     workers: int | None,
 ) -> Iterable[Attempt | None]:
-    names = [str(path.relative_to(folder)) if path.is_relative_to(folder) else path.name for path in paths]
-    with process_pool(len(paths), workers) as executor:
-        yield from executor.map(_attempt, paths, names, repeat(assignment.task), repeat(roster), repeat(only))
+    with process_pool(len(runs), workers) as executor:
+        yield from executor.map(_attempt, runs, repeat(folder), repeat(assignment.task), repeat(roster), repeat(only))
 
 
-def _attempt(path: Path, name: str, task: TaskConfig, roster: Roster, only: str) -> Attempt | None:
-    """Evaluate one recording; None: it is not one of the student to be graded."""
+def _without_second_recordings(attempts: Sequence[Attempt | None]) -> list[Attempt | None]:
+    """The attempts; a manual recording of a controller's session is not graded."""
+    spans = [attempt.span for attempt in attempts if attempt is not None and attempt.span is not None]
+    sessions = iter(overlapping(spans))
+    checked: list[Attempt | None] = []
+    for attempt in attempts:
+        if attempt is not None and attempt.span is not None and (other := next(sessions)) and attempt.span.is_manual:
+            checked.append(replace(attempt, problem=f"recorded manually at the time of {', '.join(other)}: not graded"))
+        else:
+            checked.append(attempt)
+    return checked
+
+
+def _attempt(files: RunFiles, folder: Path, task: TaskConfig, roster: Roster, only: str) -> Attempt | None:
+    """Evaluate one run; None: it is not one of the student to be graded."""
+    path = files[0]
+    names = tuple(each.relative_to(folder).as_posix() for each in files)
     rig = session = started = ""
     try:
         with isolated(path):
-            run = open_run(path)
+            run = open_run(files)
             rig, session, started = run.rig, run.session, run.started
-            owner = owner_of(Path(name), rig, roster).student
+            owner = owner_of(Path(names[0]), rig, roster).student
             if owner is None or (only and owner.id != only):
-                return Attempt(name, session, rig, started) if owner is None else None
+                return Attempt(names, session, rig, started) if owner is None else None
             summary = summarize(run, task)
     except HilrigError as error:
         text = str(error).removeprefix(f"{path}: ")
-        return Attempt(name, session, rig, started, problem=text, data_quality=text)
+        return Attempt(names, session, rig, started, problem=text, data_quality=text)
     grade, latency = summary.grade, summary.latency
     return Attempt(
-        file=name,
+        files=names,
         session=session,
         rig=rig,
         started=started,
@@ -260,6 +287,7 @@ def _attempt(path: Path, name: str, task: TaskConfig, roster: Roster, only: str)
         latency_ms=latency.age_ms.p95 if latency.fit and latency.age_ms is not None else None,
         work_j=summary.motion.work_j,
         data_quality=latency.reason_text(),
+        span=summary.span,
         torques=summary.torques,
     )
 

@@ -8,6 +8,7 @@ from typing import Any
 from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.gradebook import feedback, used_attempt
 from hilrig_classroom.roster import Roster, Student
+from hilrig_replay.io.segments import RunFiles
 from hilrig_replay.report import assets
 from hilrig_replay.report.report import build_report
 from hilrig_runtime.config.task import TaskConfig
@@ -80,20 +81,20 @@ def write_student_pages(
     rows = [by_id[student.id] for student in students]
     introductions = [_introduction(student, row, document) for student, row in zip(students, rows, strict=True)]
     attempts = [used_attempt(row) for row in rows]
-    paths = [None if attempt is None else folder / attempt["file"] for attempt in attempts]
+    runs = [() if attempt is None else tuple(folder / file for file in attempt["files"]) for attempt in attempts]
     titles = [f"{document['assignment']}: {student.name}" for student in students]
     with process_pool(len(students), workers) as executor:
-        pages = executor.map(_student_page, titles, paths, introductions, repeat(assignment.task))
+        pages = executor.map(_student_page, titles, runs, introductions, repeat(assignment.task))
         for done, (student, page) in enumerate(zip(students, pages, strict=True), start=1):
             (out / names[student.id]).write_text(page, encoding="utf-8")
             if on_progress is not None:
                 on_progress(done / len(students))
 
 
-def _student_page(title: str, path: Path | None, introduction: str, task: TaskConfig) -> str:
-    if path is not None:
+def _student_page(title: str, files: RunFiles, introduction: str, task: TaskConfig) -> str:
+    if files:
         try:
-            return build_report([path], task=task, title=title, introduction=introduction).html
+            return build_report([files], task=task, title=title, introduction=introduction).html
         except HilrigError as error:
             introduction += f'<section><p class="bad">{as_html(str(error))}</p></section>'
     return _page(title, f"<h1>{as_html(title)}</h1>{introduction}")
