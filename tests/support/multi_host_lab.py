@@ -54,12 +54,16 @@ class MultiHostLab:
     commands: dict[str, list[str]]
     """Arguments of `hilrig`, by host."""
     processes: dict[str, subprocess.Popen[Any]] = field(default_factory=dict)
+    environ: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Environment of the process of a host, if it is not that of the test."""
 
     def start(self, host: str) -> None:
         """Start the process of a host."""
         command = [HILRIG, *self.commands[host], "-c", str(self.config)]
         with self.log(host).open("a") as log:
-            self.processes[host] = self.network.popen(host, command, stdin=subprocess.PIPE, stdout=log, stderr=log)
+            self.processes[host] = self.network.popen(
+                host, command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=self.environ.get(host)
+            )
 
     def log(self, host: str) -> Path:
         """Log file of the process of a host."""

@@ -24,6 +24,7 @@ from hilrig_recorder.ingest.sources import (
     PublisherTracker,
 )
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
@@ -357,7 +358,7 @@ class SessionTracker:
             if recording.end_wall_ns is None:
                 self._check_owner(recording, last_received.get(recording.owner, 0), now_ns)
             elif self._is_drained(recording, now_ns):
-                self._close(recording, "ended", recording.end_reason)
+                self._close(recording, Ending.ENDED, recording.end_reason)
         for session, until_ns in list(self._blocked_until.items()):
             if now_ns > until_ns:
                 del self._blocked_until[session]
@@ -389,7 +390,7 @@ class SessionTracker:
             # The session is not blocked: when the owner announces it again, it continues in a new segment.
             self._rigs[recording.rig].flush_block(self._wall_ns)
             self.drop(recording)
-            self._store.close(recording, "keeper lost", reason)
+            self._store.close(recording, Ending.OWNER_LOST, reason)
 
     def _is_drained(self, recording: Recording, now_ns: int) -> bool:
         draining_ns = now_ns - recording.ended_ns
@@ -413,9 +414,9 @@ class SessionTracker:
         """Close every recording, because the recorder stops."""
         for recording in self.recordings:
             if recording.end_wall_ns is None:
-                self._close(recording, "recorder stopped", "the recorder was stopped during the session")
+                self._close(recording, Ending.RECORDER_STOPPED, "the recorder was stopped during the session")
             else:
-                self._close(recording, "ended", recording.end_reason)
+                self._close(recording, Ending.ENDED, recording.end_reason)
 
     def drop(self, recording: Recording) -> None:
         """Remove a recording without closing its file; its session may be opened again."""
@@ -424,7 +425,7 @@ class SessionTracker:
         if rig is not None and recording in rig.recordings:
             rig.recordings.remove(recording)
 
-    def _close(self, recording: Recording, end: str, reason: str) -> None:
+    def _close(self, recording: Recording, end: Ending, reason: str) -> None:
         self._rigs[recording.rig].flush_block(self._wall_ns)
         self.drop(recording)
         self._block(recording.session, recording.ended_ns + _ENDED_SESSION_MEMORY_NS)
