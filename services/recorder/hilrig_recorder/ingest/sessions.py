@@ -108,6 +108,10 @@ class SessionTracker:
         """The open recordings."""
         return list(self._recordings.values())
 
+    def last_received(self) -> dict[str, int]:
+        """Arrival of the last batch of each publisher, monotonic clock, ns."""
+        return self._publishers.last_received()
+
     def has_received(self, rig: str) -> bool:
         """Whether any message of a rig was received."""
         return rig in self._rigs
