@@ -286,7 +286,14 @@ def check_reports(faults: list[Fault], recorded: Recorded, logs: dict[str, str])
     def has(fault: Fault, kind: Event.Kind, text: str = "") -> bool:
         end_ns = fault.begin_wall_ns + fault.end_ns - fault.begin_ns + 5 * 10**9
         return any(
-            event.kind == kind and text in event.text and fault.begin_wall_ns <= event.wall_ns <= end_ns
+            (event.kind == kind and text in event.text and fault.begin_wall_ns <= event.wall_ns <= end_ns)
+            # A fault soon after another one continues its outage.
+            or (
+                event.kind == Event.STATE_BACK
+                and kind == Event.STATE_LOST
+                and "interruptions" in event.text
+                and event.wall_ns - event.watchdog_data.silent_ns - 10 * 10**9 <= fault.begin_wall_ns <= event.wall_ns
+            )
             for event in recorded.events
         )
 

@@ -1,4 +1,4 @@
-"""`hilrig doctor` on each host: a cut link, a stopped, a killed service and a dead router are told apart."""
+"""`hilrig doctor` on each host distinguishes a cut link, a stopped and a killed service, and a dead router."""
 
 import json
 import os

@@ -374,6 +374,9 @@ class SessionTracker:
     def _check_outages(self, last_received: dict[str, int], now_ns: int, wall_ns: int) -> None:
         """Report the publishers of open recordings whose recording streams stopped or arrive again."""
         for name, last_ns in last_received.items():
+            if name.startswith("recorder/"):
+                # Only the services of the loop publish all the time.
+                continue
             outage = self._outages.setdefault(name, OutageDetector(STREAM_TIMEOUT_NS)).check(last_ns, now_ns)
             if outage is None:
                 continue
