@@ -42,6 +42,8 @@ class LatestValueCache:
         """Arrival of the last batch on each key, monotonic clock, ns."""
         self._monotonic_ns = clock.monotonic_ns
         self._counters = counters
+        self.notify: Callable[[], object] | None = None
+        """Called after each batch, on the thread of the bus; None: nothing."""
 
     def get(self, rig: str) -> TimestampedPayload | None:
         """Return the newest message of `rig`, the same object until the next one arrives; None: none has arrived."""
@@ -73,6 +75,8 @@ class LatestValueCache:
             self._by_rig = dict(newest)
         if len(self.last_ns) > MAX_RIGS:
             self.last_ns = {key: arrived_ns}
+        if self.notify is not None:
+            self.notify()
 
     def reject(self, key: str, defect: object) -> None:
         """Count a malformed batch or message; its receiver drops it."""
