@@ -228,7 +228,7 @@ ROUTED = '[bus]\ntopology = "router"\nrouter = "tcp/hub:7447"\n'
 def seen_without(name: str, silent_s: float) -> services.BusSnapshot:
     """A snapshot of a lab whose recorder received the last message of a service some time ago."""
     found = snapshot(*(other for other in ALL_SERVICES if other != name))
-    found.healths["recorder/1"][0].peers.add(service=name, host="left", silent_ns=round(silent_s * 1e9))
+    found.healths["recorder/1"].peers.add(service=name, host="left", silent_ns=round(silent_s * 1e9))
     return found
 
 

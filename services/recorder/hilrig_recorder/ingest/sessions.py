@@ -331,7 +331,6 @@ class SessionTracker:
             owner,
             opened.start_wall_ns,
             now_ns,
-            self._store,
             certificate=opened.certificate,
         )
         if not self._store.open(recording):

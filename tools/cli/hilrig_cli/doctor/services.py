@@ -54,7 +54,7 @@ class BusSnapshot:
 
     def peers(self) -> Iterator[PeerReport]:
         """The reports of all services about others."""
-        for health, _ in self.healths.values():
+        for health in self.healths.values():
             yield from health.peers
 
 
@@ -236,7 +236,7 @@ def _observations(name: str, snapshot: BusSnapshot) -> str:
     """Return when which service received the last message of a service."""
     found = [
         f"{observer} received its last message {peer.silent_ns / 1e9:.1f} s ago"
-        for observer, (health, _) in sorted(snapshot.healths.items())
+        for observer, health in sorted(snapshot.healths.items())
         for peer in health.peers
         if peer.service == name and peer.silent_ns
     ]
