@@ -157,6 +157,11 @@ class ControllerSession:
         states = np.concatenate(found)
         return states[np.argsort(states["sampled_ns"], kind="stable")]
 
+    def event_texts(self, kind: str) -> list[str]:
+        """Texts of the events of a kind in the recordings of this session."""
+        events = [event for path in self._finished() for event in open_run(path).events]
+        return [event["message"].text for event in events if event["kind"] == kind]
+
     def reported_lost(self) -> int:
         """Number of lost messages reported by the recordings of this session."""
         losses = [open_run(path).losses for path in self._finished()]
