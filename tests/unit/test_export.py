@@ -14,10 +14,11 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.export.export import TABLES, TEMPORARY_SUFFIX, export_foxglove, export_tables, table
+from hilrig_replay.export.export import TEMPORARY_SUFFIX, export_foxglove, export_tables
 from hilrig_replay.geometry.quaternion import rotate
 from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
 from hilrig_replay.io.run import open_run
+from hilrig_replay.io.tables import TABLES, table
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters
