@@ -26,7 +26,7 @@ def test_frames_have_the_recorded_values(run: Run, library: str) -> None:
     np.testing.assert_array_equal(states["position_d3"].to_numpy(), run.states["position"][:, 2])
     np.testing.assert_array_equal(states["time_s"].to_numpy(), run.time_s(run.states))
     assert set(run.frame("command", library)["controller"].to_list()) == {CONTROLLER}
-    assert list(run.frame("event", library)["kind"])[0] == "SESSION_START"
+    assert next(iter(run.frame("event", library)["kind"])) == "SESSION_START"
     assert run.frame("traffic", library).shape[0] == len(run.traffic)
 
 
