@@ -15,6 +15,7 @@ from hilrig_modbus_edge.server.tls import HANDSHAKE_TIMEOUT_S
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 from hilrig_recorder.mcap_format.records import COMPRESSION
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentSetting
 from hilrig_runtime.config.lab import (
     ArmConfig,
@@ -23,7 +24,6 @@ from hilrig_runtime.config.lab import (
     RecorderConfig,
     RigSettings,
     SimConfig,
-    TlsConfig,
 )
 from hilrig_runtime.config.scene import MagnetConfig, PartConfig, SceneConfig, TableConfig, TrayConfig
 from hilrig_runtime.config.task import TaskConfig
@@ -51,7 +51,7 @@ DOCUMENTED = [
         [("edge.watchdog_min_ms", 1), ("edge.watchdog_max_ms", 1000)],
     ),
     ("docs/controllers.md", r"sent no request for (\S+) s", [("edge.lease_timeout_ms", 1000)]),
-    ("docs/controllers.md", r"runs every (\d+) ms, like the simulation", [("sim.step_ms", 1)]),
+    ("docs/controllers/openplc.md", r"runs every (\d+) ms, like the simulation", [("sim.step_ms", 1)]),
     (
         "docs/controllers.md",
         r"at most (\d+) mm beside and (\d+) mm below",
@@ -103,6 +103,7 @@ DOCUMENTED = [
         for page in (
             "README.md",
             "docs/controllers.md",
+            *(f"docs/controllers/{name}.md" for name in ("python", "c", "nodejs", "go", "forte")),
             *(f"examples/hold_position.{kind}" for kind in ("py", "c", "js")),
         )
         for pattern in (r"(?:127\.0\.0\.1[: ]|-p |--port |[pP]ort.{1,22}[=:] \"?)(\d{4})\b",)

@@ -1,5 +1,6 @@
 """`lab.toml`: defaults, and errors with the place, the accepted value and the value found."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -30,17 +31,26 @@ def test_group_of_rigs_and_single_rigs() -> None:
     assert [rig.arm.l2_m for rig in lab.rigs] == [0.2, 0.3, 0.2, 0.3]
 
 
+def test_rigs_have_one_port_at_several_addresses() -> None:
+    text = '[[rigs]]\nname="a"\nport=502\nhost="10.0.0.1"\n[[rigs]]\nname="b"\nport=502\nhost="{}"\n'
+    lab = parse_lab(text.format("10.0.0.2"))
+    assert [lab.addresses()[rig]["Modbus TCP"] for rig in "ab"] == [("10.0.0.1", 502), ("10.0.0.2", 502)]
+    for host in ("10.0.0.1", "0.0.0.0", "::"):
+        with pytest.raises(InputError, match="port 502 is already used by another rig at the same address"):
+            parse_lab(text.format(host))
+
+
 def test_large_lab_is_parsed_quickly() -> None:
     lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
-    assert lab.addresses()["seat-2000"] == {"Modbus TCP": "127.0.0.1:7019"}
+    assert lab.addresses()["seat-2000"] == {"Modbus TCP": ("127.0.0.1", 7019)}
 
 
 def test_addresses_match_listening_ports() -> None:
     tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
     plain, secured = "Modbus TCP", "Modbus TCP with TLS"
-    assert parse_lab("").addresses()["rig1"] == {plain: "127.0.0.1:5020"}
-    assert parse_lab(tls).addresses()["rig1"] == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
-    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: "127.0.0.1:8020"}
+    assert parse_lab("").addresses()["rig1"] == {plain: ("127.0.0.1", 5020)}
+    assert parse_lab(tls).addresses()["rig1"] == {plain: ("127.0.0.1", 5020), secured: ("127.0.0.1", 8020)}
+    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: ("127.0.0.1", 8020)}
 
 
 def test_lab_keeps_its_source_text(tmp_path: Path) -> None:
@@ -97,6 +107,41 @@ def test_all_errors_are_reported_at_once() -> None:
     with pytest.raises(InputError) as caught:
         parse_lab("[sim]\nstep = 1\n[edge]\nhots = 2\n")
     assert len(str(caught.value).splitlines()) == 2
+
+
+TLS = "[edge.tls]\ncertificate = 'edge.pem'\nkey = 'edge.key'\nauthority = 'ca.pem'\n[edge.tls.clients]\n"
+
+
+def test_every_mistake_in_the_clients_is_reported() -> None:
+    clients = (
+        'alice = ["rig1"]\nAlice = ["*"]\n"CN=bob" = ["rig1"]\n"" = ["rig1"]\nnone = []\nall = ["*", "rig1"]\n'
+        'twice = ["rig1", "rig1"]\nplc7 = ["rig7", "rig8"]\n'
+    )
+    with pytest.raises(InputError) as caught:
+        parse_lab(TLS + clients)
+    found = str(caught.value).splitlines()
+    assert all(line.startswith("lab.toml: edge.tls.clients.") for line in found)
+    expected = [
+        r"alice: duplicate name",
+        r"Alice: duplicate name",
+        r"CN=bob: must be the common name .* without CN=",
+        r": must be the common name",
+        r"none: must have at least one rig",
+        r'all: "\*" is every rig',
+        r"twice: duplicate rig 'rig1'",
+        r"plc7: unknown rig 'rig7'",
+        r"plc7: unknown rig 'rig8'",
+    ]
+    assert len(found) == len(expected)
+    for line, text in zip(found, expected, strict=True):
+        assert re.match(rf"lab\.toml: edge\.tls\.clients\.{text}", line), line
+
+
+def test_clients_write_to_the_rigs_of_their_lists() -> None:
+    tls = parse_lab(TLS + 'alice = ["rig1"]\nplc7 = ["*"]\n').edge.tls
+    assert tls is not None
+    assert (tls.writers_of("rig1"), tls.writers_of("added")) == ({"alice", "plc7"}, {"plc7"})
+    assert parse_lab(TLS.removesuffix("[edge.tls.clients]\n")).edge.tls.writers_of("rig1") is None
 
 
 def test_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
-"""Prometheus exporter of a lab: text exposition format, version 0.0.4, and its HTTP server."""
+"""Metrics of a lab in the text exposition format of Prometheus, version 0.0.4."""
 
 from collections.abc import Callable, Iterable, Iterator
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
 from hilrig_monitoring.lab_view import LabView, RigStatus, ServiceStatus
@@ -29,10 +27,11 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("connections", "gauge", "Modbus connections open.", "connections", 1),
     ("requests_total", "counter", "Modbus requests answered, also with an exception.", "requests", 1),
     ("malformed_total", "counter", "Malformed messages and connections with malformed frames.", "malformed", 1),
-    ("refused_total", "counter", "Connections and writes refused.", "refused", 1),
+    ("refused_total", "counter", "Connections refused, and writes without lease or permission.", "refused", 1),
     ("recordings", "gauge", "Open recordings.", "recordings", 1),
     ("written_bytes_total", "counter", "Bytes written to recordings.", "bytes_written", 1),
     ("clock_offset_seconds", "gauge", "Largest wall clock offset to another service.", "clock_offset_ns", 1e-9),
+    ("clock_uncertainty_seconds", "gauge", "Uncertainty of this offset.", "clock_uncertainty_ns", 1e-9),
 )
 
 
@@ -72,6 +71,14 @@ def _lines(view: LabView, lab: str, now_s: float) -> Iterator[str]:
                     yield _labels(lab=lab, rig=rig.rig, quantile=f"{share:g}"), value / 1e3
 
     yield from _family("rig_loop_seconds", "gauge", "Loop latency in the last 10 s.", quantiles(RigStatus.loop_ms))
+
+    def exceptions() -> Iterator[tuple[str, float]]:
+        for rig in rigs:
+            for (host, function, code), count in sorted(rig.exceptions.items()):
+                named = str(function) if function else "other"
+                yield _labels(lab=lab, rig=rig.rig, host=host, function=named, code=str(code)), count
+
+    yield from _family("exceptions_total", "counter", "Modbus exception responses.", exceptions())
     text = "Age of the acting command's basis at each step in the last 10 s."
     yield from _family("rig_age_seconds", "gauge", text, quantiles(RigStatus.age_ms))
 
@@ -88,33 +95,3 @@ def _labels(**labels: str) -> str:
         return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
 
     return ",".join(f'{name}="{escaped(value)}"' for name, value in labels.items())
-
-
-def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> ThreadingHTTPServer:
-    """Create a server that answers GET /metrics with the result of `text`; the caller runs and closes it.
-
-    Raises:
-        OSError: the address is unavailable.
-    """
-
-    class Handler(BaseHTTPRequestHandler):
-        timeout = 10.0
-
-        def do_GET(self) -> None:
-            """Answer one request."""
-            if self.path.partition("?")[0] != "/metrics":
-                self.send_error(HTTPStatus.NOT_FOUND, "the metrics are at /metrics")
-                return
-            body = text().encode()
-            self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", CONTENT_TYPE)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Do not log requests: there is one per scrape."""
-
-    server = ThreadingHTTPServer(address, Handler)
-    server.daemon_threads = True
-    return server

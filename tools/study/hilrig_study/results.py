@@ -65,7 +65,7 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
 
 
 def provenance(study: StudyConfig, folder: Path) -> dict[str, Any]:
-    """Return versions, date, seed, hash of each controller file, and units: what a figure needs to be repeated.
+    """Return the data that repeat a figure: versions, date, seed, hash of each controller file, and units.
 
     Args:
         study: the study.

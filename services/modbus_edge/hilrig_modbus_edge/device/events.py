@@ -1,6 +1,8 @@
 """Events of a rig: each has the session and the simulation step; those that may occur in bursts are rate-limited."""
 
-from typing import Final
+from typing import Final, NamedTuple
+
+from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.output import DeviceOutput
@@ -8,7 +10,7 @@ from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_runtime.process.outage import Outage, describe_outage
-from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+from hilrig_runtime.timing.rate_limiter import RateLimiter, RepeatReporter, repeat_suffix
 from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
@@ -44,12 +46,14 @@ class EventEmitter:
         text: str,
         controller: str,
         *,
+        certificate: str = "",
         reason: str = "",
         holder: str = "",
     ) -> None:
         """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
+        event.controller_data.certificate = certificate
         event.controller_data.reason = reason
         event.controller_data.holder = holder
         self.emit(event)
@@ -66,58 +70,92 @@ class EventEmitter:
         self.emit(event)
 
 
+class Refusal(NamedTuple):
+    """A write that is refused."""
+
+    cause: str
+    """Name of the cause: the reasons of one cause differ in times and addresses only."""
+    reason: str
+    """Human-readable."""
+    code: ExcCodes
+    holder: str = ""
+    """Address of the connection for which it is refused; empty: none."""
+
+
 class LeaseEventReporter:
     """Reports acquired, released and denied leases as events, rate-limited per host.
 
     A client may open a new connection for every request, dozens of times a second. Per host, the first acquisition of
     a second is reported and the others are counted. A holder that keeps the lease for a second is always reported.
-    Time is passed in.
+    Denied writes are counted per host, cause and session. Time is passed in.
     """
 
     def __init__(self, rig: str, events: EventEmitter) -> None:
         self._rig = rig
         self._events = events
         self._acquisitions: RateLimiter[str] = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._denials: RateLimiter[tuple[str, bool]] = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._pending_acquire: tuple[str, int] | None = None
-        """Address of the lease holder and time of the acquisition (ns), if it was suppressed."""
+        self._denials: RepeatReporter[tuple[str, str], tuple[Client, Refusal]] = RepeatReporter(
+            LEASE_EVENT_PERIOD_NS, self._emit_denied
+        )
+        self._pending_acquire: tuple[Client, int] | None = None
+        """Connection of the lease holder and time of the acquisition (ns), if it was suppressed."""
 
     def lease_acquired(self, client: Client, now_ns: int) -> None:
         """Report that a client acquired the lease; ns, monotonic clock."""
         count = self._acquisitions.record(client.host, now_ns)
-        self._pending_acquire = None if count else (client.address, now_ns)
+        self._pending_acquire = None if count else (client, now_ns)
         if count:
-            self._emit_acquired(client.address, count)
+            self._emit_acquired(client, count)
 
-    def lease_released(self, address: str, reason: str, *, disconnected: bool) -> None:
+    def lease_released(self, client: Client, reason: str, *, disconnected: bool) -> None:
         """Report that the holder has no lease any more; `disconnected`: its last writing connection was closed."""
         if self._pending_acquire is not None:
             self._pending_acquire = None
             if disconnected:
                 return
-            self._emit_acquired(address)
+            self._emit_acquired(client)
         verb = "released" if disconnected else "lost"
-        text = f"{address} {verb} the lease of {self._rig}: {reason}"
-        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, address, reason=reason)
+        text = f"{client.label} {verb} the lease of {self._rig}: {reason}"
+        self._events.emit_for_controller(
+            Event.LEASE_LOST, Event.INFO, text, client.address, certificate=client.certificate, reason=reason
+        )
 
-    def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
-        """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""
-        count = self._denials.record((client.host, bool(holder)), now_ns)
-        if count:
-            text = f"{client.address}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
-            self._events.emit_for_controller(
-                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=holder
-            )
+    def lease_denied(self, client: Client, refusal: Refusal, now_ns: int) -> None:
+        """Report a denied write; ns, monotonic clock."""
+        self._denials.record((client.host, refusal.cause), (client, refusal), now_ns)
+
+    def flush_denials(self) -> None:
+        """Report the denied writes that were not reported, because a session starts or ends."""
+        self._denials.flush()
 
     def check(self, now_ns: int) -> None:
-        """Report a suppressed acquisition after its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`."""
-        if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
-            address, self._pending_acquire = self._pending_acquire[0], None
-            self._emit_acquired(address)
+        """Do everything that is due: report denied writes that were suppressed, and a suppressed acquisition.
 
-    def _emit_acquired(self, address: str, count: int = 1) -> None:
-        text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
-        self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
+        Its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`.
+        """
+        self._denials.check(now_ns)
+        if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
+            client, self._pending_acquire = self._pending_acquire[0], None
+            self._emit_acquired(client)
+
+    def _emit_denied(self, denied: tuple[Client, Refusal], count: int) -> None:
+        client, refusal = denied
+        text = f"{client.label}: write to {self._rig} denied: {refusal.reason}{repeat_suffix(count)}"
+        self._events.emit_for_controller(
+            Event.LEASE_REFUSED,
+            Event.WARNING,
+            text,
+            client.address,
+            certificate=client.certificate,
+            reason=refusal.reason,
+            holder=refusal.holder,
+        )
+
+    def _emit_acquired(self, client: Client, count: int = 1) -> None:
+        text = f"{client.label} acquired the lease of {self._rig}{repeat_suffix(count)}"
+        self._events.emit_for_controller(
+            Event.LEASE_GRANTED, Event.INFO, text, client.address, certificate=client.certificate
+        )
 
 
 class StallReporter:

@@ -53,7 +53,7 @@ def frame(table: pa.Table, library: str) -> Any:
     """Convert an Arrow table to a data frame.
 
     Raises:
-        InputError: the library is none of `LIBRARIES`.
+        InputError: unknown library.
         OperationError: the library is not installed.
     """
     if library not in LIBRARIES:
