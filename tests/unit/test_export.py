@@ -19,8 +19,8 @@ from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export.export import export_foxglove, export_tables
 from hilrig_replay.geometry.quaternion import rotate
 from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
+from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.run import open_run
-from hilrig_replay.io.tables import TABLES, table
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.arm.kinematics import forward
 from hilrig_sim.arm.model import ArmParameters

@@ -133,7 +133,7 @@ class LatencyReport:
         """
         import pyarrow as pa
 
-        from hilrig_replay.io.tables import frame
+        from hilrig_replay.io.frames.tables import frame
 
         return frame(pa.table({name: self.table[name] for name in self.table.dtype.names or ()}), library)
 

@@ -29,10 +29,10 @@ from hilrig_replay.export.copying import copy_metadata, own_messages
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import StringTable
+from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.records import Decoder, concatenate_records, enum_name
 from hilrig_replay.io.run import BLOCK_ROWS, Run
-from hilrig_replay.io.tables import TABLES, table
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.escaping import csv_text

@@ -215,7 +215,7 @@ class Run:
             InputError: unknown name.
             OperationError: the library is not installed.
         """
-        from hilrig_replay.io import tables
+        from hilrig_replay.io.frames import tables
 
         if table not in tables.TABLES:
             raise InputError(f"table: expected one of {', '.join(tables.TABLES)}, got {table!r}")
