@@ -93,7 +93,7 @@ class PeerReport(_message.Message):
     def __init__(self, service: _Optional[str] = ..., host: _Optional[str] = ..., silent_ns: _Optional[int] = ...) -> None: ...
 
 class RigReport(_message.Message):
-    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us")
+    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us", "exceptions", "alert")
     RIG_FIELD_NUMBER: _ClassVar[int]
     LOOP_US_FIELD_NUMBER: _ClassVar[int]
     SAFE_FIELD_NUMBER: _ClassVar[int]
@@ -103,6 +103,8 @@ class RigReport(_message.Message):
     CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FIELD_NUMBER: _ClassVar[int]
     AGE_US_FIELD_NUMBER: _ClassVar[int]
+    EXCEPTIONS_FIELD_NUMBER: _ClassVar[int]
+    ALERT_FIELD_NUMBER: _ClassVar[int]
     rig: str
     loop_us: _containers.RepeatedScalarFieldContainer[int]
     safe: bool
@@ -112,4 +114,18 @@ class RigReport(_message.Message):
     connections: int
     recording: bool
     age_us: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ...) -> None: ...
+    exceptions: _containers.RepeatedCompositeFieldContainer[ExceptionCount]
+    alert: str
+    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ..., exceptions: _Optional[_Iterable[_Union[ExceptionCount, _Mapping]]] = ..., alert: _Optional[str] = ...) -> None: ...
+
+class ExceptionCount(_message.Message):
+    __slots__ = ("host", "function", "code", "count")
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    FUNCTION_FIELD_NUMBER: _ClassVar[int]
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    host: str
+    function: int
+    code: int
+    count: int
+    def __init__(self, host: _Optional[str] = ..., function: _Optional[int] = ..., code: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
