@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilrig_replay.analysis.data_quality import Stalls
 from hilrig_replay.analysis.diagnosis import control_observations, timing_causes
 from hilrig_replay.analysis.diagnosis.diagnose import MAX_FINDINGS, diagnose
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, sections
@@ -163,16 +162,6 @@ def test_pauses_far_from_a_retransmission_are_not_of_the_network() -> None:
     apart = lossy(3, 200)
     apart.windows[0].connections["wall_ns"] += 4_000 * MS
     assert timing_causes.retransmissions(apart) is None
-
-
-def test_processor_time_that_was_taken_explains_the_stalls() -> None:
-    stalls = Stalls(2, 80 * MS, area_ns2=2 * (80.0 * MS) ** 2 / 2)
-    stalled = replace(evidence([]), stalls=stalls, edge_stalls=stalls)
-    assert timing_causes.cpu_steal(stalled) is None
-    assert timing_causes.cpu_steal(replace(stalled, stolen_ns=30 * MS)) is None
-    found = timing_causes.cpu_steal(replace(stalled, stolen_ns=90 * MS))
-    assert found is not None
-    assert found.evidence["stolen_ms"] == 90
 
 
 EMPTY = Records(
