@@ -26,6 +26,7 @@ from support.waiting import eventually
 pytestmark = [pytest.mark.rig, pytest.mark.alone]
 
 PROGRAM = Path(__file__).parents[1] / "support/student_program.py"
+EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"
 LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 4.0 if LONG else 1.5
 LIVE_RUNS = 25
@@ -98,11 +99,18 @@ def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
         yield
 
 
-def test_previous_poll_adds_a_period(lab: RunningLab) -> None:
-    first, *_ = causes_of(lab, program(lab, "previous poll", seconds=2 * SECONDS))
+def test_example_that_writes_the_old_torques_is_found(lab: RunningLab, tmp_path: Path) -> None:
+    source = EXAMPLE.read_text(encoding="utf-8")
+    written = "answer = client.write_registers(0, words)"
+    late = source.replace(written, "answer = client.write_registers(0, old)\n        old = words")
+    late = late.replace("error = [0.0] * 4\n", "error = [0.0] * 4\n    old = [0, 0, 0, 0]\n", 1)
+    assert late.count("old") == 3
+    path = tmp_path / "hold_previous.py"
+    path.write_text(late, encoding="utf-8")
+    arguments = ["--port", str(lab.port), "--duration", str(2 * SECONDS)]
+    first, *_ = causes_of(lab, [sys.executable, str(path), *arguments])
     assert first.code == "previous_poll", first
     assert "add one period of 20 ms" in first.text
-    assert first.gain_ms == pytest.approx(20, abs=3)
 
 
 def test_wait_between_read_and_write_is_found(lab: RunningLab) -> None:

@@ -23,6 +23,7 @@ from hilrig_runtime.config.task import PoseConfig
 from support.recordings import Script, make, record, write
 
 MS = 1_000_000
+DATA = Path(__file__).parents[1] / "data"
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:
@@ -135,6 +136,23 @@ def test_accepts_commands_without_a_known_basis(tmp_path: Path, basis_step: int)
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
     codes = [finding.code for finding in report.findings if finding.list == "timing"]
     assert codes == (["open_loop"] if basis_step else [])
+
+
+def test_recorded_limit_cycle_is_saturated_and_oscillates() -> None:
+    report = measure(open_run(DATA / "limit-cycle.mcap"))
+    observed = {one.code: one for one in report.findings if one.list == "control"}
+    saturated, cycle = observed["saturation"], observed["limit_cycle"]
+    assert saturated.text.startswith("joint 1 is saturated at ±32 N·m for 6")
+    assert saturated.evidence["saturated_share"] > 0.5
+    assert cycle.evidence["frequency_hz"] == pytest.approx(1.1, abs=0.2)
+    assert cycle.evidence["amplitude"] == pytest.approx(65, abs=15)
+
+
+def test_recorded_open_loop_has_one_timing_cause() -> None:
+    report = measure(open_run(DATA / "read-once-then-write.mcap"))
+    [cause] = [one for one in report.findings if one.list == "timing"]
+    assert cause.code == "open_loop"
+    assert "1183 commands are based on 1 state" in cause.text
 
 
 def lossy(count: int, rtt_us: int) -> Evidence:
