@@ -100,6 +100,25 @@ def test_torques_answer_the_positions_of_their_basis() -> None:
     assert len({command.session for command in commands}) == 1
 
 
+@pytest.mark.parametrize(("scan_s", "delay_s"), [(0.005, 0.0), (0.05, 0.004)])
+def test_basis_is_the_one_that_the_device_knows(scan_s: float, delay_s: float) -> None:
+    with Plc(scan_s=scan_s, delay_s=delay_s) as plc, client_of(plc) as rig:
+        eventually(lambda: len(torques(rig)) > 12)
+        commands, scans, requests = torques(rig)[2:], list(plc.scans), list(plc.requests)
+    for command in commands:
+        step = struct.pack(">H", command.basis_step & 0xFFFF)
+        [written_ns] = [at_ns for at_ns, pdu in requests if pdu[0] == 16 and pdu[-2:] == step]
+        assert command.state_served_ns < written_ns < command.positions_acknowledged_ns
+        read = [at for at, pdu in requests if pdu[0] == 3 and command.read_sent_ns < at < command.write_arrived_ns]
+        [read_ns] = read
+        used = [(begin, end) for begin, end, seen in scans if seen == command.basis_step and end < read_ns]
+        assert used[0][0] > written_ns
+        # No scan with newer positions ended before the read.
+        assert not [seen for _, end, seen in scans if seen > command.basis_step and end < read_ns - 2e6]
+        if command.stale_read_sent_ns:
+            assert command.state_served_ns < command.stale_read_sent_ns < command.read_sent_ns
+
+
 def test_first_write_follows_a_read_of_the_torques() -> None:
     with Plc() as plc, client_of(plc) as rig:
         works(rig)

@@ -90,7 +90,6 @@ def print_report(report: "LatencyReport") -> None:
 
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
-    from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
@@ -101,7 +100,7 @@ def print_report(report: "LatencyReport") -> None:
         table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
         table.add_row("loop", *report.loop_ms.cells(), style="bold", end_section=True)
-        for stage in LOOP_STAGES:
+        for stage in report.stages:
             table.add_row(f"  {stage.title}", *report.stages_ms[stage.key].cells())
         table.add_section()
     if report.age_ms is not None:

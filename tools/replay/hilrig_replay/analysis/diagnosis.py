@@ -176,7 +176,8 @@ def slow_polling(evidence: Evidence) -> Finding | None:
 
 def slow_controller(evidence: Evidence) -> Finding | None:
     """A controller with a long time between reading a state and writing a command."""
-    if evidence.loop_ms is None:
+    if evidence.loop_ms is None or CONTROLLER.key not in evidence.stages_ms:
+        # In the client role the edge itself waits between its requests.
         return None
     held, loop = evidence.stages_ms[CONTROLLER.key].p50 * MS, evidence.loop_ms.p50 * MS
     if held < max(0.4 * loop, 5 * MS):

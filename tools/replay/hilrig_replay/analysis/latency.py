@@ -13,14 +13,17 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from hilrig_replay.analysis.age import AgeTable
-from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
+from hilrig_replay.analysis.data_quality import NO_ECHO, NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
+from hilrig_replay.analysis.device_scan import DeviceScan, device_scan
 from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose, edge_stalls
 from hilrig_replay.analysis.distribution import Statistics, percentiles
 from hilrig_replay.analysis.feedback import follows_positions
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
-from hilrig_replay.analysis.stages import STAGES
+from hilrig_replay.analysis.stages import CLIENT_STAGES, LOOP_STAGES, Stage
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_replay.io.sequence_order import Repairs
@@ -48,7 +51,10 @@ class LatencyReport:
     step_ms: float
     loop_ms: Statistics | None
     """None: no closed loop (see `reasons`)."""
+    client_role: bool
+    """Whether the edge was the client of the controller."""
     stages_ms: dict[str, Statistics]
+    """By the key of each of `stages`."""
     age_ms: Statistics | None
     """Age of the loop at each step; None: no command that is based on a state took effect."""
     control_period_ms: float | None
@@ -64,6 +70,8 @@ class LatencyReport:
     kernel_timestamps: bool
     """Whether the kernel's timestamps separate *controller* from *edge*; else *controller* includes the wake-up of the
     edge."""
+    device_scan: DeviceScan | None
+    """Scan time of the controller's program in the client role; None: not measured."""
     network: NetworkShare | None
     """Share of the network in *controller*; None: not recorded."""
     jitter_ms: Jitter
@@ -85,6 +93,11 @@ class LatencyReport:
         """Copy without the samples and ages, to save memory when many reports are kept."""
         return replace(self, table=SampleTable(), ages=None)
 
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Stages of the loop in the role of the edge."""
+        return CLIENT_STAGES if self.client_role else LOOP_STAGES
+
     def notes(self) -> list[str]:
         """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
         notes = []
@@ -98,7 +111,11 @@ class LatencyReport:
             notes.append(str(self.network))
         if self.loop_ms is not None and self.read_on_other_connection:
             notes.append("read on another connection: positions and torques of the controller have one each")
-        if self.loop_ms is not None and not self.kernel_timestamps:
+        if self.device_scan is not None:
+            notes.append(str(self.device_scan))
+        if self.client_role:
+            notes.append("client of the controller: position write and torque read include the wake-up of the edge")
+        elif self.loop_ms is not None and not self.kernel_timestamps:
             notes.append("without kernel timestamps: controller includes the wake-up of the edge")
         if self.repaired.duplicates:
             notes.append(f"dropped duplicate messages: {self.repaired.duplicates}")
@@ -146,7 +163,9 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         reported_edge_stalls=quality.edge_stalls,
         cycle_ns=quality.cycle_ns(),
     )
-    other_connection = _other_connection_share(table) >= 0.5
+    other_connection = _share(table, "basis_on_other_connection") >= 0.5
+    client_role = _share(table, "polled") >= 0.5
+    role_stages = CLIENT_STAGES if client_role else LOOP_STAGES
     open_loop = other_connection and not follows_positions(
         (window.states, window.commands) for window in evidence.windows()
     )
@@ -156,13 +175,15 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         evidence = replace(evidence, samples=table)
     if len(table):
         loop = Statistics.of(table.column("loop"))
-        stages = {stage: Statistics.of(table.column(stage)) for stage in STAGES}
+        stages = {stage.key: Statistics.of(table.column(stage.key)) for stage in role_stages}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
         evidence = replace(evidence, loop_ms=loop, stages_ms=stages)
     reasons = tuple(quality.reasons(matcher.unmatched, loop, age, edge_stalls(evidence)))
     if open_loop:
         reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
+    if _share(table, "basis_is_bound"):
+        reasons = (*reasons, NO_ECHO)
     return LatencyReport(
         session=run.session,
         rig=run.rig,
@@ -170,6 +191,7 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         samples=len(table),
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
+        client_role=client_role,
         stages_ms=stages,
         age_ms=age.age_ms if age else None,
         control_period_ms=age.control_period_ms if age else None,
@@ -178,6 +200,7 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         older_than_steps=age.older_than_steps if age else {},
         read_on_other_connection=other_connection,
         kernel_timestamps=_kernel_timestamps(table),
+        device_scan=device_scan(np.concatenate([window.commands for window in evidence.windows()])),
         network=network_share(evidence),
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),
@@ -190,9 +213,9 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
     )
 
 
-def _other_connection_share(samples: SampleTable) -> float:
-    """Share of the samples whose basis was served to another connection than the one that wrote."""
-    marked = sum(int(values.sum()) for values in samples.column("basis_on_other_connection")())
+def _share(samples: SampleTable, name: str) -> float:
+    """Share of the samples with a property, a column of `SAMPLE_DTYPE`."""
+    marked = sum(int(values.sum()) for values in samples.column(name)())
     return marked / max(len(samples), 1)
 
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.similarity import find_similar
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
@@ -271,7 +270,7 @@ def _latency(summary: RunSummary) -> str:
     rows = []
     if latency.loop_ms is not None:
         rows.append(["loop", *latency.loop_ms.cells()])
-        rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in LOOP_STAGES]
+        rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in latency.stages]
     if latency.age_ms is not None:
         rows.append(["age", *latency.age_ms.cells()])
     rows.append(["tick lateness", *latency.jitter_ms.tick_lateness.cells()])
