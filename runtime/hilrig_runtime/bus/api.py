@@ -58,6 +58,8 @@ class Reply:
     payload: bytes
     error: str = ""
     """Human-readable reason of a failure; empty: success."""
+    arrived_ns: int = 0
+    """Arrival of this reply, ns, monotonic clock of the system."""
     round_trip_ns: int = 0
     """Time from the query to the arrival of this reply, ns."""
 

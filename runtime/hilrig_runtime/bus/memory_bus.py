@@ -1,6 +1,7 @@
 """The bus within one process, for tests and simulated time; delivery is synchronous and complete."""
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -110,7 +111,10 @@ class MemoryBus(Bus):
         for key, handler in list(self.hub.queryables):
             if matches(key_expr, key):
                 try:
-                    replies.append(Reply(key, handler(payload)))
+                    sent_ns = time.monotonic_ns()
+                    content = handler(payload)
+                    now_ns = time.monotonic_ns()
+                    replies.append(Reply(key, content, arrived_ns=now_ns, round_trip_ns=now_ns - sent_ns))
                 except HilrigError as error:
                     replies.append(Reply(key, b"", str(error)))
         return replies

@@ -142,10 +142,20 @@ class ZenohBus(Bus):
         """See `Bus.query`."""
         replies = []
         sent_ns = time.monotonic_ns()
-        for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
+        # Without consolidation, each reply is delivered when it arrives. Otherwise zenoh keeps it back until all have
+        # arrived or the time is over, which a stopped service prolongs for all others.
+        found = self.session.get(
+            key_expr,
+            payload=payload,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        for reply in found:
             if reply.ok is not None:
-                round_trip_ns = time.monotonic_ns() - sent_ns
-                replies.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), round_trip_ns=round_trip_ns))
+                now_ns = time.monotonic_ns()
+                key, content = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+                replies.append(Reply(key, content, arrived_ns=now_ns, round_trip_ns=now_ns - sent_ns))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes().decode(errors="replace")
                 # zenoh reports a query without a reply as an error of its own.

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model
 
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.controller import ClientConfig, ControllerAddress, RegistersConfig, parse_controller
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
@@ -86,21 +87,6 @@ class SimConfig(Section):
     def command_timeout_ns(self) -> int:
         """`command_timeout_ms` in ns."""
         return round(self.command_timeout_ms * 1e6)
-
-
-class TlsConfig(Section):
-    """Modbus/TCP Security: each rig listens on a second port with mutual TLS (`hilrig certs`)."""
-
-    certificate: Path
-    """The edge's certificate with its chain, PEM."""
-    key: Path
-    """The certificate's private key, PEM."""
-    authority: Path
-    """Certificate of the authority that signs the clients' certificates, PEM."""
-    first_port: Port = 802
-    """Port of the first rig; the others follow."""
-    no_role: Literal["operator", "observer", "refuse"] = "observer"
-    """Rights of a client whose certificate has no role: operator (write), observer (read) or refuse (no access)."""
 
 
 class EdgeConfig(Section):
@@ -261,11 +247,27 @@ class LabConfig(Section):
         tuple[RigSettings, ...], BeforeValidator(_expand_group), TableForm(RigsTable), Field(min_length=1)
     ] = (RigSettings(),)
     _source: str = PrivateAttr("")
+    _path: Path | None = PrivateAttr(None)
 
     @property
     def source(self) -> str:
         """Text of the file; empty: the defaults, or a configuration made by a program."""
         return self._source
+
+    @property
+    def path(self) -> Path | None:
+        """The file; None: the defaults, or a configuration made by a program."""
+        return self._path
+
+    def read_again(self) -> "LabConfig":
+        """Return the present content of the file.
+
+        Raises:
+            InputError: as `load_lab`, or the configuration is not from a file.
+        """
+        if self._path is None:
+            raise InputError("this lab has no lab.toml that could be read again")
+        return load_lab(self._path)
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
@@ -306,13 +308,19 @@ class LabConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _edges_command_rigs(self) -> "LabConfig":
+    def _edges_and_clients_have_rigs(self) -> "LabConfig":
         edges = {} if self.bus.tls is None else self.bus.tls.edges
         names = {rig.name for rig in self.rigs}
-        for edge, rigs in edges.items():
-            for rig in rigs:
-                if rig not in names:
-                    raise ValueError(f"bus.tls.edges.{edge}: {self.no_such_rig(rig)}")
+        mistakes = [
+            f"bus.tls.edges.{edge}: {self.no_such_rig(rig)}"
+            for edge, rigs in edges.items()
+            for rig in rigs
+            if rig not in names
+        ]
+        if self.edge.tls is not None:
+            mistakes += self.edge.tls.mistakes_in_clients(names)
+        if mistakes:
+            raise ValueError("\n".join(mistakes))
         return self
 
     @property
@@ -389,7 +397,11 @@ def load_lab(path: Path | None) -> LabConfig:
     Raises:
         InputError: the file can't be read, or is not a valid lab configuration; names every error.
     """
-    return LabConfig() if path is None else parse_lab(read_text(path), str(path))
+    if path is None:
+        return LabConfig()
+    lab = parse_lab(read_text(path), str(path))
+    lab._path = path
+    return lab
 
 
 def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:

@@ -79,6 +79,8 @@ class Service(Handle):
         self._token: Handle | None = None
         self._failure = ""
         info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
+        self.reload: Callable[[], object] = lambda: logger.info("nothing to read again on SIGHUP")
+        """Called on SIGHUP, in any thread; set by the edge."""
         self.addresses: Callable[[str], str] = lambda _: ""
         """Returns the address of a rig for the service info; set by the edge."""
         self._registry = PeerRegistry(

@@ -33,13 +33,15 @@ class LogBatch(_message.Message):
     def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ..., events: _Optional[bool] = ..., checksum: _Optional[int] = ...) -> None: ...
 
 class OpenSession(_message.Message):
-    __slots__ = ("rig", "session", "controller", "start_wall_ns")
+    __slots__ = ("rig", "session", "controller", "start_wall_ns", "certificate")
     RIG_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     CONTROLLER_FIELD_NUMBER: _ClassVar[int]
     START_WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
     controller: str
     start_wall_ns: int
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ...) -> None: ...
+    certificate: str
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ..., certificate: _Optional[str] = ...) -> None: ...

@@ -135,6 +135,7 @@ class RigEndpoint:
         if server.connections:
             self.device.refresh_state()
             server.close_idle(now_ns)
+            server.close_expired(self._clock.wall_ns())
         count = server.request_log.count
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
             late_ns = max(0, now_ns - self.request_log_due_ns)
@@ -143,6 +144,10 @@ class RigEndpoint:
                 self._tcp_figures_due_ns = now_ns + TCP_FIGURES_PERIOD_NS
                 server.log_tcp_figures()
             self._publish_request_log()
+
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of clients with a certificate; see `RigServer.close_certificate`."""
+        return self._server.close_certificate(name, reason)
 
     def report(self) -> RigReport:
         """Return the part of the health report that describes the rig."""
@@ -167,5 +172,6 @@ class RigEndpoint:
         self.closing.close()
 
     def _publish_request_log(self) -> None:
-        clock = self._clock
-        self._request_log.publish(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
+        clock, server = self._clock, self._server
+        server.counters.requests += server.request_log.count
+        self._request_log.publish(server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))

@@ -65,6 +65,7 @@ class Client:
     certificate: str = ""
     """Name in its certificate; empty: it has none."""
     may_write: bool = True
+    """Whether the role in its certificate allows writes."""
     controller: ConnectedController = field(init=False)
     """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
@@ -87,6 +88,11 @@ class Client:
     """Reason why that controller does not command the rig now; empty: it does."""
     skipped_states: int = 0
     """Number of states that were not written to that controller, because a newer one was there."""
+
+    @property
+    def label(self) -> str:
+        """Address, and the name in its certificate if it has one: for texts."""
+        return f"{self.address} (CN={self.certificate})" if self.certificate else self.address
 
     def record_request(self, now_ns: int) -> None:
         """Record that a request arrived."""

@@ -6,6 +6,7 @@ owner calls `check` every few milliseconds; the device schedules its own deadlin
 """
 
 import random
+from collections.abc import Set as AbstractSet
 from typing import Final
 
 from pymodbus.constants import ExcCodes
@@ -361,6 +362,10 @@ class Device:
 
     # -- operator
 
+    def permit(self, names: AbstractSet[str] | None) -> None:
+        """Set the certificates whose clients may write; see `WriteAccess.permit`."""
+        self._write_access.permit(names)
+
     def release(self, reason: str) -> str:
         """Revoke the lease; return the previous holder, empty: none. See `WriteAccess.release`."""
         return self._write_access.release(reason)
@@ -413,6 +418,6 @@ class Device:
             status |= Status.WATCHDOG_ON
         if self.watchdog.state is WatchdogState.TRIPPED:
             status |= Status.WATCHDOG_TRIPPED
-        if not client.may_write:
+        if not self._write_access.may_write(client):
             status |= Status.READ_ONLY
         return status

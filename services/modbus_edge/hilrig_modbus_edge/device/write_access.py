@@ -112,8 +112,10 @@ class WriteAccess:
         self._reserved_for: Client | None = None
         """The only client that may write; None: any."""
         self._session_note = ""
-        self._last_writer = ""
-        """Address of the newest writing connection."""
+        self._last_writer: Client | None = None
+        """The newest writing connection, which may be closed."""
+        self._permitted: AbstractSet[str] | None = None
+        """Names in the certificates of the clients that may write; None: all clients."""
         self._controller_change_ns = 0
         """Earliest time at which another controller may end a session, ns, monotonic clock."""
         self._watchdog_timer: TimerHandle | None = None
@@ -140,7 +142,22 @@ class WriteAccess:
             self._acquire_lease(client, now_ns)
         self._writers.record(client, begin, end, now_ns)
         client.writes = True
-        self._last_writer = client.address
+        self._last_writer = client
+
+    def permit(self, names: AbstractSet[str] | None) -> None:
+        """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
+        self._permitted = names
+        for client in self._clients:
+            if not self.may_write(client):
+                self._writers.remove(client)
+        holder = self.lease.holder
+        if holder is not None and not any(client.writes and self.may_write(client) for client in holder.clients):
+            self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
+
+    def may_write(self, client: Client) -> bool:
+        """Return whether a client may write if the rig is free: by the role and the name in its certificate."""
+        is_permitted = self._permitted is None or client.certificate in self._permitted or client is self._reserved_for
+        return client.may_write and is_permitted
 
     def authorize(self, client: Client, begin: int, end: int, now_ns: int) -> Refusal | None:
         """Return why a client may not write to the rig now; None: it may. The only place of these reasons.
@@ -164,12 +181,15 @@ class WriteAccess:
                 ExcCodes.DEVICE_BUSY,
                 reserved_for.address,
             )
+        if not self.may_write(client):
+            return Refusal(self._not_listed(client), ExcCodes.ILLEGAL_FUNCTION)
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
             return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
         if self.lease.holder not in (None, client.controller):
             return Refusal(
-                f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release",
+                f"{self._last_writer_label} holds the lease; stop that client, or run: "
+                f"hilrig lease {self._rig} --release",
                 ExcCodes.DEVICE_BUSY,
                 self._holder,
             )
@@ -197,7 +217,7 @@ class WriteAccess:
             return
         if watchdog.feed(now_ns):
             verb = "writes" if self._reserved_for is None else "answers"
-            text = f"watchdog of {self._rig} re-armed: {client.address} {verb} again"
+            text = f"watchdog of {self._rig} re-armed: {client.label} {verb} again"
             event = self._events.event(Event.WATCHDOG_REARM, Event.INFO, text)
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._events.emit(event)
@@ -284,13 +304,29 @@ class WriteAccess:
     @property
     def _holder(self) -> str:
         """Address of the newest writing connection of the lease holder; empty: none."""
-        return "" if self.lease.holder is None else self._last_writer
+        return "" if self.lease.holder is None or self._last_writer is None else self._last_writer.address
+
+    @property
+    def _last_writer_label(self) -> str:
+        return "" if self._last_writer is None else self._last_writer.label
+
+    def _not_listed(self, client: Client) -> str:
+        """Reason why a client may only read, because [edge.tls.clients] does not permit it."""
+        if not client.certificate:
+            return (
+                "read-only: lab.toml has [edge.tls.clients], so writing needs a certificate; connect to the TLS port "
+                "with one that is listed there"
+            )
+        return (
+            f"read-only: [edge.tls.clients] does not list {self._rig} for {client.certificate}; add it in lab.toml, "
+            "then send SIGHUP to the edge"
+        )
 
     def _acquire_lease(self, client: Client, now_ns: int) -> None:
         session = self._session.current
         if session is not None and session.controller is not client.controller:
             self._controller_change_ns = now_ns + CONTROLLER_CHANGE_PERIOD_NS
-            self._end_session(f"{client.address} acquired the lease")
+            self._end_session(f"{client.label} acquired the lease")
         self.lease.acquire(client.controller)
         self._start_or_continue_session(client)
         self._lease_events.lease_acquired(client, now_ns)
@@ -307,7 +343,8 @@ class WriteAccess:
         if not self._commands.has_torque:
             # There is no torque to stop.
             self.watchdog.disarm()
-        self._lease_events.lease_released(self._last_writer, reason, disconnected=disconnected)
+        if self._last_writer is not None:
+            self._lease_events.lease_released(self._last_writer, reason, disconnected=disconnected)
 
     def _start_or_continue_session(self, client: Client) -> None:
         if self._session.current is not None:
@@ -317,13 +354,15 @@ class WriteAccess:
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._rng)
         number = self._session_count
-        self._session.current = Session(self._rig, identity, number, client.address, client.controller, wall_ns)
+        self._session.current = Session(
+            self._rig, identity, number, client.address, client.certificate, client.controller, wall_ns
+        )
         # What another connection read before the session is no basis in it: it may have been another program.
         client.controller.clear_served()
         # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
         self._commands.echo = 0
-        text, reason = f"session {identity} started by {client.address}", "lease acquired"
+        text, reason = f"session {identity} started by {client.label}", "lease acquired"
         if self._reserved_for is not None:
             text, reason = (
                 f"session {identity} started as client of {client.address}",
@@ -333,6 +372,7 @@ class WriteAccess:
             text, reason = f"{text}: {self._session_note}", f"{reason}: {self._session_note}"
         event = self._events.event(Event.SESSION_START, Event.INFO, text)
         event.session_data.controller = client.address
+        event.session_data.certificate = client.certificate
         event.session_data.reason = reason
         self._events.emit(event)
         self._output.sessions_changed()
@@ -348,6 +388,7 @@ class WriteAccess:
         self.stalls.flush()
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.address
+        event.session_data.certificate = session.certificate
         event.session_data.reason = reason
         # This command tells the simulation that the session has ended. It is a new one, because it has no session.
         self._session.current = None
@@ -358,18 +399,18 @@ class WriteAccess:
     def _trip(self, silent_ns: int, now_ns: int) -> None:
         self._commands.zero()
         self._commands.publish_internal()
-        holder = self.lease.holder
+        holder, writer = self.lease.holder, self._last_writer_label
         missing, rearming = "write", "write"
         if self._reserved_for is not None:
             missing, rearming = "torque of its program", "one"
             cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
         elif holder is None:
-            cause = f"{self._last_writer} no longer holds the lease"
+            cause = f"{writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:
             # It may have been unplugged after a read.
-            cause = f"no request from {self._last_writer} for {quiet_ns / 1e9:.1f} s"
+            cause = f"no request from {writer} for {quiet_ns / 1e9:.1f} s"
         else:
-            cause = f"{self._last_writer} reads but does not write"
+            cause = f"{writer} reads but does not write"
         text = (
             f"watchdog of {self._rig} tripped: no {missing} for {silent_ns // MS} ms, torque set to zero: {cause}; "
             f"the next {rearming} re-arms it"

@@ -54,6 +54,8 @@ class Connection(asyncio.Protocol):
 
     def __init__(self, server: ConnectionOwner, transport: asyncio.Transport, client: Client) -> None:
         self.client = client
+        self.expiry_ns = 0
+        """End of the validity of the client's certificate, ns since 1970-01-01 UTC; 0: it has none."""
         self.socket: socket.socket = transport.get_extra_info("socket")
         self._server = server
         self._transport = transport
@@ -62,7 +64,6 @@ class Connection(asyncio.Protocol):
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._log_request = server.request_log.record
-        self._counters = server.counters
         self._pending = b""
         """Received bytes that are not executed yet: more requests than one turn executes, or an incomplete one."""
         self._arrived_ns = self._received_ns = 0
@@ -159,7 +160,6 @@ class Connection(asyncio.Protocol):
             reply = exception_response(pdu[0], _TARGET_SILENT)
         code = reply[1] if reply[0] & 0x80 else 0
         self._log_request(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
-        self._counters.requests += 1
         return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
 
     def _close_malformed(self, defect: str) -> None:

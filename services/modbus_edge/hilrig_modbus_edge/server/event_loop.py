@@ -29,9 +29,11 @@ ACCEPT_RETRY_S: Final = 1.0
 _RECEIVE_BYTES: Final = 448
 """Maximum number of bytes of one call. Python allocates an object of up to 512 bytes 0.1 µs faster."""
 _MS: Final = 0.001
+_NEARLY_MS: Final = 0.000_999
 _SO_TIMESTAMPNS: Final = 35
 """Number of the socket option on Linux that stamps received data; the module `socket` has no name for it."""
 _TIMESPEC: Final = struct.Struct("=qq")
+_unpack_timespec = _TIMESPEC.unpack
 _ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size) if hasattr(socket, "CMSG_SPACE") else 0
 _Args = TypeVarTuple("_Args")
 _Ready = list[tuple[int, int]]
@@ -111,8 +113,8 @@ if hasattr(select, "epoll"):
             if timeout is None:
                 return poll()
             if timeout >= _MS:
-                # epoll counts whole milliseconds and rounds up: half a millisecond less gives no more than remain.
-                return poll(int(timeout / _MS) * _MS - _MS / 2)
+                # epoll counts whole milliseconds and rounds up: a millisecond less, nearly, gives no more than remain.
+                return poll(timeout - _NEARLY_MS)
             if timeout > 0:
                 wait(own_descriptor, (), (), timeout)
             return poll(0)
@@ -238,7 +240,7 @@ class SocketTransport(asyncio.Transport):
         """
         if not self._ancillary:
             return 0
-        seconds, nanoseconds = _TIMESPEC.unpack_from(self._ancillary[0][2])
+        seconds, nanoseconds = _unpack_timespec(self._ancillary[0][2])
         wall_ns = seconds * 1_000_000_000 + nanoseconds
         received_ns: int = wall_ns - time_ns() + monotonic_ns()
         if not earliest_ns <= received_ns <= latest_ns:
@@ -273,28 +275,25 @@ class SocketTransport(asyncio.Transport):
         events &= self._events
         try:
             if events & EVENT_READ:
-                self._read()
+                try:
+                    if self._receive_stamped is None:
+                        data = self._receive(_RECEIVE_BYTES)
+                    else:
+                        data, self._ancillary, _, _ = self._receive_stamped(_RECEIVE_BYTES, _ANCILLARY_BYTES)
+                except (BlockingIOError, InterruptedError):
+                    pass
+                except OSError as error:
+                    self._abort(error)
+                else:
+                    if data:
+                        self._data_received(data)
+                    else:
+                        self.close()
             if events & EVENT_WRITE:
                 self._flush()
         except Exception as error:
             logger.exception("connection %s closed: internal error", self.get_extra_info("peername"))
             self._abort(error)
-
-    def _read(self) -> None:
-        try:
-            if self._receive_stamped is None:
-                data = self._receive(_RECEIVE_BYTES)
-            else:
-                data, self._ancillary, _, _ = self._receive_stamped(_RECEIVE_BYTES, _ANCILLARY_BYTES)
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._abort(error)
-            return
-        if data:
-            self._data_received(data)
-        else:
-            self.close()
 
     def _flush(self) -> None:
         try:

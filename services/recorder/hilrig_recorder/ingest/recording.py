@@ -45,6 +45,8 @@ class Recording:
     """When the recording was opened, monotonic clock, ns."""
     store: "RecordingStore" = field(repr=False)
     """Has its file."""
+    certificate: str = ""
+    """Name in the controller's certificate; empty: it has none."""
     counters: LossCounters = field(default_factory=LossCounters)
     seen: set[tuple[int, int, int]] | None = None
     """(channel id, sequence, publish time) of messages in the previous segment; None: no duplicates are expected."""

@@ -28,7 +28,7 @@ from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.outage import OutageDetector, describe_outage
-from hilrig_schemas import Event, LogBatch
+from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, SERVICES, is_name, parse_rig_key
 
 BLOCK_PERIOD_NS: Final = 8 * SECOND_NS // 10
@@ -263,7 +263,15 @@ class SessionTracker:
 
     def _handle_event(self, publisher: PublisherState, event: Event, publish_ns: int, now_ns: int) -> None:
         if event.kind == Event.SESSION_START:
-            self._open(publisher.name, event.rig, event.session, event.session_data.controller, event.wall_ns, now_ns)
+            data = event.session_data
+            session = OpenSession(
+                rig=event.rig,
+                session=event.session,
+                controller=data.controller,
+                certificate=data.certificate,
+                start_wall_ns=event.wall_ns,
+            )
+            self._open(publisher.name, session, now_ns)
         elif event.kind == Event.SESSION_END:
             recording = self._recordings.get(event.session)
             if recording is not None and recording.owner != publisher.name:
@@ -282,7 +290,7 @@ class SessionTracker:
     def _handle_announcement(self, publisher: PublisherState, batch: LogBatch, now_ns: int) -> None:
         listed = {session.session: session for session in batch.sessions}
         for session in listed.values():
-            self._open(publisher.name, session.rig, session.session, session.controller, session.start_wall_ns, now_ns)
+            self._open(publisher.name, session, now_ns)
         if not batch.complete_sessions:
             return
         for recording in self._recordings.values():
@@ -297,7 +305,8 @@ class SessionTracker:
                 reason = f"{publisher.name} no longer announces the session"
                 self._end(recording, reason, publisher.last_publish_ns, now_ns)
 
-    def _open(self, owner: str, rig_name: str, session: str, controller: str, start_wall_ns: int, now_ns: int) -> None:
+    def _open(self, owner: str, opened: OpenSession, now_ns: int) -> None:
+        rig_name, session = opened.rig, opened.session
         if session in self._recordings or session in self._blocked_until or not self._is_assigned(rig_name):
             return
         if not _SESSION_ID.fullmatch(session) or not is_name(rig_name):
@@ -310,7 +319,16 @@ class SessionTracker:
         if rig is None or len(rig.recordings) >= MAX_RECORDINGS_PER_RIG:
             self._reject(f"{owner}: more sessions than {MAX_RECORDINGS_PER_RIG} of a rig, or too many rigs")
             return
-        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns, self._store)
+        recording = Recording(
+            rig_name,
+            session,
+            opened.controller,
+            owner,
+            opened.start_wall_ns,
+            now_ns,
+            self._store,
+            certificate=opened.certificate,
+        )
         if not self._store.open(recording):
             self._block(session, now_ns + RETRY_PERIOD_NS)
             return

@@ -232,6 +232,7 @@ class FileStore:
             "rig": recording.rig,
             "lab": self._lab,
             "controller": recording.controller,
+            "certificate": recording.certificate,
             "keeper": recording.owner,
             "start": start.strftime("%Y-%m-%dT%H:%M:%SZ"),
             "start_wall_ns": str(recording.start_wall_ns),

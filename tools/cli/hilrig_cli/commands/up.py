@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from hilrig_cli.commands.services import LogFormat, StopWithParent
-from hilrig_cli.options import Config, log
+from hilrig_cli.options import Config
 
 
 def up(
@@ -38,20 +38,18 @@ def up(
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.logging_setup import start_logging
-    from hilrig_runtime.process.shutdown import stop_on_signals
+    from hilrig_runtime.process.shutdown import call_on_hangup, stop_on_signals
     from hilrig_sim.parameters import lab_parameters
 
+    start_logging("up", "1", log_format)
+    report: Callable[[str], None] = logging.getLogger(__name__).info
+    say: Callable[[str], None] = partial(print, flush=True) if log_format == "text" else report
     written = ExitStack()
     if controller:
         config = written.enter_context(lab_file_of_controller(controller, config))
     lab = load_lab(config)
     lab_parameters(lab, str(config or "defaults"))
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
-    say: Callable[[str], None] = partial(print, flush=True)
-    report: Callable[[str], None] = log
-    if log_format != "text":
-        start_logging("up", "1", log_format)
-        say = report = logging.getLogger(__name__).info
 
     processes = lab_processes([rig.name for rig in lab.rigs], edges=edges, recorders=recorders)
     with written, running_lab(lab, config, report, stopping, processes, ["--log-format", log_format]) as supervisor:
@@ -65,6 +63,7 @@ def up(
                     say(f"{rig.name}: {rig.describe_controller()}")
             say(f"recordings: {(lab.recorder.folder / lab.name).resolve()}")
             say("running; press Ctrl-C to stop")
+        call_on_hangup(supervisor.reload, stopping)
         viewer = None
         if view and not stopping.is_set():
             command = [sys.executable, "-m", "hilrig_cli", "live", lab.rigs[0].name]

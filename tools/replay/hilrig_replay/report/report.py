@@ -7,7 +7,9 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
+from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
+from hilrig_replay.analysis.intervals import cells
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
@@ -204,7 +206,8 @@ def _run(number: int, page: _Page) -> str:
 
 def _origin(summary: RunSummary) -> str:
     # A session that was started by a controller has the controller's address.
-    started_by = f"controlled by {summary.controller}" if summary.controller else "recorded manually"
+    name = f"{summary.certificate} at " if summary.certificate else ""
+    started_by = f"controlled by {name}{summary.controller}" if summary.controller else "recorded manually"
     return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {started_by} · {summary.start}"
 
 
@@ -269,11 +272,12 @@ def _latency(summary: RunSummary) -> str:
     latency = summary.latency
     rows = []
     if latency.loop_ms is not None:
-        rows.append(["loop", *latency.loop_ms.cells()])
-        rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in latency.stages]
+        known = latency.intervals_ms
+        rows.append(["loop", *cells(latency.loop_ms, known["loop"])])
+        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in latency.stages]
     if latency.age_ms is not None:
-        rows.append(["age", *latency.age_ms.cells()])
-    rows.append(["tick lateness", *latency.jitter_ms.tick_lateness.cells()])
+        rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
+    rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
@@ -284,8 +288,10 @@ def _latency(summary: RunSummary) -> str:
 
 
 def _findings(summary: RunSummary) -> str:
-    findings = "".join(f"<li>{as_html(finding.text)}</li>" for finding in summary.latency.findings)
-    return f"<ul>{findings}</ul>" if findings else "<p>No cause found.</p>"
+    return "".join(
+        f"<p>{title}:</p><ul>{''.join(f'<li>{as_html(sentence)}</li>' for sentence in sentences)}</ul>"
+        for title, sentences in sections(summary.latency.findings)
+    )
 
 
 def _events(name: str, page: _Page) -> str:
