@@ -26,6 +26,7 @@ from hilrig_replay.analysis.distribution import Statistics, percentiles
 from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
 from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
+from hilrig_replay.analysis.older_positions import OlderPositions, older_positions
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import CLIENT_STAGES, CONTROLLER, LOOP_STAGES, Stage
 from hilrig_replay.geometry.scene import parameters_of
@@ -83,6 +84,9 @@ class LatencyReport:
     edge."""
     device_scan: DeviceScan | None
     """Scan time of the controller's program in the client role; None: not measured."""
+    older_positions: OlderPositions | None
+    """Estimate of the time by which the latency exceeds its bound in the client role without an echo register; None: it
+    is exact, or the torques do not show it."""
     network: NetworkShare | None
     """Share of the network in *controller*; None: not recorded."""
     jitter_ms: Jitter
@@ -112,6 +116,8 @@ class LatencyReport:
     def notes(self) -> list[str]:
         """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
         notes = []
+        if self.older_positions is not None:
+            notes.append(str(self.older_positions))
         if self.age_ms is not None and self.control_period_ms is not None and self.longest_hold_ms is not None:
             older = ", ".join(f"{share:.1%} > {steps}" for steps, share in self.older_than_steps.items())
             notes.append(
@@ -193,7 +199,8 @@ def measure(
     reasons = tuple(quality.reasons(matcher.unmatched, loop, age, stalled))
     if open_loop:
         reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
-    if _share(table, "basis_is_bound"):
+    is_bound = _share(table, "basis_is_bound") > 0
+    if is_bound:
         reasons = (*reasons, NO_ECHO)
     network = network_share(windows, stages[CONTROLLER.key].p50 if CONTROLLER.key in stages else None)
     evidence = Evidence(
@@ -231,6 +238,7 @@ def measure(
         read_on_other_connection=other_connection,
         kernel_timestamps=_kernel_timestamps(table),
         device_scan=device_scan(np.concatenate([window.commands for window in windows])),
+        older_positions=older_positions(evidence.gains, run.step_ns) if is_bound else None,
         network=network,
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),
