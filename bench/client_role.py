@@ -1,7 +1,7 @@
 """Measures the client role: rigs whose controllers are Modbus servers, which the edge polls.
 
 Four questions. How many such rigs does one machine run: 16 and 64 rigs at a step of 20 ms against servers in C on
-libmodbus, whose programs run every 10 ms. What is the latency of one such rig beside one in the server role, in one
+libmodbus, whose programs run every 10 ms. The latency of one such rig beside one in the server role, in one
 lab. Which latency do the paper's devices have: programs with scan times of 5 to 80 ms over networks of 0 to 20 ms; each
 basis in the recording is compared with the step that the device's program used. And without an echo register: how far
 is the bound from the truth.

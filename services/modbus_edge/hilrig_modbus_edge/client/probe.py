@@ -10,7 +10,7 @@ from hilrig_modbus_edge.client.transactions import ControllerConnection
 
 
 def probe_controller(settings: ExchangeSettings) -> list[str]:
-    """Read every register that the edge would read or write; return what is wrong, empty: nothing.
+    """Read every register that the edge would read or write; return the defects.
 
     Raises:
         InputError: a file of client.tls can't be used.

@@ -30,7 +30,7 @@ class OlderPositions:
 
 
 def older_positions(gains: RoundingGains, step_ns: int) -> OlderPositions | None:
-    """Return the estimate; None: the torques do not show what they answer."""
+    """Return the estimate; None: the torques do not show it."""
     first = gains.polls_behind
     if first is None:
         return None
