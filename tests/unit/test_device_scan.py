@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilrig_replay.analysis.device_scan import device_scan
+from hilrig_replay.analysis.client_role.device_scan import device_scan
 from hilrig_replay.io.columns import COMMAND_DTYPE, Rows
 
 MS = 1_000_000

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from hilrig_replay.analysis.client_role.older_positions import older_positions
 from hilrig_replay.analysis.feedback import MAX_POLLS, RoundingGains
-from hilrig_replay.analysis.older_positions import older_positions
 
 STEP_NS = 20_000_000
 OLDER = np.arange(MAX_POLLS + 1, dtype=float)

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from hilrig_replay.analysis.age import AgeTable
+from hilrig_replay.analysis.client_role.device_scan import DeviceScan, device_scan
+from hilrig_replay.analysis.client_role.older_positions import OlderPositions, older_positions
 from hilrig_replay.analysis.data_quality import NO_ECHO, NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
-from hilrig_replay.analysis.device_scan import DeviceScan, device_scan
 from hilrig_replay.analysis.diagnosis.diagnose import diagnose
 from hilrig_replay.analysis.diagnosis.edge_stalls import edge_stalls
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, windows_of
@@ -26,7 +27,6 @@ from hilrig_replay.analysis.distribution import Statistics, percentiles
 from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
 from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
-from hilrig_replay.analysis.older_positions import OlderPositions, older_positions
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import CLIENT_STAGES, CONTROLLER, LOOP_STAGES, Stage
 from hilrig_replay.geometry.scene import parameters_of
