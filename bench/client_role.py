@@ -1,10 +1,10 @@
 """Measures the client role: rigs whose controllers are Modbus servers, which the edge polls.
 
 Four questions. How many such rigs does one machine run: 16 and 64 rigs at a step of 20 ms against servers in C on
-libmodbus, whose programs run every 10 ms. Which latency has one such rig beside one in the server role, in one lab. Which
-latency do the paper's devices have: programs with scan times of 5 to 80 ms over networks of 0 to 20 ms; the basis of each
-command is compared with the positions that the device's program used. And without an echo register: how far is the
-bound from the truth, and how good is the estimate.
+libmodbus, whose programs run every 10 ms. Which latency has one such rig beside one in the server role, in one lab.
+Which latency do the paper's devices have: programs with scan times of 5 to 80 ms over networks of 0 to 20 ms; the basis
+of each command is compared with the positions that the device's program used. And without an echo register: how far is
+the bound from the truth, and how good is the estimate.
 """
 
 import math
@@ -155,7 +155,10 @@ def add_devices(report: Report, network_ms: float, seconds: float) -> None:
     """Add the latency of devices with different scan times, and compare it with their own knowledge."""
     for echo in (True, False):
         with ExitStack() as stack:
-            devices = [stack.enter_context(Plc(scan_s=scan_ms / 1e3, delay_s=network_ms / 1e3)) for scan_ms in SCANS_MS]
+            devices = [
+                stack.enter_context(Plc(scan_s=scan_ms / 1e3, delay_s=network_ms / 1e3, law=follow))
+                for scan_ms in SCANS_MS
+            ]
             found = run_lab([device.address for device in devices], seconds, echo=echo)
         for scan_ms, device, one, commands in zip(SCANS_MS, devices, found.latency, found.commands, strict=True):
             case = f"scan {scan_ms:g} ms, network {network_ms:g} ms" + ("" if echo else ", no echo")
