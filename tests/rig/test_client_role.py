@@ -233,6 +233,17 @@ def test_stopped_program_trips_the_watchdog() -> None:
         rig.event(Event.CONTROLLER_BACK)
 
 
+def test_missing_states_are_no_fault_of_the_program() -> None:
+    with Plc() as plc, client_of(plc) as rig:
+        works(rig)
+        publish, rig.state = rig.state, lambda **_: None  # type: ignore[assignment, method-assign]
+        trip = rig.event(Event.WATCHDOG_TRIP)
+        assert f"no new state was written to {plc.address}" in trip.text
+        assert "CONTROLLER_FAULT" not in rig.kinds()
+        rig.state = publish  # type: ignore[method-assign]
+        works(rig)
+
+
 def test_program_that_does_not_copy_the_step_is_reported() -> None:
     with Plc(copies_step=False) as plc, client_of(plc) as rig:
         fault(rig, "does not copy the step number")

@@ -310,8 +310,10 @@ class Exchange:
 
     def _check_program(self, now_ns: int) -> None:
         """Report a program that has not copied a step number for the timeout of the watchdog."""
-        if self._echo_changed_ns == 0:
+        if self._echo_changed_ns == 0 or self._echo == self._written.newest_echo:
+            # Without a new state, the program has nothing to copy.
             self._echo_changed_ns = now_ns
+            self._client.fault = ""
         limit_ns = self._device.watchdog.timeout_ns or FAULT_EVENT_PERIOD_NS
         if now_ns - self._echo_changed_ns >= limit_ns:
             self._report(ControllerError(FaultKind.NOT_RUNNING, NOT_RUNNING, closes=False))

@@ -32,6 +32,11 @@ class WrittenPositions:
         """Whether a write was acknowledged."""
         return self._newest.acknowledged_ns != 0
 
+    @property
+    def newest_echo(self) -> int:
+        """Step number of the newest acknowledged write, as a program copies it."""
+        return self._newest.served[0][1] & STEP_MASK
+
     def add(self, served: ServedState) -> None:
         """Add a write that is about to be sent; `served` has the state and the time of sending."""
         step = served[0][1] & STEP_MASK
