@@ -268,13 +268,16 @@ class Run:
 
     def _checked(self, records: Records) -> Records:
         """Refuse numbers that no simulation sends, before anything is computed from them."""
-        for rows, names in ((records.states, ("position", "velocity", "effort")), (records.commands, ("effort",))):
+        for rows, names in (
+            (records.states, ("position", "velocity", "effort")),
+            (records.commands, ("effort",)),
+            (records.parts, ("x", "y", "z", "yaw")),
+        ):
             for name in names:
-                finite = np.isfinite(rows[name]).all(axis=1)
+                finite = np.isfinite(rows[name])
                 if not finite.all():
-                    row = rows[int(np.argmin(finite))]
-                    found = f"{name} {row[name].tolist()} in message {int(row['sequence'])}; expected finite numbers"
-                    raise InputError(f"{self.path}: can't be evaluated: {found}")
+                    wrong = rows[name][~finite][0]
+                    raise InputError(f"{self.path}: unusable content: {name} is {wrong}; expected finite numbers")
         return records
 
     def _read_all(self, topic: str) -> Records:

@@ -58,7 +58,7 @@ class Timebase:
                 axis_ns = int(row["wall_ns"]) - self.start_wall_ns - self._sim_clock.step_ns
                 self._offsets[incarnation] = _int64(axis_ns - int(row["sampled_ns"]))
         self._sim_clock.update(states["wall_ns"], states["sampled_ns"], self.start_wall_ns)
-        self._anchor = (int(states["wall_ns"][-1]), int(states["step"][-1]))
+        self._anchor = (int(states["wall_ns"][-1]), _int64(int(states["step"][-1])))
 
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
         """Times at which the rows were sent, ns from the first state of the run, shape as `rows`."""
@@ -74,7 +74,7 @@ class Timebase:
     def steps(self, rows: Rows, step_ns: int) -> NDArray[np.int64]:
         """Simulation step of each row, shape as `rows`; estimated from the wall clock if a row has no step."""
         wall_ns, step = self._anchor
-        anchor_ns = wall_ns - self._sim_clock.step_ns
+        anchor_ns = _int64(wall_ns - self._sim_clock.step_ns)
         estimated = np.maximum(step + (self._wall_ns(rows) - anchor_ns) // step_ns, 0)
         if "step" not in (rows.dtype.names or ()):
             return np.asarray(estimated)
