@@ -233,7 +233,9 @@ def test_recordings_are_listed_served_and_reported(running_lab: ConsoleWithLab) 
     status, headers, page = running_lab.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")
     assert status == 200
     assert b"<h1>Run 20260101T000000Z-rig1-abcd</h1>" in page
-    assert headers["content-security-policy"].startswith("default-src 'none'; img-src data:;")
+    policy = headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "img-src data:;" in policy
     assert running_lab.console.ask("/reports/lab/rig9/good%20%3C%26%3E%20run.mcap")[2] == page
     status, _, message = running_lab.console.ask("/reports/lab/rig9/torn.mcap")
     assert (status, b"hilrig recover" in message) == (404, True)
