@@ -4,6 +4,7 @@ import json
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
@@ -14,7 +15,9 @@ from hilrig_recorder.mcap_format.scan import scan
 from hilrig_replay.analysis.index import INDEX_NAME, RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
+from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
 from hilrig_runtime.config.validation import MAX_TEXT_BYTES, read_text
@@ -152,6 +155,18 @@ def test_extreme_stamps_are_evaluated(tmp_path: Path, wall_ns: int) -> None:
             one.message.wall_ns = wall_ns  # type: ignore[attr-defined]
     path = recordings.write(tmp_path / "run.mcap", made, script=SCRIPT)
     assert measure(open_run(path)).samples > 0
+
+
+@pytest.mark.timeout(10)
+def test_steps_and_restarts_at_each_state_take_little_time() -> None:
+    states, commands = np.zeros(10_000, STATE_DTYPE), np.zeros(10_000, COMMAND_DTYPE)
+    states["step"] = states["incarnation"] = np.arange(10_000)
+    states["sampled_ns"] = commands["wall_ns"] = 20_000_000 * np.arange(10_000)
+    # The wall clock is set by a quarter of an hour at each state.
+    states["wall_ns"] = states["sampled_ns"] + 10**12 * (np.arange(10_000) % 2) + 1
+    timebase = Timebase()
+    timebase.update(states)
+    assert (len(timebase.time_ns(states)), len(timebase.time_ns(commands))) == (10_000, 10_000)
 
 
 def test_number_too_large_for_its_column_is_damage(tmp_path: Path) -> None:

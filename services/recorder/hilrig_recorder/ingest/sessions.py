@@ -326,7 +326,6 @@ class SessionTracker:
             owner,
             opened.start_wall_ns,
             now_ns,
-            self._store,
             certificate=opened.certificate,
         )
         if not self._store.open(recording):

@@ -13,7 +13,7 @@ _MAX_COUNT: Final = (1 << 63) - 1
 _Ranges = dict[str, tuple[int, int]]
 _LOSSES: Final = ("lost_transport", "lost_recorder", "lost_batches")
 _RANGES: Final[dict[str, _Ranges]] = {
-    "hilrig.session": {"part": (0, 1_000_000), "start_wall_ns": (0, _MAX_COUNT)},
+    "hilrig.session": {"part": (0, 1_000_000), "last_part": (0, 1_000_000), "start_wall_ns": (0, _MAX_COUNT)},
     "hilrig.config": {"step_ns": (1, MAX_STEP_NS), "incarnation": (0, _MAX_NUMBER)},
     "hilrig.summary": dict.fromkeys(
         (*_LOSSES, "overruns", "missed_steps", "clock_steps", "messages", "end_wall_ns"), (0, _MAX_COUNT)

@@ -43,24 +43,25 @@ def latency(
     from hilrig_replay.analysis.intervals import aggregate
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.isolation import isolated
-    from hilrig_replay.io.paths import display_names, find_recordings
+    from hilrig_replay.io.paths import display_names, find_runs
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import HilrigError, InputError
     from hilrig_runtime.escaping import printable
 
-    paths = find_recordings(runs)
+    found = find_runs(runs)
+    paths = [files[0] for files in found]
     if plot is not None:
         from hilrig_replay.plots.latency_plot import save_plot
         from hilrig_replay.plots.output import check_plot_path
 
         if len(paths) > 1:
             raise InputError(f"--plot: expected one recording, got {len(paths)}")
-        check_plot_path(plot, paths)
+        check_plot_path(plot, found[0])
     reports, unreadable = [], []
-    for path in paths:
+    for path, files in zip(paths, found, strict=True):
         try:
             with isolated(path):
-                run = open_run(path)
+                run = open_run(files)
                 report = measure(run, task=_task(run))
         except HilrigError as error:
             # An unreadable recording of several is reported in its own line.

@@ -11,25 +11,33 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 from google.protobuf.message import Message
-from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hilrig_recorder.mcap_format.channels import file_descriptor_set
+from hilrig_recorder.mcap_format.channels import (
+    CHANNEL_OF_TOPIC,
+    CHANNELS,
+    EVENT_CHANNEL,
+    SCHEMAS,
+    file_descriptor_set,
+)
+from hilrig_recorder.mcap_format.new_file import new_file
 from hilrig_recorder.mcap_format.records import Message as RecordedMessage
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
+from hilrig_replay.export.copying import copy_metadata, own_messages
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
 from hilrig_replay.io.columns import Rows, StringTable
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
-from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
+from hilrig_replay.io.run import BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.escaping import csv_text
 from hilrig_schemas import Event
+from hilrig_schemas.topics import STATE
 
 WORLD_FRAME: Final = "world"
 _STATIC_PERIOD_STATES: Final = 500
@@ -45,8 +53,7 @@ TABLES: Final[dict[str, Callable[[Records], Rows]]] = {
 """Tables of a recording by name."""
 _INTERNED_FIELDS: Final = frozenset({"session", "held_part", "controller", "part"})
 """Fields that hold a code of the run's string table."""
-TEMPORARY_SUFFIX: Final = ".exporting"
-"""Suffix of an incomplete export."""
+_STATE_CHANNEL: Final = CHANNEL_OF_TOPIC[STATE.name]
 
 
 # -- tables ---------------------------------------------------------------------------------------------------------
@@ -92,7 +99,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
             for name, rows_of in TABLES.items():
                 schema = table(run, rows_of(empty)).schema
                 writer = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
-                temporary = closing.enter_context(output_file(paths[name], [run.path]))
+                temporary = closing.enter_context(output_file(paths[name], run.file.paths))
                 writers[name] = closing.enter_context(writer(temporary, schema))
             for block in run.blocks():
                 for name, rows_of in TABLES.items():
@@ -120,58 +127,22 @@ def export_foxglove(run: Run, path: Path) -> Path:
     """
     if not run.urdf:
         raise InputError(f"{run.path}: has no URDF attachment, which is needed to draw the arm")
-    if path.exists():
-        raise InputError(f"{path}: already exists; choose another name")
     arm, shapes = parse_arm(run.urdf), visual_shapes(run.urdf)
-    temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
-    try:
-        # Left behind by an export that was killed.
-        temporary.unlink(missing_ok=True)
-        with run.path.open("rb") as stream:
-            reader = SeekingReader(stream)
-            summary = reader.get_summary()
-            if summary is None:
-                raise InputError(f"{run.path}: has no index; create one with `hilrig recover`")
-            writer = RecordingWriter(path, temporary_path=temporary, schemas=(), channels=(), library="hilrig export")
-            try:
-                visualization = _Visualization(
-                    writer, run, arm, shapes, max(summary.schemas, default=0), max(summary.channels)
-                )
-                for schema in summary.schemas.values():
-                    writer.add_schema(schema)
-                for channel in summary.channels.values():
-                    writer.add_channel(channel)
-                visualization.write_channels()
-                for record in reader.iter_metadata():
-                    writer.add_metadata(record.name, record.metadata)
-                for item in reader.iter_attachments():
-                    writer.add_attachment(
-                        item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
-                    )
-                _copy(run, writer, visualization)
-                writer.finish()
-                if writer.dropped_count:
-                    raise OperationError(f"{path}: can't be written: no space left on device")
-                writer.publish()
-            except BaseException:
-                writer.discard()
-                raise
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+    with new_file(path, library="hilrig export") as writer:
+        visualization = _Visualization(writer, run, arm, shapes)
+        visualization.write_channels()
+        copy_metadata(run.file, writer)
+        messages = own_messages(run.file)
+        while block := list(islice(messages, BLOCK_ROWS)):
+            visualization.prepare(message for message in block if message.channel_id == _STATE_CHANNEL)
+            for message in block:
+                writer.add(encode_message(*message))
+                if message.channel_id == _STATE_CHANNEL:
+                    visualization.add_state(message.log_time)
+                elif message.channel_id == EVENT_CHANNEL:
+                    visualization.add_event(message.log_time, Event.FromString(message.data))
+        writer.finish()
     return path
-
-
-def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization") -> None:
-    messages = run.file.messages(ALL_TOPICS)
-    while block := list(islice(messages, BLOCK_ROWS)):
-        visualization.prepare(message for message in block if run.file.topics[message.channel_id] == "state")
-        for message in block:
-            writer.add(encode_message(*message))
-            topic = run.file.topics[message.channel_id]
-            if topic == "state":
-                visualization.add_state(message.log_time)
-            elif topic == "event":
-                visualization.add_event(message.log_time, Event.FromString(message.data))
 
 
 class _Visualization:
@@ -183,8 +154,6 @@ class _Visualization:
         run: Run,
         arm: ArmGeometry,
         shapes: list[VisualShape],
-        last_schema: int,
-        last_channel: int,
     ) -> None:
         self._writer = writer
         self._arm = arm
@@ -195,8 +164,7 @@ class _Visualization:
             "/log": foxglove.Log,
             **{f"/points/{shape.link}": foxglove.PointCloud for shape in shapes},
         }
-        self._last_schema = last_schema
-        self._ids = {topic: last_channel + number for number, topic in enumerate(self._types, start=1)}
+        self._ids = {topic: len(CHANNELS) + number for number, topic in enumerate(self._types, start=1)}
         self._sequences = dict.fromkeys(self._types, 0)
         self._fixed_joints = fixed_joints(run.urdf)
         self._scene = _scene(shapes)
@@ -219,7 +187,7 @@ class _Visualization:
         for topic, message in self._types.items():
             name = message.DESCRIPTOR.full_name
             if name not in schema_ids:
-                schema_ids[name] = self._last_schema + len(schema_ids) + 1
+                schema_ids[name] = len(SCHEMAS) + len(schema_ids) + 1
                 schema = Schema(schema_ids[name], file_descriptor_set(message), "protobuf", name)
                 self._writer.add_schema(schema)
             self._writer.add_channel(

@@ -5,7 +5,7 @@ blocks, so one pass needs the same memory for a minute and for a day; `between` 
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,8 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from hilrig_replay.io.columns import Rows, StringTable
-from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile, open_recording
+from hilrig_replay.io.joined_recording import open_segments
+from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile
 from hilrig_replay.io.records import Decoder, Records, concatenate_records
 from hilrig_replay.io.sequence_order import Repairs, in_sequence
 from hilrig_replay.io.timebase import Timebase
@@ -279,10 +280,10 @@ class Run:
         return self.timebase.time_ns(rows)
 
 
-def open_run(path: Path | str) -> Run:
-    """Open a recording; its arrays are read on first access.
+def open_run(files: Path | str | Sequence[Path]) -> Run:
+    """Open a recording, or the segments of a session as one run; the arrays are read on first access.
 
     Raises:
-        InputError: the file is missing, not a recording, empty, truncated, damaged, or of a newer version.
+        InputError: a file is missing, not a recording, empty, truncated, damaged, or of a newer version.
     """
-    return Run(open_recording(Path(path)))
+    return Run(open_segments([Path(files)] if isinstance(files, Path | str) else files))

@@ -39,10 +39,10 @@ def save_plot(report: LatencyReport, run: Run, path: Path) -> None:
         InputError: the run has no latency samples, or the path is not usable.
         OperationError: the file can't be written.
     """
-    check_plot_path(path, [run.path])
+    check_plot_path(path, run.file.paths)
     if report.loop_ms is None:
         raise InputError(f"{run.path}: no latency samples to plot")
-    save_figure(latency_figure(report, run), path, [run.path])
+    save_figure(latency_figure(report, run), path, run.file.paths)
 
 
 def latency_figure(report: LatencyReport, run: Run) -> Figure:
