@@ -55,6 +55,7 @@ test-long: .venv/dev ## tests that take minutes: 2,000 other forged recordings, 
 	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
 	HILRIG_BUS_FUZZ_MESSAGES=100000 $(BIN)/pytest tests/rig/test_bus_fuzz.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_doctor.py tests/rig/test_console.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py
 
 check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff format --check .

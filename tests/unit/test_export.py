@@ -16,9 +16,10 @@ from hilrig_recorder.mcap_format.file_names import recovering_path
 from hilrig_recorder.mcap_format.records import COPY_SUFFIX
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.export.export import TABLES, export_foxglove, export_tables, table
+from hilrig_replay.export.export import export_foxglove, export_tables
 from hilrig_replay.geometry.quaternion import rotate
 from hilrig_replay.geometry.urdf_geometry import VisualShape, visual_shapes
+from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_sim.arm.kinematics import forward

@@ -81,7 +81,7 @@ class Health(_message.Message):
     def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., cpu_ns: _Optional[int] = ..., resident_bytes: _Optional[int] = ..., rigs: _Optional[int] = ..., ticks: _Optional[int] = ..., overruns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., lateness_p50_ns: _Optional[int] = ..., lateness_p99_ns: _Optional[int] = ..., lateness_max_ns: _Optional[int] = ..., received_hz: _Optional[float] = ..., published_hz: _Optional[float] = ..., lost_transport: _Optional[int] = ..., lost_recorder: _Optional[int] = ..., queue_depth: _Optional[int] = ..., queue_capacity: _Optional[int] = ..., connections: _Optional[int] = ..., requests: _Optional[int] = ..., malformed: _Optional[int] = ..., refused: _Optional[int] = ..., recordings: _Optional[int] = ..., bytes_written: _Optional[int] = ..., alert: _Optional[str] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., clock_offset_ns: _Optional[int] = ..., clock_uncertainty_ns: _Optional[int] = ..., clock_peer: _Optional[str] = ..., rig_reports: _Optional[_Iterable[_Union[RigReport, _Mapping]]] = ..., realtime_priority: _Optional[int] = ..., inaccurate_steps: _Optional[int] = ...) -> None: ...
 
 class RigReport(_message.Message):
-    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us")
+    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us", "exceptions", "alert")
     RIG_FIELD_NUMBER: _ClassVar[int]
     LOOP_US_FIELD_NUMBER: _ClassVar[int]
     SAFE_FIELD_NUMBER: _ClassVar[int]
@@ -91,6 +91,8 @@ class RigReport(_message.Message):
     CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FIELD_NUMBER: _ClassVar[int]
     AGE_US_FIELD_NUMBER: _ClassVar[int]
+    EXCEPTIONS_FIELD_NUMBER: _ClassVar[int]
+    ALERT_FIELD_NUMBER: _ClassVar[int]
     rig: str
     loop_us: _containers.RepeatedScalarFieldContainer[int]
     safe: bool
@@ -100,4 +102,18 @@ class RigReport(_message.Message):
     connections: int
     recording: bool
     age_us: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ...) -> None: ...
+    exceptions: _containers.RepeatedCompositeFieldContainer[ExceptionCount]
+    alert: str
+    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ..., exceptions: _Optional[_Iterable[_Union[ExceptionCount, _Mapping]]] = ..., alert: _Optional[str] = ...) -> None: ...
+
+class ExceptionCount(_message.Message):
+    __slots__ = ("host", "function", "code", "count")
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    FUNCTION_FIELD_NUMBER: _ClassVar[int]
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    host: str
+    function: int
+    code: int
+    count: int
+    def __init__(self, host: _Optional[str] = ..., function: _Optional[int] = ..., code: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...

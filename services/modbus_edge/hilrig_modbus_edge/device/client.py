@@ -23,11 +23,6 @@ class PollTimes(NamedTuple):
     """Whether the basis is only the newest state that the torques can answer."""
 
 
-def address_of(host: str, port: int) -> str:
-    """Return "host:port"; an IPv6 host is put in brackets."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
 @dataclass(slots=True, eq=False)
 class ConnectedController:
     """A controller with all its connections: one connection may read and another write."""

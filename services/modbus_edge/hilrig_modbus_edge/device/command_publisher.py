@@ -44,6 +44,8 @@ class CommandPublisher:
         """The four torque registers, big-endian; published by `publish_write` or `publish_internal`."""
         self.echo = 0
         """Value of the echo register, 16 bit; the next published write carries it."""
+        self.is_reset_requested = False
+        """Whether the reset register is not 0: the next reset by it needs a 0 in between."""
         self.delayed: DelayedCommands | None = None
         """The impaired command link; None: commands are sent at once."""
         self._clock = clock

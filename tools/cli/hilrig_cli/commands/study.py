@@ -117,7 +117,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
             plot_paths += save_plots(figure, out / f"plane-{number + 1}")
         save_study_rrd(chosen, swept, simulated_traces, out / "study.rrd")
         extra = {"pictures": [str(path) for path in plot_paths], "live": measured}
-        return save_results(chosen, swept, out, extra)
+        return save_results(chosen, swept, out, extra, file.parent)
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:

@@ -37,6 +37,7 @@ RIG_COLUMNS: Final = {
     "p99 ms": 0,
     "age p99": 1,
     "samples": 4,
+    "refused": 3,
     "recorded": 3,
     "state": 0,
 }
@@ -125,6 +126,7 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
             "p99 ms": _or_dash(rig.loop_ms(0.99)),
             "age p99": _or_dash(rig.age_ms(0.99)),
             "samples": str(len(rig.loops_us)),
+            "refused": str(sum(rig.exceptions.values()) or ""),
             "recorded": "yes" if rig.recording else "",
             "state": rig.state,
         }

@@ -121,6 +121,22 @@ class LatencyReport:
         """Reasons why the recording is not valid, as one text; empty: it is valid."""
         return "; ".join(reason.text for reason in self.reasons)
 
+    def frame(self, library: str = "pandas") -> Any:
+        """The samples as a data frame, one row per new command that took effect; times in ns as in `SAMPLE_DTYPE`.
+
+        Args:
+            library: `pandas` or `polars`.
+
+        Raises:
+            InputError: unknown library.
+            OperationError: the library is not installed.
+        """
+        import pyarrow as pa
+
+        from hilrig_replay.io.frames.tables import frame
+
+        return frame(pa.table({name: self.table[name] for name in self.table.dtype.names or ()}), library)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples; None for an infinite bound."""
         plain = asdict(self.without_table())

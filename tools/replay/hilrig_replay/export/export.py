@@ -1,13 +1,12 @@
 """Exports recordings: MCAP with visualization messages for Foxglove and rerun, tables for pandas and MATLAB."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 from google.protobuf.message import Message
@@ -29,9 +28,10 @@ from hilrig_replay.export import foxglove_messages as foxglove
 from hilrig_replay.export.copying import copy_metadata, own_messages
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
-from hilrig_replay.io.columns import Rows, StringTable
+from hilrig_replay.io.columns import StringTable
+from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.output_file import output_file
-from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
+from hilrig_replay.io.records import Decoder, concatenate_records, enum_name
 from hilrig_replay.io.run import BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
@@ -42,44 +42,8 @@ from hilrig_schemas.topics import STATE
 WORLD_FRAME: Final = "world"
 _STATIC_PERIOD_STATES: Final = 500
 """Static frames and shapes are repeated after this many states, for players that start in the middle of the file."""
-_VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
 
-TABLES: Final[dict[str, Callable[[Records], Rows]]] = {
-    "state": lambda records: records.states,
-    "command": lambda records: records.commands,
-    "event": lambda records: records.events,
-    "traffic": lambda records: records.traffic,
-}
-"""Tables of a recording by name."""
-_INTERNED_FIELDS: Final = frozenset({"session", "held_part", "controller", "part"})
-"""Fields that hold a code of the run's string table."""
 _STATE_CHANNEL: Final = CHANNEL_OF_TOPIC[STATE.name]
-
-
-# -- tables ---------------------------------------------------------------------------------------------------------
-
-
-def table(run: Run, rows: Rows, escape: Callable[[str], str] = str) -> pa.Table:
-    """Convert rows of one of `TABLES` to an Arrow table.
-
-    Units are SI as in the schemas, and `time_s` is the time since the run's first state. A joint vector becomes four
-    columns, one per joint. `escape` converts each text.
-    """
-    columns: dict[str, Any] = {"time_s": run.time_s(rows)}
-    for field in rows.dtype.names or ():
-        values = rows[field]
-        if field == "message":
-            continue
-        if field in _INTERNED_FIELDS:
-            columns[field] = pa.array(map(escape, run.names.texts(values).tolist()), pa.string())
-        elif values.ndim == 2:
-            for number, joint in enumerate(_VECTOR_NAMES):
-                columns[f"{field}_{joint}"] = np.ascontiguousarray(values[:, number])
-        elif values.dtype == object:
-            columns[field] = pa.array(map(escape, values.tolist()), pa.string())
-        else:
-            columns[field] = np.ascontiguousarray(values)
-    return pa.table(columns)
 
 
 def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -201,6 +201,26 @@ class Run:
     def traffic(self) -> Rows:
         """All Modbus requests, shape (n,), fields as `columns.TRAFFIC_DTYPE`."""
         return self._read_all("traffic").traffic
+
+    def frame(self, table: str, library: str = "pandas") -> Any:
+        """One table of the run as a data frame: `state`, `command`, `event` or `traffic`, SI units as in the schemas.
+
+        A joint vector becomes four columns, a code its text, and `time_s` is the time from the first state.
+
+        Args:
+            table: name of the table.
+            library: `pandas` or `polars`.
+
+        Raises:
+            InputError: unknown name.
+            OperationError: the library is not installed.
+        """
+        from hilrig_replay.io.frames import tables
+
+        if table not in tables.TABLES:
+            raise InputError(f"table: expected one of {', '.join(tables.TABLES)}, got {table!r}")
+        rows = tables.TABLES[table](self._read_all(table))
+        return tables.frame(tables.table(self, rows), library)
 
     def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL_TOPICS) -> Records:
         """Messages that were sent in a time range, `until_s` excluded; only that part of the file is read."""
