@@ -6,6 +6,7 @@ import struct
 import sys
 import threading
 import time
+from contextlib import ExitStack
 
 import pytest
 
