@@ -58,7 +58,7 @@ def main() -> None:
                     pass
             sent, old = (old, words) if mistake == "previous poll" else (words, words)
             answer = ask(struct.pack(">HHHBBHHB4h", 2, 0, 15, 1, 16, 0, 4, 8, *sent))
-            if mistake != "refused":
+            if mistake != "competitor":
                 assert not answer[7] & 0x80, answer.hex()
             if mistake in ("wait before write", "computing"):
                 continue

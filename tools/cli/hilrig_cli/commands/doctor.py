@@ -49,15 +49,16 @@ def doctor(
 def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     from importlib.metadata import version
 
-    from hilrig_cli.doctor import CheckResult, host, services
+    from hilrig_cli.doctor import CheckResult, host, processes, services
 
     text = f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms"
     results = [CheckResult.ok("lab", text)]
     results += host.check_software()
-    bus_results, joined = services.check_bus(lab)
+    local = processes.local_processes(lab)
+    bus_results, joined = services.check_bus(lab, local)
     results += bus_results
     if joined is not None:
-        results += services.check_services(lab, joined)
+        results += services.check_services(lab, joined, local)
     # Without the bus the services are unknown; the checks of this host still run.
     snapshot = joined or services.BusSnapshot()
     results += services.check_realtime(lab, snapshot)

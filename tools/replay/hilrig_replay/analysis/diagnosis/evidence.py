@@ -79,8 +79,6 @@ class Evidence:
     """Ticks that were late by more than one step."""
     edge_stalls: Stalls = NO_STALLS
     """Stalls of the edge, reported by it or found in the request log."""
-    stolen_ns: int = 0
-    """CPU steal time during the stalls."""
     watchdog_gaps: int = 0
     """Trips of the watchdog after which the controller wrote again."""
     gains: RoundingGains = NO_GAINS
