@@ -317,26 +317,6 @@ def test_connections_of_one_host_are_limited() -> None:
         assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
 
 
-def test_silent_connections_of_many_hosts_take_no_place() -> None:
-    """300 hosts connect and send nothing, or reset their connection: neither a new nor a connected client notices."""
-    with running_edge(max_connections=8) as rig, rig.client() as owner, ExitStack() as closing:
-        owner.write(0, 100)
-        for number in range(300):
-            address = ("127.0.0.1", rig.port)
-            source = (f"127.0.{10 + number // 250}.{number % 250 + 1}", 0)
-            silent = closing.enter_context(socket.create_connection(address, timeout=5, source_address=source))
-            if number % 3 == 0:
-                silent.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                silent.close()
-        for _ in range(3):
-            with rig.client() as new:
-                assert new.read(0, 1) == [100]
-        owner.write(0, 200)
-        eventually(lambda: rig.service.counters.connections <= 8)
-        assert not [event for event in rig.events if event.kind == Event.LEASE_LOST]
-        assert len([event for event in rig.events if event.kind == Event.CONNECTION_REFUSED]) <= 40
-
-
 def test_only_allowed_networks_may_connect() -> None:
     with running_edge(allow=["10.0.0.0/8"]) as rig:
         with rig.client() as client:

@@ -141,10 +141,7 @@ class RigServer:
         return idle_ns if idle_ns >= self._idle_ns else 0
 
     def _make_room(self, host: str, close_now: bool) -> bool:
-        """Return whether a connection gives way to a new one, and close it.
-
-        It is the oldest one that has sent no valid request, because anybody can open such a connection; without one,
-        that which was idle for the longest time, if that is the idle timeout.
+        """Return whether a connection was idle for the idle timeout, and close the one that was for the longest time.
 
         Args:
             host: only connections of this host; empty: of all hosts.
@@ -152,13 +149,12 @@ class RigServer:
         """
         now_ns = self.monotonic_ns()
         candidates = [connection for connection in self.connections if host in ("", connection.client.host)]
-        candidates = [connection for connection in candidates if connection.is_silent] or candidates
         longest = min(candidates, key=lambda connection: connection.client.last_request_ns, default=None)
-        if longest is None or not (longest.is_silent or (self._idle_ns and self._idle_since(longest, now_ns))):
+        if not self._idle_ns or longest is None or not self._idle_since(longest, now_ns):
             return False
         if close_now:
-            idle_s = (now_ns - longest.client.last_request_ns) / 1e9
-            longest.make_room(f"no valid request for {idle_s:.1f} s, and its place is needed")
+            idle_s = self._idle_since(longest, now_ns) / 1e9
+            longest.make_room(f"no request for {idle_s:.0f} s, and its place is needed")
         return True
 
     def close_certificate(self, name: str, reason: str) -> int:
