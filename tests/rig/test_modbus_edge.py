@@ -6,7 +6,6 @@ import struct
 import sys
 import threading
 import time
-from contextlib import ExitStack
 
 import pytest
 
