@@ -31,8 +31,6 @@ LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 4.0 if LONG else 1.5
 LIVE_RUNS = 25
 """Runs of each cause in the long test."""
-
-
 RIGS = 5
 MISTAKES: dict[str, tuple[str, tuple[float, float]]] = {
     "previous_poll": ("previous poll", (0, 0)),
@@ -108,7 +106,7 @@ def test_example_that_writes_the_old_torques_is_found(lab: RunningLab, tmp_path:
     assert "old = [0, 0, 0, 0]" in late
     path = tmp_path / "hold_previous.py"
     path.write_text(late, encoding="utf-8")
-    arguments = ["--port", str(lab.port), "--duration", str(2 * SECONDS)]
+    arguments = ["--port", str(lab.port), "--duration", str(3 * SECONDS)]
     first, *_ = causes_of(lab, [sys.executable, str(path), *arguments])
     assert first.code == "previous_poll", first
     assert "add one period of 20 ms" in first.text
