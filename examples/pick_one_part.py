@@ -3,8 +3,7 @@
     pip install "pymodbus>=3.16"
     python pick_one_part.py --host 127.0.0.1 --port 5020
 
-Change it to pick another part: its position is in PART. Coil 101 (`client.write_coil(100, True)`) moves arm and parts
-back to their start. The exit code is 0 if the part was put down.
+PART is the position of the part. Coil 101 (`client.write_coil(100, True)`) moves arm and parts back to their start.
 """
 
 import argparse
@@ -94,7 +93,7 @@ def checked(answer):
     return answer
 
 
-def main() -> int:
+def main() -> None:
     """Pick the part and put it down."""
     parser = argparse.ArgumentParser(description="Pick the red part and put it down in the tray.")
     parser.add_argument("--host", default="127.0.0.1")
@@ -102,8 +101,7 @@ def main() -> int:
     options = parser.parse_args()
     client = ModbusTcpClient(options.host, port=options.port)
     if not client.connect():
-        print(f"can't connect to a rig at {options.host}:{options.port}: is hilrig up running?", file=sys.stderr)
-        return 3
+        raise RuntimeError(f"can't connect to a rig at {options.host}:{options.port}: is hilrig up running?")
     arm = Arm(client)
     for what, point, on in (("the part", PART, True), ("the tray", PLACE, False)):
         arm.move_to(f"over {what}", *point[:2], SAFE_Z)
@@ -112,8 +110,10 @@ def main() -> int:
         arm.move_to("up", *point[:2], SAFE_Z)
     client.write_registers(0, [0, 0, 0, 0])
     print("done")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        main()
+    except RuntimeError as error:
+        sys.exit(f"pick_one_part: {error}")

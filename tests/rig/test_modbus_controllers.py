@@ -18,6 +18,7 @@ import pytest
 
 from support.clients import compile_with_libmodbus, mbpoll_read, mbpoll_write, require_mbpoll
 from support.edge_rig import EdgeRig, RawClient, running_edge
+from support.guides import commands as commands_of
 from support.guides import write_programs
 from support.labs import RunningLab, hilrig, write_lab
 from support.waiting import eventually
@@ -187,6 +188,18 @@ def test_libmodbus_holds_the_lease_and_mbpoll_is_denied(in_c: Path) -> None:
         mbpoll_write(rig.port, 1, 1000)
         assert rig.commands[-1].effort[0] == 1.0
         mbpoll_write(rig.port, 1, 1, kind="coil")
+        assert rig.commands[-1].magnet
+
+
+def test_documented_mbpoll_commands_reach_the_rig() -> None:
+    require_mbpoll()
+    with running_edge() as rig:
+        read, torques, magnet = (line.split() for line in commands_of("other-devices", rig.port))
+        done = subprocess.run(read, check=True, capture_output=True, text=True, timeout=10)
+        assert "[5]:" in done.stdout
+        subprocess.run(torques, check=True, capture_output=True, timeout=10)
+        assert list(rig.commands[-1].effort) == [-0.5, 0.0, 0.0, 0.0]
+        subprocess.run(magnet, check=True, capture_output=True, timeout=10)
         assert rig.commands[-1].magnet
 
 

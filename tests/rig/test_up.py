@@ -91,6 +91,7 @@ def test_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
     assert '"samples"' in report.stdout
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_stops_the_lab_within_three_seconds(lab: RunningLab, number: signal.Signals) -> None:
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:

@@ -401,6 +401,7 @@ def test_stream_that_stops_and_returns_is_reported() -> None:
     assert bench.store.outages == [], "no recording is concerned"
     bench.states(100)
     bench.start()
+    bench.accept(FakeSource("recorder/1").batch([]))
     for _ in range(20):
         bench.wait(500 * MS)
         bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))

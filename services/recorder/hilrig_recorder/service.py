@@ -130,6 +130,7 @@ class Recorder:
             partial(handle_control_request, handlers),
         )
         service.health.rig_reports = self._rig_reports
+        service.last_received = self._sessions.last_received
         self._maintenance = MaintenanceWorker(
             self._store.folder,
             unfinished,

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import decode_message_head
 
 SECOND_NS: Final = 1_000_000_000
@@ -117,8 +118,8 @@ class RecordingStore(Protocol):
         It may set `recording.seen`, `recording.last` and `recording.horizon_ns`.
         """
 
-    def close(self, recording: Recording, end: str, reason: str) -> None:
-        """Finish the file of a recording; `end` is a machine-readable cause, `reason` a sentence."""
+    def close(self, recording: Recording, end: Ending, reason: str) -> None:
+        """Finish the file of a recording; `reason` is a sentence."""
 
     def record_loss(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
         """Record a loss in the file: number of messages lost in transport and in the recorder."""

@@ -15,6 +15,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
 
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.fsutil import lock_file, map_file, open_file
 from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.new_file import new_file
@@ -363,7 +364,7 @@ class _Copier:
         }
         if is_hilrig and "hilrig.summary" not in self._metadata:
             records["hilrig.summary"] = {
-                "ended": "recovered",
+                "ended": Ending.RECOVERED,
                 "reason": _REASON_DAMAGED if self._finished else _REASON_UNFINISHED,
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),

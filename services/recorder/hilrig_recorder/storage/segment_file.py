@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Final
 
 from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigConfig
@@ -110,13 +111,13 @@ class SegmentFile:
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
 
-    def finisher(self, end: str, reason: str) -> Callable[[], None]:
+    def finisher(self, end: Ending, reason: str) -> Callable[[], None]:
         """A function that writes the final metadata and the index; any thread may call it.
 
         Nothing else may be written to this file any more. The function raises the errors of `RecordingWriter.finish`.
 
         Args:
-            end: machine-readable cause of the end.
+            end: cause of the end.
             reason: a sentence that explains the end.
         """
         writer, recording = self.writer, self.recording

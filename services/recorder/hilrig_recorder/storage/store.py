@@ -12,6 +12,7 @@ from mcap.records import Metadata
 from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording
 from hilrig_recorder.mcap_format.channels import SCHEMA_VERSION
 from hilrig_recorder.mcap_format.chunk import compressor
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
 from hilrig_recorder.storage.disk_reserve import MIB, DiskReserve
 from hilrig_recorder.storage.segment_file import SegmentFile
@@ -108,13 +109,13 @@ class FileStore:
             return False
         if segment.previous is not None:
             tail = read_session_tail(folder, recording.session, segment.number - 1, self._repeated_ns)
-            if tail.end == "ended":
+            if tail.end == Ending.ENDED:
                 return False
             recording.seen, recording.last = tail.keys, tail.last
             recording.horizon_ns = horizon_by_channel(tail)
         return not self._reserve.is_exhausted and self._open(recording, segment) is not None
 
-    def close(self, recording: Recording, end: str, reason: str) -> None:
+    def close(self, recording: Recording, end: Ending, reason: str) -> None:
         """Finish the file of a recording in the background."""
         recording.file = None
         file = self._files.pop(recording, None)
@@ -259,12 +260,12 @@ class FileStore:
             file.opened_ns = self._clock.monotonic_ns()
             file.is_replaced = False
             return
-        self._finish(file, "continued", f"the session continues in {following.writer.path.name}")
+        self._finish(file, Ending.CONTINUED, f"the session continues in {following.writer.path.name}")
         recording.counters = LossCounters()
         for source, incarnation in file.sources:
             following.record_source(source, incarnation)
 
-    def _finish(self, file: SegmentFile, end: str, reason: str) -> None:
+    def _finish(self, file: SegmentFile, end: Ending, reason: str) -> None:
         self._finishing[file.writer] = file.recording
         self._sync_worker.finish(file.writer, file.finisher(end, reason))
 
@@ -279,7 +280,7 @@ class FileStore:
         recording = file.recording
         recording.file = None
         del self._files[recording]
-        end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
+        end = Ending.DISK_FULL if error.errno in _NO_SPACE_ERRORS else Ending.WRITE_FAILED
         reason = f"{error.strerror}; the recording ends here"
         # The file contains its name only: the path could reveal the name of a user.
         self._finish(file, end, f"{file.writer.path.name}: {reason}")
