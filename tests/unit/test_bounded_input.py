@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from hilrig_recorder.mcap_format.recover import recover
 from hilrig_recorder.mcap_format.scan import scan
 from hilrig_replay.analysis.index import INDEX_NAME, RunIndex
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.export.export import export_foxglove, export_tables
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
 from hilrig_replay.io.timebase import Timebase
+from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
 from hilrig_runtime.config.validation import MAX_TEXT_BYTES, read_text
@@ -167,6 +170,35 @@ def test_steps_and_restarts_at_each_state_take_little_time() -> None:
     timebase = Timebase()
     timebase.update(states)
     assert (len(timebase.time_ns(states)), len(timebase.time_ns(commands))) == (10_000, 10_000)
+
+
+@pytest.mark.parametrize(("topic", "field"), [("state", "position"), ("command", "effort"), ("part", "x")])
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_infinite_number_is_refused_with_its_name(tmp_path: Path, topic: str, field: str, number: float) -> None:
+    made = recordings.make(SCRIPT)
+    message: Any = next(one.message for one in made if one.topic == topic.replace("part", "state"))
+    if topic == "part":
+        message.parts[0].x = number
+    else:
+        getattr(message, field)[2] = number
+    path = recordings.write(tmp_path / "run.mcap", made, script=SCRIPT)
+    with pytest.raises(InputError, match=rf"run\.mcap: unusable content: {field} is {number}; expected finite"):
+        measure(open_run(path))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_differences_of_impossible_times_are_bounded(tmp_path: Path, sign: int) -> None:
+    made = recordings.make(SCRIPT)
+    for number, one in enumerate(one for one in made if one.topic == "state"):
+        state: Any = one.message
+        state.sampled_ns = (-sign if number % 2 else sign) * ((1 << 63) - 1)
+        state.wall_ns = -(1 << 63)
+        state.step = (1 << 64) - 1 - number
+    run = open_run(recordings.write(tmp_path / "run.mcap", made, script=SCRIPT))
+    measure(run)
+    export_tables(run, tmp_path / "tables", "csv")
+    export_foxglove(run, tmp_path / "drawn.mcap")
+    save_rrd(run, tmp_path / "run.rrd")
 
 
 def test_number_too_large_for_its_column_is_damage(tmp_path: Path) -> None:

@@ -194,6 +194,7 @@ def test_truncation_by_another_process_is_noticed(tmp_path: Path) -> None:
     fill(writer, 2_000)
     writer.sync()
     os.truncate(writer.temporary_path, 20_000)
+    fill(writer, 2_000)
     for method in (writer.sync, writer.finish):
         with pytest.raises(FileReplacedError, match="truncated while it was being written"):
             method()

@@ -404,7 +404,7 @@ class WriteAccess:
         missing, rearming = "write", "write"
         if self._reserved_for is not None:
             missing, rearming = "torque of its program", "one"
-            cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
+            cause = self._reserved_for.fault or f"no new state was written to {self._reserved_for.address}"
         elif holder is None:
             cause = f"{writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:

@@ -64,6 +64,7 @@ class RecordingWriter:
         self.temporary_path = part_path(path) if temporary_path is None else temporary_path
         self._file = FileIO(self.temporary_path, "x+")
         self._folder_synced = False
+        self._is_truncated = False
         lock_file(self._file.fileno())
         self.size = 0
         """Bytes in the file, all of complete records."""
@@ -235,8 +236,12 @@ class RecordingWriter:
             raise FileReplacedError(self.temporary_path)
 
     def _check_size(self) -> None:
-        if os.fstat(self._file.fileno()).st_size < self.size:
+        self._note_truncation()
+        if self._is_truncated:
             raise FileReplacedError(self.temporary_path, "truncated")
+
+    def _note_truncation(self) -> None:
+        self._is_truncated |= os.fstat(self._file.fileno()).st_size < self.size
 
     def _is_at(self, path: Path) -> bool:
         try:
@@ -292,6 +297,8 @@ class RecordingWriter:
         return self._file.read(size)
 
     def _append(self, data: bytes) -> None:
+        # The next write would extend a truncated file to its old size, with zeros between.
+        self._note_truncation()
         rest = memoryview(data)
         try:
             while rest:

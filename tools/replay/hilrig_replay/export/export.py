@@ -196,7 +196,8 @@ class _Visualization:
         self._sequences[topic] += 1
         channel_id = self._ids[topic]
         payload = message.SerializeToString()
-        self._writer.add(encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
+        # The time of a sender whose clock is before 1970 is negative; MCAP has no negative times.
+        self._writer.add(encode_message(channel_id, self._sequences[topic], log_ns, max(stamp, 0), payload))
 
 
 def _scene(shapes: list[VisualShape]) -> Any:

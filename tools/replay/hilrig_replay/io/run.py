@@ -280,11 +280,25 @@ class Run:
                 count += 1
                 if count >= rows:
                     count = 0
-                    yield decoder.drain()
+                    yield self._checked(decoder.drain())
         except (DecodeError, struct.error, OverflowError) as error:
             raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
-            yield decoder.drain()
+            yield self._checked(decoder.drain())
+
+    def _checked(self, records: Records) -> Records:
+        """Refuse numbers that no simulation sends, before anything is computed from them."""
+        for rows, names in (
+            (records.states, ("position", "velocity", "effort")),
+            (records.commands, ("effort",)),
+            (records.parts, ("x", "y", "z", "yaw")),
+        ):
+            for name in names:
+                finite = np.isfinite(rows[name])
+                if not finite.all():
+                    wrong = rows[name][~finite][0]
+                    raise InputError(f"{self.path}: unusable content: {name} is {wrong}; expected finite numbers")
+        return records
 
     def _read_all(self, topic: str) -> Records:
         return concatenate_records(list(self.blocks(frozenset({topic}))))
