@@ -34,16 +34,16 @@ def check_numbers(record: Metadata, offset: int) -> None:
         DamagedError: a value is not a decimal number, or out of its range, or a text of the session is too long;
             `offset` is the place of the record.
     """
-    if record.name.removesuffix(COPY_SUFFIX) == "hilrig.session":
-        for key, text in record.metadata.items():
-            if len(text) > MAX_TEXT:
-                found = f"{key} has {len(text)} characters, expected at most {MAX_TEXT}"
-                raise DamagedError(f"metadata {record.name}: {found}", offset)
     for key, (low, high) in _RANGES.get(record.name.removesuffix(COPY_SUFFIX), {}).items():
         text = record.metadata.get(key, "0" if low == 0 else str(low))
         # The length is checked first, because the conversion of a long text takes long.
         if not (text.isascii() and text.isdecimal() and len(text) <= len(str(high)) and low <= int(text) <= high):
             raise DamagedError(f"metadata {record.name}: {key} is {text[:40]!r}, expected {low} to {high}", offset)
+    if record.name.removesuffix(COPY_SUFFIX) == "hilrig.session":
+        for key, text in record.metadata.items():
+            if len(text) > MAX_TEXT:
+                found = f"{key} has {len(text)} characters, expected at most {MAX_TEXT}"
+                raise DamagedError(f"metadata {record.name}: {found}", offset)
 
 
 def add_metadata(known: dict[str, dict[str, str]], record: Metadata, offset: int) -> bool:

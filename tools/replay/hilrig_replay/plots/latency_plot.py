@@ -94,7 +94,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
         near_right = value > 0.75 * limit
         axes.annotate(
             f"{name} {value:.2f} ms",
-            (value, 0.97 - 0.07 * row),
+            (min(value, limit), 0.97 - 0.07 * row),
             xycoords=("data", "axes fraction"),
             xytext=(-4 if near_right else 4, 0),
             textcoords="offset points",
