@@ -139,11 +139,8 @@ class WriteAccess:
     def permit(self, names: AbstractSet[str] | None) -> None:
         """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
         self._permitted = names
-        for client in self._clients:
-            if not self.may_write(client):
-                self._writers.remove(client)
         holder = self.lease.holder
-        if holder is not None and not any(client.writes and self.may_write(client) for client in holder.clients):
+        if holder is not None and not any(self.may_write(client) for client in holder.clients):
             self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
 
     def may_write(self, client: Client) -> bool:
@@ -407,7 +404,7 @@ class WriteAccess:
         missing, rearming = "write", "write"
         if self._reserved_for is not None:
             missing, rearming = "torque of its program", "one"
-            cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
+            cause = self._reserved_for.fault or f"no new state was written to {self._reserved_for.address}"
         elif holder is None:
             cause = f"{writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:

@@ -108,7 +108,6 @@ def print_report(report: "LatencyReport") -> None:
     from hilrig_replay.analysis.diagnosis.evidence import sections
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.intervals import cells
-    from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
@@ -119,7 +118,7 @@ def print_report(report: "LatencyReport") -> None:
         table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
         table.add_row("loop", *cells(report.loop_ms, report.intervals_ms["loop"]), style="bold", end_section=True)
-        for stage in LOOP_STAGES:
+        for stage in report.stages:
             table.add_row(f"  {stage.title}", *cells(report.stages_ms[stage.key], report.intervals_ms[stage.key]))
         table.add_section()
     if report.age_ms is not None:

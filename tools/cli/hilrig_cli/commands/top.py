@@ -132,7 +132,9 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
         }
         for rig in rig_views[:max_rigs]
     ]
-    return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, RIG_COLUMNS, width), *alerts)
+    has_refused = any(rig["refused"] for rig in rigs)
+    rig_columns = {name: rank for name, rank in RIG_COLUMNS.items() if name != "refused" or has_refused}
+    return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, rig_columns, width), *alerts)
 
 
 def _table(

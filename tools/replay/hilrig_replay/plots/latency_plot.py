@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.latency import LatencyReport
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
@@ -111,7 +110,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
 
 
 def _stages(axes: Axes, report: LatencyReport) -> None:
-    for row, stage in enumerate(LOOP_STAGES):
+    for row, stage in enumerate(report.stages):
         statistics = report.stages_ms[stage.key]
         axes.barh(row, statistics.p50, color=stage.color, height=0.6)
         axes.plot([statistics.p50, statistics.p99], [row, row], color=TEXT_COLOR, linewidth=1.2)
@@ -125,7 +124,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
             fontsize=8,
             color=TEXT_COLOR,
         )
-    axes.set_yticks(range(len(LOOP_STAGES)), [stage.title for stage in LOOP_STAGES])
+    axes.set_yticks(range(len(report.stages)), [stage.title for stage in report.stages])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max(1e-3, *(statistics.p99 for statistics in report.stages_ms.values())))
     label_axes(axes, "Stage latencies (bar and number: p50, line: p99)", "latency, ms", "")

@@ -11,7 +11,6 @@ from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.intervals import cells
 from hilrig_replay.analysis.similarity import find_similar
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
@@ -315,7 +314,7 @@ def _latency(summary: RunSummary) -> str:
     if latency.loop_ms is not None:
         known = latency.intervals_ms
         rows.append(["loop", *cells(latency.loop_ms, known["loop"])])
-        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in LOOP_STAGES]
+        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in latency.stages]
     if latency.age_ms is not None:
         rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
     rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])

@@ -73,6 +73,8 @@ class Evidence:
     windows: Sequence[Records]
     """Messages of windows that are evenly spread over the run."""
     duration_s: float
+    client_role: bool = False
+    """Whether the edge was the client of the controller."""
     age: LoopAge | None = None
     """None: no command that is based on a state took effect."""
     stalls: Stalls = NO_STALLS

@@ -417,6 +417,10 @@ RULES: Final[tuple[Rule, ...]] = (
     watchdog_gaps,
     competing_clients,
 )
+OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
+    {previous_poll, delayed_acknowledgement, wait_before_write, slow_polling, computing_time, beating}
+)
+"""Rules about a program that polls the rig; in the client role the edge itself polls."""
 RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "watchdog_gaps"})
 SUPPRESSED: Final = {
     "open_loop": frozenset(rule.__name__ for rule in RULES[1:]),
