@@ -35,6 +35,7 @@ def client_of(
 ) -> Iterator[EdgeRig]:
     """Run an edge that is the client of `plc`, with a state every 20 ms."""
     settings = {"controller": edge.pop("controller", plc.address), "registers": registers, "client": client}
+    settings |= {key: edge.pop(key) for key in ("impairment",) if key in edge}
     edge = {"watchdog_ms": 300.0, "session_grace_ms": 600.0} | edge
     with running_edge(first_rig=settings, **edge) as rig:
         ended = threading.Event()
@@ -207,6 +208,20 @@ def test_no_other_connection_may_write() -> None:
         assert f"the edge is a client of {plc.address}, which alone commands rig1" in event.text
         status = lease(rig)
         assert (status.client_of, status.holder, status.controller_fault) == (plc.address, plc.address, "")
+
+
+def test_emulated_network_delays_states_and_torques() -> None:
+    impairment = {"state": {"delay": "constant:30"}, "command": {"delay": "constant:7"}}
+    with Plc() as plc, client_of(plc, impairment=impairment) as rig:
+        # The first ones are later, because the connection was established meanwhile.
+        eventually(lambda: len(torques(rig)) > 8)
+        commands = torques(rig)[-3:]
+    for command in commands:
+        assert (command.state_injected_ns, command.command_injected_ns) == (30_000_000, 7_000_000)
+        assert command.state_served_ns - command.state_arrived_ns >= 30_000_000
+        # The state is written as soon as its delay has passed, not with the next one.
+        assert command.state_served_ns - command.state_arrived_ns < 45_000_000
+        assert command.sent_ns - command.write_arrived_ns >= 7_000_000
 
 
 def test_operator_can_revoke_the_lease() -> None:
