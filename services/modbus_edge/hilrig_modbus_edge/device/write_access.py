@@ -139,11 +139,8 @@ class WriteAccess:
     def permit(self, names: AbstractSet[str] | None) -> None:
         """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
         self._permitted = names
-        for client in self._clients:
-            if not self.may_write(client):
-                self._writers.remove(client)
         holder = self.lease.holder
-        if holder is not None and not any(client.writes and self.may_write(client) for client in holder.clients):
+        if holder is not None and not any(self.may_write(client) for client in holder.clients):
             self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
 
     def may_write(self, client: Client) -> bool:

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from pymodbus.constants import ExcCodes
 
@@ -55,7 +55,6 @@ class RigServer:
         self._alert = ("", 0)
         """The last log message, and its time, ns."""
         self._acceptors: list[asyncio.Task[None]] = []
-        self._tls_servers: list[asyncio.Server] = []
 
     async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
         """Accept connections from a listening socket, with TLS if a policy is given; runs on a `DirectEventLoop`.
@@ -64,19 +63,21 @@ class RigServer:
         """
         loop = asyncio.get_running_loop()
         assert isinstance(loop, DirectEventLoop)
-        if policy is None:
-            self._acceptors.append(loop.create_task(accept_connections(loop, listening, self._on_accept)))
-        else:
-            # TLS runs on asyncio's own transports.
-            server = await loop.create_server(
-                lambda: TlsHandshake(self._admission, policy, self.attach), sock=listening, backlog=BACKLOG
-            )
-            self._tls_servers.append(server)
 
-    def _on_accept(self, transport: SocketTransport) -> None:
-        peer = self._admission.admit(transport)
-        if peer is not None:
-            self.attach(transport, *peer)
+        async def accept(connected: socket.socket, peer: Any) -> None:
+            transport = SocketTransport(loop, connected, peer)
+            admitted = self._admission.admit(transport)
+            if admitted is not None:
+                self.attach(transport, *admitted)
+
+        async def accept_tls(connected: socket.socket, peer: Any) -> None:
+            del peer
+            # TLS runs on asyncio's own transports.
+            assert policy is not None
+            await loop.connect_accepted_socket(lambda: TlsHandshake(self._admission, policy, self.attach), connected)
+
+        on_accept = accept if policy is None else accept_tls
+        self._acceptors.append(loop.create_task(accept_connections(loop, listening, on_accept)))
 
     def attach(
         self,
@@ -173,8 +174,6 @@ class RigServer:
         """Stop listening and close every connection."""
         for acceptor in self._acceptors:
             acceptor.cancel()
-        for server in self._tls_servers:
-            server.close()
         for handshake in self._admission.pending_handshakes:
             handshake.close()
         for connection in list(self.connections):
