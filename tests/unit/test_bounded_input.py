@@ -20,6 +20,7 @@ from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
 from hilrig_replay.io.timebase import Timebase
+from hilrig_replay.plots.latency_plot import save_plot
 from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
@@ -108,6 +109,15 @@ def test_impossible_numbers_are_damage(tmp_path: Path, record: str, key: str, nu
     [entry] = RunIndex(tmp_path).load()
     assert f"damaged (metadata hilrig.{record}: {key} is " in entry.error
     assert len(entry.error) < 250
+
+
+def test_session_of_a_million_characters_is_damage(tmp_path: Path) -> None:
+    path = with_metadata(tmp_path / "run.mcap", "session", session="s" * 1_000_000)
+    with pytest.raises(InputError, match=r"session has 1000000 characters, expected at most 1000") as raised:
+        open_run(path)
+    assert len(str(raised.value)) < 500
+    [entry] = RunIndex(tmp_path).load()
+    assert "characters, expected at most" in entry.error
 
 
 @pytest.mark.parametrize(
@@ -199,6 +209,16 @@ def test_differences_of_impossible_times_are_bounded(tmp_path: Path, sign: int) 
     export_tables(run, tmp_path / "tables", "csv")
     export_foxglove(run, tmp_path / "drawn.mcap")
     save_rrd(run, tmp_path / "run.rrd")
+
+
+def test_impossible_loop_latency_is_plotted(tmp_path: Path) -> None:
+    made = recordings.make(SCRIPT)
+    for one in made:
+        if one.topic == "state":
+            one.message.loop_latency_ns = (1 << 63) - 1  # type: ignore[attr-defined]
+    run = open_run(recordings.write(tmp_path / "run.mcap", made, script=SCRIPT))
+    save_plot(measure(run), run, tmp_path / "run.png")
+    assert (tmp_path / "run.png").stat().st_size > 10_000
 
 
 def test_number_too_large_for_its_column_is_damage(tmp_path: Path) -> None:

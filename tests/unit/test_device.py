@@ -789,6 +789,7 @@ def test_holder_that_writes_keeps_lease_on_lossy_link() -> None:
     assert bench.device.watchdog.tripped
     with pytest.raises(ModbusError):
         bench.write(other, 0, 6)
+    assert "10.0.0.1:1000 holds the lease" in bench.events[-1].text
     bench.wait(1000)
     bench.write(other, 0, 6)
     assert bench.device.lease.holder is other.controller

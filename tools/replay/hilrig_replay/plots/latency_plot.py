@@ -22,6 +22,8 @@ from hilrig_runtime.escaping import plot_text
 Floats = NDArray[np.float64]
 
 _PERCENTILE_COLOR: Final = "#d62728"
+MAX_HISTOGRAM_STEPS: Final = 500
+"""Largest extent of the histogram, steps of the simulation: damaged timestamps would make it arbitrarily large."""
 _MAX_HISTORY_POINTS: Final = 4000
 """Points of the plot over time: a few per pixel."""
 
@@ -70,7 +72,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     statistics, step = report.loop_ms, report.step_ms
     assert statistics is not None
     # Outliers beyond the limit would compress the histogram: they are counted in its title and shown in the tail plot.
-    limit = max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step)
+    limit = min(max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step), MAX_HISTOGRAM_STEPS * step)
     edges = np.arange(0, limit + step / 80, step / 40)
     counts, beyond = np.zeros(len(edges) - 1, np.int64), 0
     for loop_ns in report.table.column("loop")():
@@ -91,7 +93,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
         near_right = value > 0.75 * limit
         axes.annotate(
             f"{name} {value:.2f} ms",
-            (value, 0.97 - 0.07 * row),
+            (min(value, limit), 0.97 - 0.07 * row),
             xycoords=("data", "axes fraction"),
             xytext=(-4 if near_right else 4, 0),
             textcoords="offset points",
