@@ -15,7 +15,7 @@ _SEPARATORS = "-_. "
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Student of a recording, or the reason why there is none."""
+    """Student of a recording, or the reason why no student was found."""
 
     student: Student | None
     problem: str = ""

@@ -132,10 +132,10 @@ def fill_export(path: Path, document: dict[str, Any], roster: Roster) -> FilledE
 
 
 def feedback(row: dict[str, Any], document: dict[str, Any]) -> str:
-    """One-line feedback for a student: points, goals, and what was subtracted."""
+    """One-line feedback for a student: points, goals and penalty."""
     attempt = used_attempt(row)
     if attempt is None:
-        return "No run that can be graded." if row["override"] is None else row["override"]["reason"] or "Set by hand."
+        return "No run that can be graded." if row["override"] is None else row["override"]["reason"] or "Set manually."
     reached = sum(goal["reached"] for goal in attempt["goals"])
     parts = [
         f"{_number(row['points'])} of {_number(document['points'])} points",
@@ -147,12 +147,12 @@ def feedback(row: dict[str, Any], document: dict[str, Any]) -> str:
         parts.append("after the last day for late attempts")
     parts += [f"missed: {goal['name']} ({goal['text']})" for goal in attempt["goals"] if not goal["reached"]]
     if row["override"] is not None:
-        parts.append(f"set by hand: {row['override']['reason'] or 'no reason given'}")
+        parts.append(f"set manually: {row['override']['reason'] or 'no reason given'}")
     return "; ".join(parts)
 
 
 def used_attempt(row: dict[str, Any]) -> dict[str, Any] | None:
-    """The attempt of a student that counts; None: there is none."""
+    """The attempt of a student that counts; None: no attempt counts."""
     return next((attempt for attempt in row["attempts"] if attempt["file"] == row["used"]), None)
 
 

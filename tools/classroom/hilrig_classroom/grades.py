@@ -92,7 +92,7 @@ class StudentGrade:
     attempts: tuple[Attempt, ...]
     """In the order of their start."""
     used: Attempt | None
-    """The attempt that counts; None: there is none."""
+    """The attempt that counts; None: no attempt counts."""
     similar: tuple[str, ...] = ()
     """Other students' runs with the same torques: to be compared by a person."""
     override: Override | None = None

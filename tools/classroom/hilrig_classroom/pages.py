@@ -143,7 +143,7 @@ def _class_row(student: Student, row: Mapping[str, Any], page: str) -> str:
     )
     notes = []
     if row["override"] is not None:
-        notes.append(f"set by hand: {row['override']['reason']}")
+        notes.append(f"set manually: {row['override']['reason']}")
     if attempt is not None and row["penalty"]:
         notes.append(f"late, {row['penalty']:.0%} subtracted")
     if attempt is not None and row["penalty"] is None:
