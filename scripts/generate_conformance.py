@@ -335,7 +335,12 @@ SECURITY_RULES: tuple[tuple[str, str], ...] = (
     ("a request that the role does not permit gets exception 01", "test_observer_and_unknown_roles_are_read_only"),
     ("the permission without a role is configurable", "test_permission_without_role_is_configurable"),
     ("a handshake that is incomplete after 5 s is aborted", "test_incomplete_handshake_times_out"),
+    (
+        "incomplete handshakes take no place of a connection; beyond its limits the oldest one is aborted",
+        "test_unfinished_handshakes_take_no_place",
+    ),
     ("a client cannot renegotiate", "test_client_cannot_renegotiate"),
+    ("a connection is closed when the client's certificate expires", "test_connection_ends_with_its_certificate"),
 )
 """Rule of Modbus/TCP Security, and its test function in `tests/rig/test_modbus_tls.py`."""
 

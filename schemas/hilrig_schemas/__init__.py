@@ -5,6 +5,7 @@ from hilrig_schemas.v1.control_pb2 import ControlReply as ControlReply
 from hilrig_schemas.v1.control_pb2 import ControlRequest as ControlRequest
 from hilrig_schemas.v1.control_pb2 import RemoveRig as RemoveRig
 from hilrig_schemas.v1.control_pb2 import ResetRig as ResetRig
+from hilrig_schemas.v1.control_pb2 import RevokeClient as RevokeClient
 from hilrig_schemas.v1.control_pb2 import StartSession as StartSession
 from hilrig_schemas.v1.control_pb2 import StopSession as StopSession
 from hilrig_schemas.v1.event_pb2 import Event as Event

@@ -188,8 +188,7 @@ async def run_cycle(folder: Path) -> Trace:
         [connection] = server.connections
 
         def request(frame: bytes) -> bytes:
-            connection.get_buffer(-1)[: len(frame)] = frame
-            connection.buffer_updated(len(frame))
+            connection.data_received(frame)
             response: bytes = transport.write.call_args.args[0]
             return response
 

@@ -15,6 +15,7 @@ from hilrig_modbus_edge.server.tls import HANDSHAKE_TIMEOUT_S
 from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 from hilrig_recorder.mcap_format.records import COMPRESSION
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.impairment import PRESETS, ImpairmentSetting
 from hilrig_runtime.config.lab import (
     ArmConfig,
@@ -23,7 +24,6 @@ from hilrig_runtime.config.lab import (
     RecorderConfig,
     RigSettings,
     SimConfig,
-    TlsConfig,
 )
 from hilrig_runtime.config.scene import MagnetConfig, PartConfig, SceneConfig, TableConfig, TrayConfig
 from hilrig_runtime.config.task import TaskConfig

@@ -1,5 +1,6 @@
 """Shutdown of a process: first signal, second signal, end of its parent, closing timeout, crashed thread."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -132,3 +133,41 @@ def test_error_is_one_line_with_its_exit_code(tmp_path: Path) -> None:
     assert "hilrig: error: lab.toml: sim.step: unknown key\n" in errors
     assert "Traceback" not in errors
     assert process.returncode == 2
+
+
+HANGUP_PROGRAM = """
+import fcntl, signal, sys, termios, threading
+from hilrig_runtime.process.shutdown import call_on_hangup
+
+fcntl.ioctl(int(sys.argv[1]), termios.TIOCSCTTY, 0)
+signal.signal(signal.SIGHUP, signal.SIG_IGN if sys.argv[2] == "nohup" else signal.SIG_DFL)
+stopping = threading.Event()
+call_on_hangup(lambda: print("reloaded", flush=True), stopping)
+print("ready", flush=True)
+while not stopping.wait(0.05):
+    pass
+"""
+
+
+@pytest.mark.parametrize("with_nohup", [False, True])
+def test_hangup_reloads_and_closed_terminal_stops(tmp_path: Path, with_nohup: bool) -> None:
+    master, terminal = os.openpty()
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", HANGUP_PROGRAM, str(terminal), "nohup" if with_nohup else ""]
+    with out.open("w") as log:
+        process = subprocess.Popen(command, stdout=log, start_new_session=True, pass_fds=[terminal])
+    try:
+        os.close(terminal)
+        eventually(lambda: "ready" in out.read_text())
+        process.send_signal(signal.SIGHUP)
+        eventually(lambda: "reloaded" in out.read_text())
+        assert process.poll() is None
+        os.close(master)
+        if with_nohup:
+            eventually(lambda: out.read_text().count("reloaded") >= 2)
+            assert process.poll() is None
+        else:
+            assert process.wait(5) == 0
+    finally:
+        process.kill()
+        process.wait()

@@ -1,6 +1,7 @@
 """A recorder that is killed at random times: written messages are recovered, and published messages are not lost."""
 
 import random
+import sys
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,7 +12,18 @@ from mcap.reader import make_reader
 
 from hilrig_runtime.messaging.recording_stream import MAX_CACHE_S
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from support.recorder_rig import RecorderProcess, files_of, make_lab, metadata, recorded, sending, times, wait_ready
+from support.recorder_rig import (
+    ZERO_TORQUE,
+    RecorderProcess,
+    files_of,
+    make_lab,
+    metadata,
+    recorded,
+    recorded_events,
+    sending,
+    times,
+    wait_ready,
+)
 from support.waiting import StallMonitor, eventually
 
 KILLS = times("HILRIG_RECORDER_KILLS", 4)
@@ -86,6 +98,41 @@ def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:
         for before, path in pairwise(paths):
             assert metadata(path)["hilrig.session"]["previous"] == before.name
             assert metadata(before)["hilrig.summary"]["ended"] == "recovered"
+
+
+SHORT_CACHE = 25
+"""Batches: half a second."""
+RECORDER_OF_SHORT_CACHES = f"""
+import sys
+import hilrig_runtime.process.service as service
+service.batch_cache_depth = lambda *_: {SHORT_CACHE}
+from hilrig_cli.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.rig
+def test_event_outlasts_the_cache_of_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hilrig_runtime.process.service.batch_cache_depth", lambda *_: SHORT_CACHE)
+    program = [sys.executable, "-c", RECORDER_OF_SHORT_CACHES]
+    config, lab = make_lab(tmp_path)
+    with sending(lab, ["rig1"]) as senders:
+        with RecorderProcess(config, program=program) as recorder:
+            wait_ready(lab, recorder)
+            senders.begin("rig1")
+            eventually(lambda: files_of(lab, "rig1", "*.part"))
+            recorder.kill()
+        senders.emit("rig1")
+        sent = senders.count("rig1")
+        eventually(lambda: senders.count("rig1") > sent + 4 * SHORT_CACHE)
+        with RecorderProcess(config, program=program) as recorder:
+            wait_ready(lab, recorder)
+            eventually(lambda: len(files_of(lab, "rig1", "*.part")) + len(files_of(lab, "rig1")) == 2)
+            senders.end("rig1")
+            eventually(lambda: not files_of(lab, "rig1", "*.part"))
+    paths = files_of(lab, "rig1")
+    assert set(senders.sent["rig1"]) - set(recorded(paths)), "the outage was too short to test anything"
+    assert len(recorded_events(paths, ZERO_TORQUE)) == 1
 
 
 def now_s() -> float:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from support.namespaces import Network, require_namespaces
-from support.recorder_rig import Key, files_of, make_lab, metadata, recorded
+from support.recorder_rig import ZERO_TORQUE, Key, files_of, make_lab, metadata, recorded, recorded_events
 from support.waiting import eventually
 
 TESTS = Path(__file__).parents[1]
@@ -46,6 +46,7 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
 
         eventually(lambda: size() > 20_000)
         network.set_link("store", False)
+        send_line("emit rig1")
         time.sleep(cut_s)
         during = size()
         network.set_link("store", True)
@@ -68,6 +69,7 @@ def test_five_second_link_cut_loses_nothing(tmp_path: Path) -> None:
     summary = metadata(path)["hilrig.summary"]
     assert not missing, f"{len(missing)} of {len(sent)} are missing: {sorted(missing)[0][:2]}…; summary: {summary}"
     assert (summary["lost_transport"], summary["lost_recorder"], summary["clock_steps"]) == ("0", "0", "0")
+    assert len(recorded_events([path], ZERO_TORQUE)) == 1
 
 
 @pytest.mark.hosts
@@ -82,3 +84,4 @@ def test_longer_link_cut_is_counted_exactly(tmp_path: Path) -> None:
     assert [summary["ended"] for summary in summaries] == ["keeper lost", "ended"]
     lost = [int(summary["lost_transport"]) + int(summary["lost_recorder"]) for summary in summaries]
     assert lost == [0, len(missing)], summaries
+    assert len(recorded_events(paths, ZERO_TORQUE)) == 1, "an event at the begin of the cut is lost"

@@ -1,7 +1,8 @@
-"""Every message type of the bus with random content, from a peer that may use the keys of one edge and one simulation.
+"""Every message type of the bus with random content, from a peer with an edge's certificate, or of a bus without any.
 
-The peer publishes and answers on its own keys and sends requests to all services. Afterwards every service is the same
-process as before, the dropped messages are counted, and the simulation has not missed more steps than without the peer.
+The peer publishes and answers on its own keys and on those of others, sends requests to all services, and commands a
+rig of another edge. Afterwards every service is the same process as before, the dropped messages are counted, the
+simulation has not missed more steps than without the peer, and the rig of the other edge never had a torque.
 """
 
 import os
@@ -15,7 +16,7 @@ import pytest
 
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.messaging.recording_stream import encode_batch
-from hilrig_schemas import Health, JointState, LogBatch, OpenSession, RigBatch
+from hilrig_schemas import Health, JointState, LogBatch, OpenSession, RigBatch, TorqueCommand
 from hilrig_schemas.topics import (
     COMMANDS,
     CONTROL,
@@ -31,6 +32,7 @@ from hilrig_schemas.topics import (
     STATES,
     alive_key,
 )
+from support.bus_certificates import make_bus_folder
 from support.labs import RunningLab, write_lab
 from support.random_messages import random_bytes, random_message
 from support.waiting import eventually
@@ -41,16 +43,19 @@ MESSAGES = int(os.environ.get("HILRIG_BUS_FUZZ_MESSAGES", "5000"))
 SEED = int(os.environ.get("HILRIG_BUS_FUZZ_SEED", random.SystemRandom().randrange(2**32)))
 LAB = "lab"
 WATCHED_S = 1.5
-NAMES = ("rig7", "forged", "edge", "edge/west", "west", "sim", "sim/9", "s1")
+UNKNOWN_RIG = "rig7"
+NAMES = (UNKNOWN_RIG, "rig2", "forged", "edge", "edge/west", "west", "sim", "sim/9", "s1")
 
 
 class Fuzzer:
     """Sends random messages of one type after the other."""
 
-    def __init__(self, bus: ZenohBus, rng: random.Random) -> None:
+    def __init__(self, bus: ZenohBus, rng: random.Random, rig: str) -> None:
         self.bus = bus
         self.rng = rng
-        keys = [(topic, topic.key(LAB, "rig7")) for topic in (*RECORDED.values(),)]
+        self.rig = rig
+        keys = [(topic, topic.key(LAB, rig)) for topic in (*RECORDED.values(),)]
+        self.forged = bus.publisher(RECORDED["command"].key(LAB, "rig1"), RECORDED["command"].traffic).put
         keys += [(HEALTH, HEALTH.key(LAB, "edge", "west")), (EVENT, EVENT.key(LAB, "edge"))]
         self.publishers = [(topic.message, bus.publisher(key, topic.traffic).put) for topic, key in keys]
         self.commands = bus.publisher(COMMANDS.key(LAB, "edge", "west"), COMMANDS.traffic).put
@@ -65,6 +70,14 @@ class Fuzzer:
     def publish(self) -> None:
         kind, put = self.rng.choice(self.publishers)
         put(self.random(kind))
+
+    def forge(self) -> None:
+        """Send a valid command of a rig that another edge serves, on its key and in a batch of this edge."""
+        number = self.rng.randrange(1 << 40)
+        command = TorqueCommand(rig="rig1", incarnation=time.time_ns(), seq=number, effort=(5.0, 0, 0, 0))
+        payload = command.SerializeToString()
+        self.forged(payload)
+        self.commands(RigBatch(source="edge/west", rigs=["rig1"], messages=[payload]).SerializeToString())
 
     def send_batch(self) -> None:
         topic, put = self.rng.choice(((RECORDED["command"], self.commands), (STATE, self.states)))
@@ -87,7 +100,7 @@ class Fuzzer:
                 batch.publish_wall_ns.append(self.rng.choice((-1, 0, time.time_ns())))
                 batch.payloads.append(self.random(topic.message))
             if self.rng.random() < 0.1:
-                batch.sessions.append(OpenSession(rig="rig7", session="s1", start_wall_ns=-1))
+                batch.sessions.append(OpenSession(rig=self.rig, session="s1", start_wall_ns=-1))
         del batch.sessions[8:]
         self.log(encode_batch(batch))
 
@@ -101,6 +114,8 @@ class Fuzzer:
         """Send messages of all types in random order."""
         actions: tuple[Callable[[], None], ...] = (self.publish, self.send_batch, self.send_log)
         for number in range(count):
+            if number % 50 == 0 and self.rig != UNKNOWN_RIG:
+                self.forge()
             if number % 100 == 0:
                 self.send_request()
             self.rng.choice(actions)()
@@ -114,9 +129,18 @@ def gaps(states: list[JointState], step_ns: int) -> int:
     return sum(later - sooner > 2 * step_ns for sooner, later in pairwise(times))
 
 
-def test_services_survive_random_messages_of_every_type(tmp_path: Path) -> None:
+def secured_lab(folder: Path) -> Path:
+    """Write a lab in which the certificate `west` is of an edge that may command rig 2, beside the running edge."""
+    make_bus_folder(folder / "bus", ["sim", "1", "west", "recorder", "operator"])
+    extra = f"bus.tls.folder = '{folder / 'bus'}'\nbus.tls.edges.1 = ['rig1', 'rig2']\nbus.tls.edges.west = ['rig2']"
+    return write_lab(folder, rigs=2, extra=extra)
+
+
+@pytest.mark.parametrize("secured", [True, False])
+def test_services_survive_random_messages_of_every_type(tmp_path: Path, secured: bool) -> None:
+    count = MESSAGES if secured else MESSAGES // 5
     print(f"HILRIG_BUS_FUZZ_SEED={SEED} HILRIG_BUS_FUZZ_MESSAGES={MESSAGES}")
-    config = write_lab(tmp_path, rigs=2)
+    config = secured_lab(tmp_path) if secured else write_lab(tmp_path, rigs=2)
     healths: dict[str, Health] = {}
     states: list[JointState] = []
 
@@ -134,8 +158,9 @@ def test_services_survive_random_messages_of_every_type(tmp_path: Path) -> None:
         time.sleep(WATCHED_S)
         quiet_gaps = gaps(states, lab.lab.sim.step_ns)
         states.clear()
-        with ZenohBus(lab.lab.bus, "tool") as peer:
-            Fuzzer(peer, random.Random(SEED)).run(MESSAGES)
+        peer = ZenohBus(lab.lab.bus, "edge", "west") if secured else ZenohBus(lab.lab.bus, "tool")
+        with peer:
+            Fuzzer(peer, random.Random(SEED), "rig2" if secured else UNKNOWN_RIG).run(count)
         fuzzed = list(states)
         received_ns = time.time_ns()
         eventually(lambda: len(healths) == 3 and all(health.wall_ns > received_ns for health in healths.values()))
@@ -144,5 +169,8 @@ def test_services_survive_random_messages_of_every_type(tmp_path: Path) -> None:
         for name in ("sim/1", "recorder/1", "edge/1"):
             assert healths[name].malformed > 0, name
         assert "malformed messages dropped" in lab.output()
+        assert fuzzed
+        if secured:
+            assert not any(any(state.effort) for state in fuzzed)
         assert "Traceback" not in lab.output()
         assert lab.stop() == 0

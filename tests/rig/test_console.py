@@ -5,11 +5,13 @@ import http.client
 import json
 import os
 import re
+import resource
 import signal
 import socket
 import ssl
 import subprocess
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -369,6 +371,24 @@ def test_password_is_required_off_loopback(tmp_path: Path) -> None:
             eventually(lambda: watcher.ended)
         assert running.process.stderr is not None
         assert "the password is sent unencrypted" in running.process.stderr.read()
+
+
+def test_console_is_reachable_during_half_sent_requests(tmp_path: Path) -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
+    with console(write_lab(tmp_path)) as running, ExitStack() as closing:
+        for number in range(1400):
+            source = (f"127.0.5.{number % 3 + 1}" if number % 2 else "127.0.0.1", 0)
+            connection = socket.create_connection(("127.0.0.1", running.port), timeout=5, source_address=source)
+            closing.enter_context(connection).sendall(b"GET / HTTP/1.1\r\nHost: con")
+        start_s = time.monotonic()
+        for path in ("/health", "/", "/runs"):
+            assert running.ask(path)[0] == 200
+        assert time.monotonic() - start_s < 2
+        assert len(list(Path(f"/proc/{running.process.pid}/fd").iterdir())) < 600
+        running.process.terminate()
+        assert running.process.wait(LONG_TIMEOUT_S) == 0
+        assert running.process.stderr is not None
+        assert len(running.process.stderr.read().splitlines()) < 10
 
 
 def test_serves_https_with_certificate(tmp_path: Path) -> None:

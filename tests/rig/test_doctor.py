@@ -1,15 +1,22 @@
 """`hilrig doctor` and `hilrig router` from the command line, with running services."""
 
 import json
+import os
+import signal
 import subprocess
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hilrig_runtime.bus.zenoh_bus import ZenohBus
+from hilrig_runtime.counters import Counters
+from hilrig_runtime.process.discovery import ClockOffset, query_services
 from support.labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
-from support.waiting import LONG_TIMEOUT_S
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
@@ -41,6 +48,47 @@ def test_running_lab_has_no_errors(lab: RunningLab) -> None:
     table = hilrig("doctor", "--config", lab.config, cwd=lab.config.parent)
     assert table.returncode == 0
     assert "no errors" in table.stdout
+
+
+@contextmanager
+def stopped(lab: RunningLab, service: str) -> Iterator[None]:
+    """Stop a service: it has no time to answer."""
+    pid = lab.service_pid(service)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_stopped_service_shifts_no_clock_of_others(lab: RunningLab) -> None:
+    with stopped(lab, "recorder"), ZenohBus(lab.lab.bus, "tool") as bus:
+        found: dict[str, ClockOffset] = {}
+
+        def ask() -> bool:
+            replies = query_services(bus, lab.lab.name, "*", Counters(), 1.5)
+            found.update((info.service, offset) for info, offset in replies)
+            return {"sim", "edge"} <= set(found)
+
+        eventually(ask)
+    assert "recorder" not in found
+    for offset in found.values():
+        assert abs(offset.offset_ns) <= offset.uncertainty_ns < 300_000_000
+
+
+@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes 15 s; set HILRIG_LONG=1 to run it")
+def test_top_shows_true_clocks_while_a_service_is_stopped(lab: RunningLab) -> None:
+    """After each service has compared its clock, which it does every 10 s."""
+    with stopped(lab, "recorder"):
+        deadline_s = time.monotonic() + 15
+        while time.monotonic() < deadline_s:
+            shown = json.loads(hilrig("top", "--config", lab.config, "--json").stdout)["services"]
+            clocks = [row for row in shown if row["service"] != "recorder" and row["clock_peer"]]
+            assert len(clocks) == 2
+            for row in clocks:
+                assert abs(row["clock_offset_ms"]) <= row["clock_uncertainty_ms"] < 300
+        found = results(hilrig("doctor", "--config", lab.config, "--json", cwd=lab.config.parent))
+        assert found["time"][0]["level"] == "ok"
 
 
 @pytest.mark.parametrize("service", ["sim", "edge", "recorder"])

@@ -26,6 +26,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
     config = write_lab(tmp_path_factory.mktemp("lab"), rigs=4, extra="edge.session_grace_ms = 100")
     with RunningLab(config, "--edges", "2", "--recorders", "2", "--log-format", "json") as running:
         yield running
+    # Every line, of `up` and of each service, until the end.
+    for line in running.output().splitlines():
+        assert json.loads(line)["service"] in ("up", "sim", "edge", "recorder"), line
 
 
 def top(lab: RunningLab) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from support.clients import mbpoll_read, mbpoll_write, require_mbpoll
+from support.clients import compile_with_libmodbus, mbpoll_read, mbpoll_write, require_mbpoll
 from support.edge_rig import EdgeRig, RawClient, running_edge
 from support.labs import RunningLab, hilrig, write_lab
 from support.waiting import eventually
@@ -37,19 +37,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
 
 @pytest.fixture(scope="module")
 def in_c(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
-        pytest.skip("needs gcc and pkg-config (Debian's packages of these names)")
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "libmodbus"], check=False, capture_output=True, text=True
-    )
-    if flags.returncode:
-        pytest.skip("needs libmodbus (Debian's package libmodbus-dev)")
-    program = tmp_path_factory.mktemp("c") / "hold_position"
-    source = EXAMPLES / "hold_position.c"
-    warnings = ["-O2", "-Wall", "-Wextra", "-Werror"]
-    command = ["gcc", *warnings, "-o", str(program), str(source), *flags.stdout.split(), "-lm"]
-    subprocess.run(command, check=True)
-    return program
+    return compile_with_libmodbus(EXAMPLES / "hold_position.c", tmp_path_factory.mktemp("c"))
 
 
 @pytest.fixture(scope="module")

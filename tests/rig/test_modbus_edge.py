@@ -17,8 +17,9 @@ from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_schemas import Event, LeaseRequest, LeaseStatus, RigBatch, ServiceInfo, TorqueCommand, topics
-from support.edge_rig import EdgeRig, RawClient, counts, free_ports, now_ns, running_edge
+from support.edge_rig import EdgeRig, RawClient, counts, now_ns, running_edge
 from support.foreign_requests import assert_refuses_foreign_requests
+from support.labs import free_ports
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -365,7 +366,7 @@ def test_client_that_does_not_read_does_not_delay_others() -> None:
 
 
 def test_port_in_use_is_reported_with_rig_and_address() -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"name": "left", "port": port}]})
     with running_edge() as other:
         lab = LabConfig.model_validate({"rigs": [{"name": "left", "port": other.port}]})
@@ -394,7 +395,7 @@ def test_requests_of_other_versions_are_refused() -> None:
 
 
 def test_early_client_is_served_after_the_first_state() -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"port": port}]})
     with Service("edge", lab, MemoryBus()) as service:
         rig = EdgeRig(lab, service.bus.hub, service)

@@ -9,7 +9,7 @@ import stat
 import struct
 import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -33,8 +33,8 @@ from hilrig_runtime.security.x509 import (
     role_of,
 )
 from hilrig_schemas import Event
-from support.edge_rig import EdgeRig, free_ports, running_edge
-from support.labs import hilrig
+from support.edge_rig import EdgeRig, running_edge
+from support.labs import free_ports, hilrig
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -84,26 +84,15 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 @pytest.fixture
 def rig(lab: Lab) -> Iterator[EdgeRig]:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port)) as rig:
         yield rig
 
 
 def talk(rig: EdgeRig, context: ssl.SSLContext, *requests: bytes) -> list[bytes]:
     """Return the PDUs of the responses; raises `OSError` if the edge rejects the certificate."""
-    port = rig.lab.tls_ports["rig1"]
-    with (
-        socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
-        context.wrap_socket(plain, server_hostname="localhost") as secured,
-    ):
-        answers = []
-        for request in requests:
-            secured.sendall(request)
-            answer = secured.recv(300)
-            if not answer:
-                raise ConnectionError("closed")
-            answers.append(answer[7:])
-        return answers
+    with connected(rig, context) as secured:
+        return [ask(secured, request) for request in requests]
 
 
 def test_operator_reads_and_writes(rig: EdgeRig, lab: Lab) -> None:
@@ -121,13 +110,13 @@ def test_observer_and_unknown_roles_are_read_only(rig: EdgeRig, lab: Lab, name: 
 
 @pytest.mark.parametrize(("no_role", "answer"), [("operator", "06 00 00 03 E8"), ("observer", "86 01")])
 def test_permission_without_role_is_configurable(lab: Lab, no_role: str, answer: str) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role=no_role)) as rig:
         assert talk(rig, lab.client("plain"), WRITE) == [bytes.fromhex(answer)]
 
 
 def test_clients_without_role_can_be_refused(lab: Lab) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port, no_role="refuse")) as rig:
         with pytest.raises(OSError):  # noqa: PT011  # which one depends on the timing
             talk(rig, lab.client("plain"), READ)
@@ -151,6 +140,19 @@ def test_invalid_certificate_is_refused_with_reason(rig: EdgeRig, lab: Lab, name
     assert rig.service.counters.refused == 1
     # The next client is served.
     assert talk(rig, lab.client("operator"), READ)
+
+
+def test_connection_ends_with_its_certificate(rig: EdgeRig, lab: Lab) -> None:
+    soon = datetime.now(UTC) + timedelta(seconds=1.3) - timedelta(days=1)
+    lab.write("short", issue_client(lab.authority, "short", "operator", soon, 1))
+    with connected(rig, lab.client("short")) as secured, connected(rig, lab.client("operator")) as other:
+        assert ask(secured, WRITE) == bytes.fromhex("06 00 00 03 E8")
+        assert ask(other, READ)
+        assert secured.recv(1) == b""
+        assert "its certificate has expired" in rig.event(Event.LEASE_LOST).text
+        assert ask(other, READ)
+    with pytest.raises(OSError):  # noqa: PT011  # depends on the TLS library of the client
+        talk(rig, lab.client("short"), READ)
 
 
 UTF8, PRINTABLE = b"\x0c", b"\x13"
@@ -273,7 +275,9 @@ def test_mutated_handshakes_have_no_effect_on_others(
     eventually(lambda: rig.service.counters.connections == 0)
     assert rig.service.counters.refused
     gc.collect()
-    assert {record.name for record in caplog.records} <= {"hilrig_modbus_edge.server.listener"}
+    # The test publishes no states meanwhile.
+    expected = {"hilrig_modbus_edge.server.listener", "hilrig_runtime.process.outage"}
+    assert {record.name for record in caplog.records} <= expected
 
 
 @pytest.mark.parametrize("size", [300, 5_000, 300_000])
@@ -317,17 +321,75 @@ def test_client_without_tls_is_refused_without_delay(rig: EdgeRig, lab: Lab) -> 
     assert "TLS handshake failed" in rig.event(Event.CONNECTION_REFUSED).text
 
 
-def test_unfinished_handshakes_count_as_connections(lab: Lab) -> None:
-    [port] = free_ports(1)
-    with running_edge(tls=lab.tls(port), max_connections_per_host=2) as rig:
-        with ExitStack() as idlers:
-            for _ in range(2):
-                idlers.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
-            third = idlers.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
-            assert third.recv(1) == b""
-            assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
-        # After they have disconnected, connections are available again.
-        eventually(lambda: is_served(rig, lab))
+def test_unfinished_handshakes_take_no_place(lab: Lab) -> None:
+    """Many addresses connect and never complete a handshake: the owner writes, and their number is limited."""
+    port = free_ports(1)
+    with running_edge(tls=lab.tls(port), max_connections=4, max_connections_per_host=2) as rig, ExitStack() as idlers:
+        hello = Handshake(lab.client("operator")).proceed(b"")
+        opened = []
+        for number in range(24):
+            source = (f"127.0.2.{number % 8}", 0)
+            one = socket.create_connection(("127.0.0.1", port), timeout=5, source_address=source)
+            opened.append(idlers.enter_context(one))
+            if number % 2:
+                one.sendall(hello)
+        context = lab.client("operator")
+        with connected(rig, context) as owner:
+            assert ask(owner, WRITE) == bytes.fromhex("06 00 00 03 E8")
+            for _ in range(3):
+                assert talk(rig, context, READ)
+            assert ask(owner, READ)
+        eventually(lambda: rig.service.counters.refused >= 20)
+        assert "too many others" in rig.event(Event.CONNECTION_REFUSED).text
+        assert len([one for one in opened if not is_closed(one)]) <= 4
+
+
+def test_completed_handshakes_are_limited(lab: Lab) -> None:
+    port = free_ports(1)
+    with running_edge(tls=lab.tls(port), max_connections_per_host=2) as rig, ExitStack() as closing:
+        context = lab.client("operator")
+        owner = closing.enter_context(connected(rig, context))
+        assert ask(owner, READ)
+        # Both are admitted before one of them is a client.
+        begun = [closing.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5)) for _ in range(2)]
+        second, third = (closing.enter_context(context.wrap_socket(one, server_hostname="localhost")) for one in begun)
+        assert ask(second, READ)
+        with pytest.raises(OSError):  # noqa: PT011  # which one depends on the timing
+            ask(third, READ)
+        assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
+        assert ask(owner, READ)
+
+
+@contextmanager
+def connected(rig: EdgeRig, context: ssl.SSLContext) -> Iterator[ssl.SSLSocket]:
+    port = rig.lab.tls_ports["rig1"]
+    with (
+        socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
+        context.wrap_socket(plain, server_hostname="localhost") as secured,
+    ):
+        yield secured
+
+
+def ask(secured: ssl.SSLSocket, request: bytes) -> bytes:
+    """Return the PDU of the response."""
+    secured.sendall(request)
+    answer = secured.recv(300)
+    if not answer:
+        raise ConnectionError("closed")
+    return answer[7:]
+
+
+def is_closed(connection: socket.socket) -> bool:
+    """Whether the peer has closed a connection."""
+    connection.setblocking(False)
+    try:
+        while connection.recv(4096):
+            pass
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def is_served(rig: EdgeRig, lab: Lab) -> bool:
@@ -363,7 +425,7 @@ def test_requests_right_after_handshake_are_answered(rig: EdgeRig, lab: Lab) -> 
 
 
 def test_only_tls_listens_without_plain(lab: Lab) -> None:
-    [port] = free_ports(1)
+    port = free_ports(1)
     with running_edge(tls=lab.tls(port), plain=False) as rig:
         assert talk(rig, lab.client("operator"), READ)
         with pytest.raises(ConnectionRefusedError):
@@ -444,7 +506,7 @@ def test_certs_creates_certificates_of_edge_and_clients(tmp_path: Path) -> None:
     # A later client is signed by the same authority; no other file is changed.
     added = hilrig("certs", folder, "--client", "carol=observer", "--json")
     assert [Path(path).name for path in json.loads(added.stdout)["written"]] == ["carol.pem", "carol.key"]
-    [port] = free_ports(1)
+    port = free_ports(1)
     files = Lab(folder, make_authority("unused", NOW, 1))
     with running_edge(tls=files.tls(port)) as rig:
         assert talk(rig, files.client("alice"), WRITE) == [bytes.fromhex("06 00 00 03 E8")]

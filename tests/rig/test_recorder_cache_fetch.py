@@ -35,7 +35,7 @@ import os, signal, sys, threading
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 
-numbers, lost, done = [], [], threading.Event()
+numbers, done = [], threading.Event()
 
 def on_message(key, payload):
     numbers.append(int.from_bytes(payload[:4], "big"))
@@ -45,9 +45,9 @@ def on_message(key, payload):
         done.set()
 
 with ZenohBus(BusConfig(first_port=int(sys.argv[1])), "recorder") as bus:
-    bus.subscribe_recording("hil/lab/log/*/*", on_message, lambda _, count: lost.append(count), {CACHE_DEPTH})
+    bus.subscribe_recording("hil/lab/log/*/*", on_message, {CACHE_DEPTH})
     completed = done.wait(30)
-print(completed, numbers == list(range(len(numbers))), sum(lost))
+print(completed, numbers == list(range(len(numbers))))
 """
 
 
@@ -79,5 +79,5 @@ def test_fetching_cached_messages_does_not_block_publisher() -> None:
             assert reader.stdout is not None
             output = reader.stdout.read().split()
     assert stopped_s is not None
-    assert output == ["True", "True", "0"], "all messages, in order"
+    assert output == ["True", "True"], "all messages, in order"
     assert max(puts_s) < STOPPED_S / 5, f"a put took {max(puts_s) * 1e3:.0f} ms"

@@ -17,7 +17,7 @@ from hilrig_runtime.config.lab import LabConfig, RecorderConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
-from hilrig_schemas import Event, RigConfig, ServiceInfo
+from hilrig_schemas import Event, OpenSession, RigConfig, ServiceInfo
 from hilrig_schemas.topics import CONFIG, LOG, Traffic
 from support.foreign_requests import assert_refuses_foreign_requests
 from support.log_streams import FakeSource
@@ -249,6 +249,7 @@ def test_large_recording_is_rotated_without_loss(tmp_path: Path, monkeypatch: py
             for _ in range(20):
                 sim.state("rig1", now(), SESSION)
             lab.send(sim)
+            lab.send(edge, [OpenSession(rig="rig1", session=SESSION)])
             return len(lab.recordings()) >= 2
 
         eventually(three_files)

@@ -105,6 +105,11 @@ class Browser:
         self._call("Page.navigate", url=address)
         eventually(lambda: self.run("document.readyState") == "complete")
 
+    def emulate(self, *, media: str = "", scheme: str = "light") -> None:
+        """Set the medium, "screen" or "print", and the color scheme, "light" or "dark"."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self._call("Emulation.setEmulatedMedia", media=media, features=features)
+
     @property
     def requests(self) -> list[str]:
         """URLs requested by the page, without those blocked by its Content-Security-Policy."""

@@ -59,8 +59,9 @@ class Bench:
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
         self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
 
-    def send(self, rig: str, payload: bytes) -> None:
+    def send(self, rig: str, payload: bytes, now_ns: int) -> None:
         assert rig == "rig1"
+        assert now_ns == self.clock.monotonic_ns()
         self.scheduled.append(payload)
 
     def publish_encoded(self, payload: bytes, wall_ns: int) -> None:

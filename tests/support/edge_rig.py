@@ -16,19 +16,11 @@ from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 from hilrig_schemas import Event, JointState, LogBatch, ModbusTraffic, RigBatch, TorqueCommand, topics
+from support.labs import free_ports
 from support.waiting import eventually
 
 HEADER = struct.Struct(">HHHB")
 START_POSITION = (0.1, -0.2, 0.05, 3.0)
-
-
-def free_ports(count: int) -> list[int]:
-    """Return ports that are free now, chosen by the system."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
 
 
 @dataclass
@@ -104,9 +96,13 @@ class EdgeRig:
 
 @contextmanager
 def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[EdgeRig]:
-    """Run an edge with these settings; every rig has one state on entry."""
-    ports = free_ports(len(rigs))
-    settings = [{"name": name, "port": port} for name, port in zip(rigs, ports, strict=True)]
+    """Run an edge with these settings; every rig has one state on entry.
+
+    `first_rig` are settings of the first rig.
+    """
+    first_port = free_ports(len(rigs))
+    settings: list[dict[str, Any]] = [{"name": name, "port": first_port + number} for number, name in enumerate(rigs)]
+    settings[0] |= edge.pop("first_rig", {})
     allow = edge.pop("allow", None)
     if allow is not None:
         settings[0]["allow"] = allow

@@ -47,7 +47,7 @@ REFUSED = [
 
 EXECUTED = {
     "sim": ("add_rig", "remove_rig"),
-    "edge": ("add_rig", "remove_rig", "reset_rig"),
+    "edge": ("add_rig", "remove_rig", "reset_rig", "revoke_client"),
     "recorder": ("start_session", "stop_session"),
 }
 """Requests that each service executes."""

@@ -74,10 +74,20 @@ class FakeSource:
     def batch(self, sessions: Sequence[OpenSession] | None = None) -> LogBatch:
         """A batch of the messages added since the last one; `sessions`, if given, is a complete announcement."""
         self.sequence += 1
-        batch = LogBatch(source=self.name, incarnation=self.incarnation, sequence=self.sequence)
-        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._pending])
-        self._pending.clear()
+        batch = self._batch()
         if sessions is not None:
             batch.sessions.extend(sessions)
             batch.complete_sessions = True
+        return batch
+
+    def events(self) -> LogBatch:
+        """A batch of the events added since the last batch."""
+        batch = self._batch()
+        batch.events = True
+        return batch
+
+    def _batch(self) -> LogBatch:
+        batch = LogBatch(source=self.name, incarnation=self.incarnation, sequence=self.sequence)
+        put_entries(batch, [(sent.key, sent.sequence, sent.publish_ns, sent.payload) for sent in self._pending])
+        self._pending.clear()
         return batch

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,12 +30,15 @@ Key = tuple[str, int, bytes]
 """(channel, sequence of the publisher, payload)."""
 
 
+ZERO_TORQUE = "no command received for 612 ms: torque set to zero until the next command"
+
+
 class RecorderProcess:
     """A `hilrig recorder` process; the context manager ends it."""
 
-    def __init__(self, config: Path, *options: str) -> None:
+    def __init__(self, config: Path, *options: str, program: Sequence[str] = HILRIG) -> None:
         self.log = config.parent / f"recorder{''.join(options[:2])}.log"
-        command = [*HILRIG, "recorder", "--config", str(config), *options]
+        command = [*program, "recorder", "--config", str(config), *options]
         with self.log.open("a") as log:
             self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=config.parent)
 
@@ -72,6 +75,8 @@ class Senders:
     sent: dict[str, list[Key]] = field(default_factory=dict)
     """Messages published while a session of the rig was open, by rig."""
     sessions: dict[str, str] = field(default_factory=dict)
+    events: list[Event] = field(default_factory=list)
+    """Events that the simulation emits at the next tick."""
     stopping: threading.Event = field(default_factory=threading.Event)
 
     def begin(self, rig: str) -> str:
@@ -83,6 +88,10 @@ class Senders:
     def end(self, rig: str) -> None:
         """End the session of a rig at the next tick."""
         del self.sessions[rig]
+
+    def emit(self, rig: str, text: str = ZERO_TORQUE) -> None:
+        """Emit an event of a rig at the next tick."""
+        self.events.append(Event(rig=rig, session=self.sessions[rig], kind=Event.COMMAND_LOST, text=text))
 
     def count(self, rig: str) -> int:
         """Number of messages of a rig published within sessions."""
@@ -123,6 +132,8 @@ class Senders:
                             ("/state", step, state.SerializeToString()),
                             ("/command", step, command.SerializeToString()),
                         ]
+                while self.events:
+                    sim.emit(self.events.pop())
                 now_ns = SYSTEM_CLOCK.monotonic_ns()
                 sim.beat(now_ns)
                 edge.beat(now_ns)
@@ -218,6 +229,18 @@ def recorded(paths: list[Path]) -> list[Key]:
     return found
 
 
+def recorded_events(paths: list[Path], text: str) -> list[Event]:
+    """Events with a text in finished recordings."""
+    found: list[Event] = []
+    for path in paths:
+        with path.open("rb") as stream:
+            for _, _, message in make_reader(stream).iter_messages(topics=["/event"]):
+                event = Event.FromString(message.data)
+                if event.text == text:
+                    found.append(event)
+    return found
+
+
 def metadata(path: Path) -> dict[str, dict[str, str]]:
     """Metadata of a finished recording, by name."""
     with path.open("rb") as stream:
@@ -236,12 +259,12 @@ def times(name: str, default: int) -> int:
 
 
 def main() -> None:
-    """Run senders as a program: reads `begin RIG` and `end RIG` from standard input, then writes the sent messages."""
+    """Run senders as a program: reads `begin`, `end` and `emit RIG` from standard input, then writes the messages."""
     lab, out = load_lab(Path(sys.argv[1])), Path(sys.argv[2])
     with sending(lab, [rig.name for rig in lab.rigs]) as senders:
         for line in sys.stdin:
             action, rig = line.split()
-            (senders.begin if action == "begin" else senders.end)(rig)
+            {"begin": senders.begin, "end": senders.end, "emit": senders.emit}[action](rig)
     out.write_bytes(pickle.dumps(senders.sent))
 
 

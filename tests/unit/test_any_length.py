@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_replay.analysis import compare, diagnosis, distribution, samples, summary, verify
+from hilrig_replay.analysis import compare, distribution, samples, summary, verify
+from hilrig_replay.analysis.diagnosis import evidence
 from hilrig_replay.analysis.index import RunIndex
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export import export
@@ -67,7 +68,7 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
     monkeypatch.setattr(summary, "TRAJECTORY_POINTS", ROWS)
     monkeypatch.setattr(latency_plot, "_MAX_HISTORY_POINTS", ROWS)
-    monkeypatch.setattr(diagnosis, "WINDOW_S", 1.0)
+    monkeypatch.setattr(evidence, "WINDOW_S", 1.0)
 
 
 def peak(command: Callable[[Path], object], path: Path) -> int:

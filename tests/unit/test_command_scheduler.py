@@ -39,9 +39,12 @@ class Edge:
         self.timers: list[Call] = []
         self.sent: list[tuple[int, dict[str, bytes]]] = []
         scheduler = CommandScheduler("edge/1", self, self.states, step_ns, self.clock, self._call_at)  # type: ignore[arg-type]
-        self.send, self.flush = scheduler.send, scheduler.flush
+        self.scheduler, self.flush = scheduler, scheduler.flush
         self.clock.advance(10 * STEP_NS)
         self.tick()
+
+    def send(self, rig: str, command: bytes) -> None:
+        self.scheduler.send(rig, command, self.clock.monotonic_ns())
 
     def put(self, payload: bytes) -> None:
         batch = RigBatch.FromString(payload)

@@ -1,17 +1,24 @@
-"""Limits of the console's HTTP server: half-sent requests end, and one host can't take all connections."""
+"""Limits of the console's HTTP server: half-sent requests end and take no place of a browser."""
 
 import socket
+import ssl
+import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 import uvicorn
 
 from hilrig_console import http_limits
-from hilrig_console.http_limits import LimitedProtocol
+from hilrig_console.http_limits import ConnectionTable, LimitedProtocol
+from hilrig_console.serving import TlsFiles
+from support.bus_certificates import make_bus_folder
 from support.waiting import eventually
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: console\r\n\r\n"
@@ -23,20 +30,35 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": b"ok"})
 
 
-@pytest.fixture
-def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
-    monkeypatch.setattr(http_limits, "REQUEST_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(http_limits, "MAX_CONNECTIONS_PER_HOST", 4)
-    config = uvicorn.Config(app, http=LimitedProtocol, lifespan="off", log_config=None, ws="none")
-    server = uvicorn.Server(config)
+@dataclass
+class Server:
+    """A running server with few connections and a short time for requests."""
+
+    address: tuple[str, int]
+    table: ConnectionTable
+
+
+@contextmanager
+def running(context: ssl.SSLContext | None = None) -> Iterator[Server]:
+    table = ConnectionTable(16, 8)
+    http: Any = partial(LimitedProtocol, table, context)
+    server = uvicorn.Server(uvicorn.Config(app, http=http, lifespan="off", log_config=None, ws="none"))
     with socket.create_server(("127.0.0.1", 0)) as listening:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()
         eventually(lambda: server.started)
-        yield listening.getsockname()
+        yield Server(listening.getsockname(), table)
         server.should_exit = True
         thread.join(timeout=5)
-    assert not LimitedProtocol.connections_of
+    assert not table.counts
+    assert not table.waiting
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setattr(http_limits, "REQUEST_TIMEOUT_S", 0.2)
+    with running() as server:
+        yield server
 
 
 def get(connection: socket.socket) -> bytes:
@@ -65,8 +87,8 @@ def is_closed(connection: socket.socket) -> bool:
         b"POST / HTTP/1.1\r\nHost: console\r\nContent-Length: 9\r\n\r\nhalf",
     ],
 )
-def test_half_sent_request_is_closed(address: tuple[str, int], part: bytes) -> None:
-    with socket.create_connection(address) as connection:
+def test_half_sent_request_is_closed(server: Server, part: bytes) -> None:
+    with socket.create_connection(server.address) as connection:
         connection.sendall(part)
         start_s = time.monotonic()
         answer = b""
@@ -79,21 +101,84 @@ def test_half_sent_request_is_closed(address: tuple[str, int], part: bytes) -> N
         assert time.monotonic() - start_s < 2
 
 
-def test_second_request_on_a_connection_is_limited_too(address: tuple[str, int]) -> None:
-    with socket.create_connection(address) as connection:
+def test_second_request_on_a_connection_is_limited_too(server: Server) -> None:
+    with socket.create_connection(server.address) as connection:
         assert get(connection).endswith(b"ok")
-        time.sleep(0.3)
-        assert get(connection).endswith(b"ok")
+        for _ in range(3):
+            time.sleep(0.1)
+            assert get(connection).endswith(b"ok")
         connection.sendall(REQUEST[:20])
         assert is_closed(connection)
 
 
-def test_connections_of_one_host_are_limited(address: tuple[str, int]) -> None:
+@pytest.mark.parametrize("secured", [False, True])
+def test_half_sent_requests_take_no_place(tmp_path: Path, secured: bool) -> None:
+    """Neither those of other hosts nor those of the browser's host; with TLS half-sent handshakes."""
+    trusting = None
     with ExitStack() as closing:
-        for _ in range(4):
-            closing.enter_context(socket.create_connection(address))
-        eventually(lambda: LimitedProtocol.connections_of["127.0.0.1"] == 4)
-        assert is_closed(closing.enter_context(socket.create_connection(address)))
-    eventually(lambda: not LimitedProtocol.connections_of)
-    with socket.create_connection(address) as connection:
+        context = None
+        if secured:
+            authority = make_bus_folder(tmp_path / "certs", ["console"])
+            context = TlsFiles(tmp_path / "certs/console.pem", tmp_path / "certs/console.key").context()
+            trusting = ssl.create_default_context(cadata=authority.certificate_pem.decode())
+        server = closing.enter_context(running(context))
+        for number in range(60):
+            source = (f"127.0.3.{number % 7}" if number % 2 else "127.0.0.1", 0)
+            one = closing.enter_context(socket.create_connection(server.address, source_address=source))
+            # A half-sent request and the first bytes of a TLS handshake.
+            one.sendall(b"\x16\x03\x01\x02" if secured else REQUEST[:30])
+        for _ in range(3):
+            plain = closing.enter_context(socket.create_connection(server.address, timeout=3))
+            browser = plain if trusting is None else trusting.wrap_socket(plain, server_hostname="127.0.0.1")
+            assert get(closing.enter_context(browser)).endswith(b"ok")
+        assert server.table.counts.total() <= 16
+
+
+def test_answered_requests_keep_no_place() -> None:
+    """Connections that stay open after a complete request give way to new ones."""
+    with running() as server, ExitStack() as closing:
+        for number in range(40):
+            source = (f"127.0.3.{number % 5}", 0)
+            one = closing.enter_context(socket.create_connection(server.address, source_address=source))
+            assert get(one).endswith(b"ok")
+        assert server.table.counts.total() <= 16
+
+
+@pytest.mark.parametrize(
+    ("data", "answer"),
+    [
+        (b"GET /\r\n\r\n", b"HTTP/1.1 400"),
+        (b"GET / HTTP/1.1\r\nHost: console\r\nX: " + b"a" * 200_000, b"HTTP/1.1 400"),
+        (
+            REQUEST[:-2] + b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n",
+            b"HTTP/1.1 200",
+        ),
+        (REQUEST * 200, b"HTTP/1.1 200"),
+        (b"\0" * 100, b"HTTP/1.1 400"),
+    ],
+    ids=["HTTP/0.9", "huge header", "websocket", "pipelined", "binary"],
+)
+def test_odd_requests_end_within_the_limits(server: Server, data: bytes, answer: bytes) -> None:
+    with socket.create_connection(server.address, timeout=3) as connection:
+        received = b""
+        # The server may answer and close before it has read everything.
+        with suppress(ConnectionError):
+            connection.sendall(data)
+            connection.shutdown(socket.SHUT_WR)
+        with suppress(ConnectionError):
+            while chunk := connection.recv(65536):
+                received += chunk
+    assert received.startswith(answer)
+    eventually(lambda: not server.table.counts)
+
+
+def test_reset_connections_leave_nothing(server: Server) -> None:
+    for number in range(300):
+        connection = socket.create_connection(server.address, source_address=(f"127.0.4.{number % 250}", 0))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.sendall(REQUEST[: number % len(REQUEST)])
+        connection.close()
+    with socket.create_connection(server.address) as connection:
         assert get(connection).endswith(b"ok")
+    eventually(lambda: not server.table.counts)

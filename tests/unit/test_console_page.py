@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from hilrig_console import arm_picture, catalog
+from hilrig_console import catalog
 from hilrig_console.app import FRAME_PERIOD_S, STATIC_FOLDER
 from hilrig_console.events import MAX_EVENTS, EventBuffer
 from hilrig_console.view_model import ClientState, ViewModel
 from hilrig_monitoring.lab_view import RigStatus
 from hilrig_replay.analysis.index import RunEntry
+from hilrig_replay.geometry import arm_picture
 from hilrig_schemas import Event, Health
 from support.recordings import PARAMETERS
 

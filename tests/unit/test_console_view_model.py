@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilrig_console.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, pose_of, scene_of
 from hilrig_console.events import MAX_EVENTS, EventBuffer
 from hilrig_console.poses import PoseCache
 from hilrig_console.view_model import ClientState, Frame, ViewModel
 from hilrig_monitoring.lab_view import REMOVED_AFTER_S, SILENT_AFTER_S, LabView
+from hilrig_replay.geometry.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, pose_of, scene_of
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_schemas import Event, Health, JointState, PartState, RigBatch, RigConfig, RigReport, ServiceInfo
 from hilrig_sim.arm.kinematics import forward

@@ -3,6 +3,7 @@
 import struct
 
 import pytest
+from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.protocol.functions import RegisterTable
@@ -816,3 +817,76 @@ def test_one_read_contains_one_step(bench: Bench) -> None:
         floats = struct.unpack_from(">12f", data, 24)
         assert struct.unpack_from(">I", data, 4) == (step,)
         assert (floats[2], floats[6], floats[8:]) == (step, step, (step,) * 4)
+
+
+def test_unlisted_client_may_only_read() -> None:
+    bench = Bench()
+    bench.state(1)
+    bench.device.permit({"alice"})
+    alice = bench.connect("10.0.0.1", 1, certificate="alice")
+    for unlisted, reason in (
+        (bench.connect("10.0.0.2", 2, certificate="bob"), "does not list rig1 for bob"),
+        (bench.connect("10.0.0.3", 3), "writing needs a certificate"),
+    ):
+        assert bench.read(unlisted, 4, 1)
+        with pytest.raises(ModbusError) as refused:
+            bench.write(unlisted, 0, 100)
+        assert refused.value.code == ExcCodes.ILLEGAL_FUNCTION
+        assert reason in bench.events[-1].text
+        assert bench.device.read_bits(unlisted, RegisterTable.DISCRETE_INPUT, 0, 16) & Status.READ_ONLY
+    bench.write(alice, 0, 100)
+    assert not bench.device.read_bits(alice, RegisterTable.DISCRETE_INPUT, 0, 16) & Status.READ_ONLY
+
+
+def test_client_that_loses_permission_loses_the_lease() -> None:
+    """Also in the midst of writes: the next write of the same registers is not taken for an authorized one."""
+    bench = Bench()
+    alice, bob = (bench.connect(f"10.0.0.{n}", n, certificate=name) for n, name in enumerate(("alice", "bob")))
+    bench.device.permit({"alice", "bob"})
+    bench.write(alice, 0, 100)
+    bench.device.permit({"bob"})
+    assert bench.device.lease.holder is None
+    assert "edge.tls.clients" in bench.events[-1].text
+    with pytest.raises(ModbusError):
+        bench.write(alice, 0, 100)
+    bench.wait(1000)
+    bench.write(bob, 0, 200)
+    # Bob keeps it when the others of the table change.
+    bench.device.permit({"bob", "carol"})
+    assert bench.device.lease.holder is bob.controller
+
+
+def test_events_carry_the_name_in_the_certificate() -> None:
+    bench = Bench()
+    alice = bench.connect("10.0.0.1", 1, certificate="alice")
+    bench.write(alice, 0, 100)
+    session = bench.device.session
+    assert session is not None
+    assert session.as_message().certificate == "alice"
+    bench.device.disconnect(alice, "left")
+    bench.wait(6000)
+    texts = {Event.Kind.Name(event.kind): event for event in bench.events}
+    for kind in ("SESSION_START", "SESSION_END"):
+        assert texts[kind].session_data.certificate == "alice"
+    for kind in ("LEASE_GRANTED", "LEASE_LOST"):
+        assert texts[kind].controller_data.certificate == "alice"
+        assert "10.0.0.1:1 (CN=alice)" in texts[kind].text
+
+
+def test_states_that_stop_are_an_event_and_their_return_is_one() -> None:
+    bench = Bench()
+
+    def run(duration_ms: int, *, states: bool) -> None:
+        for step in range(duration_ms // 20):
+            if states:
+                bench.state(step)
+            bench.wait(20)
+
+    run(100, states=True)
+    run(14_000, states=False)
+    assert bench.kinds() == ["STATE_LOST"]
+    assert bench.events[0].text.startswith("no states since ")
+    run(2_000, states=True)
+    assert bench.kinds() == ["STATE_LOST", "STATE_BACK"]
+    assert bench.events[1].text.endswith(" UTC, after 14.0 s")
+    assert bench.events[1].watchdog_data.silent_ns == pytest.approx(14_000 * MS, abs=40 * MS)

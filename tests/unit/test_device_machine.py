@@ -37,6 +37,12 @@ class Model:
     session_host: str | None = None
     host_change_ms: int = 0
     released_ms: int = 0
+    read_only: bool = False
+    """Whether [edge.tls.clients] is present: no client of this test has a certificate."""
+
+    @property
+    def refusal(self) -> bytes:
+        return b"\x01" if self.read_only else b"\x06"
 
     def pass_time(self) -> None:
         """Do everything that is due at this millisecond, in the order of the device."""
@@ -65,6 +71,8 @@ class Model:
 
     def write(self, client: Client, *items: int) -> bool:
         """Return whether a valid write of these registers and coils by this client is accepted."""
+        if self.read_only:
+            return False
         if self.holder not in (None, client.host):
             return False
         period_ms = self.timeout_ms or LEASE_MS
@@ -132,7 +140,7 @@ class DeviceMachine(RuleBasedStateMachine):
             assert reply == pdu[:5]
             assert list(self.bench.commands[-1].effort) == [_signed(word) / 1000 for word in self.model.torque]
         else:
-            assert reply == b"\x90\x06"
+            assert reply == b"\x90" + self.model.refusal
 
     @rule(data=st.data(), echo=WORD, timeout=st.sampled_from([0, 50, 100, 300, 10_000, 10_001]))
     @precondition(lambda self: self.clients)
@@ -145,7 +153,7 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.echo, self.model.timeout_ms = echo, timeout
             assert reply[0] == 16
         else:
-            assert reply == b"\x90\x06"
+            assert reply == b"\x90" + self.model.refusal
 
     @rule(data=st.data(), on=st.booleans())
     @precondition(lambda self: self.clients)
@@ -157,7 +165,7 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.magnet = on
             assert reply == pdu
         else:
-            assert reply == b"\x85\x06"
+            assert reply == b"\x85" + self.model.refusal
 
     @rule(data=st.data(), register=st.integers(0, 3), mask=WORD, more=WORD)
     @precondition(lambda self: self.clients)
@@ -169,7 +177,14 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.torque[register] = (self.model.torque[register] & mask) | (more & ~mask & 0xFFFF)
             assert reply == pdu
         else:
-            assert reply == b"\x96\x06"
+            assert reply == b"\x96" + self.model.refusal
+
+    @rule(read_only=st.booleans())
+    def permit(self, read_only: bool) -> None:
+        self.bench.device.permit({"alice"} if read_only else None)
+        self.model.read_only = read_only
+        if read_only and self.model.holder is not None:
+            self.model.release()
 
     @rule(data=st.data(), pdu=st.binary(min_size=1, max_size=20))
     @precondition(lambda self: self.clients)

@@ -1,22 +1,40 @@
 """Diagnosis: each rule finds its cause in a recording, and finds nothing without the cause."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from hilrig_replay.analysis.diagnosis import Finding
+from hilrig_replay.analysis.data_quality import Stalls
+from hilrig_replay.analysis.diagnosis import control_observations, timing_causes
+from hilrig_replay.analysis.diagnosis.diagnose import MAX_FINDINGS, diagnose
+from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, sections
+from hilrig_replay.analysis.feedback import rounding_gains
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.samples import SAMPLE_DTYPE
+from hilrig_replay.io.columns import COMMAND_DTYPE, CONNECTION_DTYPE, PART_DTYPE, STATE_DTYPE, TRAFFIC_DTYPE, Rows
+from hilrig_replay.io.disk_table import DiskTable
+from hilrig_replay.io.records import EVENT_DTYPE, Records
 from hilrig_replay.io.run import open_run
+from hilrig_runtime.config.task import PoseConfig
 from support.recordings import Script, make, record, write
+
+MS = 1_000_000
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:
     report = measure(open_run(record(folder / "run.mcap", script)))
-    return {finding.kind: finding for finding in report.findings}
+    return {finding.code: finding for finding in report.findings if finding.list == "timing"}
 
 
 def test_fast_controller_has_no_findings(tmp_path: Path) -> None:
-    assert findings(tmp_path, Script(seconds=12.0, poll_ms=5.0)) == {}
+    report = measure(open_run(record(tmp_path / "run.mcap", Script(seconds=12.0, poll_ms=5.0))))
+    assert report.findings == ()
+    assert sections(report.findings) == [("Timing causes", ["no cause found"]), ("Control observations", ["none"])]
 
 
 def test_finds_a_simulation_stall(tmp_path: Path) -> None:
@@ -24,6 +42,8 @@ def test_finds_a_simulation_stall(tmp_path: Path) -> None:
     assert found.evidence["stalls"] == 1
     assert found.evidence["longest_ms"] == pytest.approx(130, abs=1)
     assert found.evidence["at_s"] == pytest.approx(4.1, abs=0.05)
+    # The age grows to 130 ms once in 8 s.
+    assert found.gain_ms == pytest.approx(130**2 / 2 / 8000, rel=0.05)
 
 
 def test_finds_an_edge_stall(tmp_path: Path) -> None:
@@ -37,31 +57,40 @@ def test_finds_an_injected_delay(tmp_path: Path) -> None:
     assert found.evidence["mean_ms"] == pytest.approx(30.0)
 
 
-@pytest.mark.parametrize("poll_ms", [33.0, 100.0])
+@pytest.mark.parametrize("poll_ms", [33.0, 40.5, 100.0])
 def test_finds_polling_slower_than_the_step(tmp_path: Path, poll_ms: float) -> None:
     found = findings(tmp_path, Script(seconds=8.0, poll_ms=poll_ms))
+    assert set(found) == {"slow_polling"}
     assert found["slow_polling"].evidence["cycle_ms"] == pytest.approx(poll_ms, abs=0.5)
-    assert "slow_controller" not in found
+    assert found["slow_polling"].gain_ms == pytest.approx((poll_ms - 20) / 2, abs=1)
 
 
-def test_finds_a_slow_controller(tmp_path: Path) -> None:
-    found = findings(tmp_path, Script(seconds=8.0, delay_ms=60.0))["slow_controller"]
-    assert found.evidence["controller_ms"] == pytest.approx(60.8, abs=1)
+def test_constant_time_before_the_write_is_a_wait(tmp_path: Path) -> None:
+    found = findings(tmp_path, Script(seconds=8.0, poll_ms=0, delay_ms=60.0))
+    assert set(found) == {"wait_before_write"}
+    assert found["wait_before_write"].evidence["wait_ms"] == 60.0
 
 
-def test_controller_with_a_small_share_is_not_slow(tmp_path: Path) -> None:
-    assert "slow_controller" not in findings(tmp_path, Script(seconds=8.0, delay_ms=6.0))
+def test_time_before_a_wait_is_of_computing(tmp_path: Path) -> None:
+    found = findings(tmp_path, Script(seconds=8.0, poll_ms=70.0, delay_ms=50.0))
+    assert list(found) == ["computing_time", "slow_polling"]
+    assert found["computing_time"].evidence["computing_ms"] == pytest.approx(50.8, abs=1)
+
+
+def test_controller_with_a_small_share_is_no_cause(tmp_path: Path) -> None:
+    assert findings(tmp_path, Script(seconds=8.0, delay_ms=6.0)) == {}
 
 
 def test_finds_a_controller_that_reads_after_writing(tmp_path: Path) -> None:
-    found = findings(tmp_path, Script(seconds=12.0, poll_ms=100.0, order="write-read"))["slow_controller"]
-    assert "waits before the next write" in found.text
-    assert found.evidence["controller_ms"] == pytest.approx(99, abs=1)
+    found = findings(tmp_path, Script(seconds=12.0, poll_ms=100.0, order="write-read"))
+    assert set(found) == {"wait_before_write"}
+    assert found["wait_before_write"].evidence["wait_ms"] == pytest.approx(99, abs=1)
 
 
 @pytest.mark.parametrize("poll_ms", [19.6, 20.3])
 def test_finds_a_cycle_that_beats_with_the_step(tmp_path: Path, poll_ms: float) -> None:
-    found = findings(tmp_path, Script(seconds=12.0, poll_ms=poll_ms))["beating"]
+    script = Script(seconds=12.0, poll_ms=poll_ms, delay_ms=1.0)
+    found = findings(tmp_path, script)["beating"]
     expected_s = 0.02 / abs(poll_ms - 20.0) * poll_ms
     assert found.evidence["period_s"] == pytest.approx(expected_s, rel=0.1)
 
@@ -73,18 +102,23 @@ def test_other_cycles_do_not_beat(tmp_path: Path, poll_ms: float) -> None:
 
 @pytest.mark.parametrize("wait_ms", [40.5, 204.0])
 def test_finds_delayed_acknowledgments(tmp_path: Path, wait_ms: float) -> None:
-    found = findings(tmp_path, Script(seconds=12.0, poll_ms=0, delayed_ack_ms=wait_ms))["delayed_acknowledgement"]
-    assert found.evidence["wait_ms"] == pytest.approx(wait_ms, abs=2)
-    assert "TCP_NODELAY" in found.text
+    script = Script(seconds=12.0, poll_ms=0, delay_ms=wait_ms, delayed_ack_ms=wait_ms)
+    found = findings(tmp_path, script)
+    assert set(found) == {"delayed_acknowledgement"}
+    assert found["delayed_acknowledgement"].evidence["wait_ms"] == pytest.approx(wait_ms, abs=2)
+    assert "TCP_NODELAY" in found["delayed_acknowledgement"].remedy
 
 
 @pytest.mark.parametrize("poll_ms", [20.0, 40.0, 100.0])
 def test_finds_torques_based_on_the_previous_poll(tmp_path: Path, poll_ms: float) -> None:
-    found = findings(tmp_path, Script(seconds=20.0, poll_ms=poll_ms, law="feedback", feedback_delay_polls=1))[
-        "previous_poll"
-    ]
-    assert found.evidence["added_ms"] == pytest.approx(poll_ms, rel=0.05)
-    assert found.evidence["unexplained_previous"] < found.evidence["unexplained_newest"]
+    found = findings(tmp_path, Script(seconds=20.0, poll_ms=poll_ms, law="feedback", feedback_delay_polls=1))
+    assert found["previous_poll"].evidence["added_ms"] == pytest.approx(poll_ms, rel=0.05)
+    assert f"add one period of {poll_ms:.0f} ms" in found["previous_poll"].text
+
+
+def test_finds_torques_two_polls_behind(tmp_path: Path) -> None:
+    found = findings(tmp_path, Script(seconds=20.0, poll_ms=20.0, law="feedback", feedback_delay_polls=2))
+    assert found["previous_poll"].gain_ms == pytest.approx(40, rel=0.05)
 
 
 @pytest.mark.parametrize("poll_ms", [5.0, 20.0, 40.0, 100.0])
@@ -100,4 +134,124 @@ def test_accepts_commands_without_a_known_basis(tmp_path: Path, basis_step: int)
         if item.topic == "command" or (item.topic == "state" and item.message.basis_step):
             item.message.basis_step = basis_step
     report = measure(open_run(write(tmp_path / "run.mcap", made, script=script)))
-    assert "previous_poll" not in {finding.kind for finding in report.findings}
+    codes = [finding.code for finding in report.findings if finding.list == "timing"]
+    assert codes == (["open_loop"] if basis_step else [])
+
+
+def lossy(count: int, rtt_us: int) -> Evidence:
+    """Cycles of 20 ms with two pauses of 300 ms; `count` retransmissions are recorded at the first pause."""
+    commands = np.zeros(200, COMMAND_DTYPE)
+    at_ns = np.arange(200) * 20 * MS + np.where(np.arange(200) >= 50, 300 * MS, 0)
+    commands["wall_ns"] = commands["write_arrived_ns"] = commands["write_received_ns"] = at_ns + 1_000 * MS
+    commands["state_served_ns"] = commands["write_arrived_ns"] - 1 * MS
+    commands["basis_step"], commands["session"] = np.arange(1, 201), 1
+    tcp = np.zeros(4, CONNECTION_DTYPE)
+    tcp["wall_ns"], tcp["min_rtt_us"] = (np.arange(4) + 1) * 1_000 * MS, rtt_us
+    tcp["retransmissions"] = (0, count, count, count)
+    window = replace(EMPTY, commands=commands, connections=tcp)
+    return replace(evidence([window]), min_rtt_ns=rtt_us * 1e3)
+
+
+def test_finds_retransmissions_with_pauses() -> None:
+    found = timing_causes.retransmissions(lossy(3, 200))
+    assert found is not None
+    assert (found.evidence["retransmissions"], found.evidence["longest_ms"]) == (3, 320)
+    assert timing_causes.retransmissions(lossy(0, 200)) is None
+
+
+def test_pauses_far_from_a_retransmission_are_not_of_the_network() -> None:
+    apart = lossy(3, 200)
+    apart.windows[0].connections["wall_ns"] += 4_000 * MS
+    assert timing_causes.retransmissions(apart) is None
+
+
+def test_processor_time_that_was_taken_explains_the_stalls() -> None:
+    stalls = Stalls(2, 80 * MS, area_ns2=2 * (80.0 * MS) ** 2 / 2)
+    stalled = replace(evidence([]), stalls=stalls, edge_stalls=stalls)
+    assert timing_causes.cpu_steal(stalled) is None
+    assert timing_causes.cpu_steal(replace(stalled, stolen_ns=30 * MS)) is None
+    found = timing_causes.cpu_steal(replace(stalled, stolen_ns=90 * MS))
+    assert found is not None
+    assert found.evidence["stolen_ms"] == 90
+
+
+EMPTY = Records(
+    np.empty(0, STATE_DTYPE),
+    np.empty(0, COMMAND_DTYPE),
+    np.empty(0, EVENT_DTYPE),
+    np.empty(0, TRAFFIC_DTYPE),
+    np.empty(0, PART_DTYPE),
+    np.empty(0, CONNECTION_DTYPE),
+)
+
+
+def evidence(windows: list[Records], samples: Rows | None = None) -> Evidence:
+    table = DiskTable(SAMPLE_DTYPE)
+    table.add(np.empty(0, SAMPLE_DTYPE) if samples is None else samples)
+    gains = rounding_gains((window.states, window.commands) for window in windows)
+    return Evidence(20 * MS, table, windows, 10.0, gains=gains)
+
+
+SIZES = st.sampled_from((0, 1, 2, 3, 17, 40, 300))
+SCALES: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {
+    "regular": lambda random, size: np.arange(size) * 20 * MS + random.integers(0, MS, size),
+    "equal": lambda random, size: np.full(size, random.integers(0, 1 << 40)),
+    "any order": lambda random, size: random.integers(-(1 << 50), 1 << 50, size),
+    "small": lambda random, size: random.integers(0, 3, size),
+}
+
+
+def rows(dtype: np.dtype, size: int, random: np.random.Generator, scale: str) -> Rows:
+    """Rows with random values of a kind in each field."""
+    made = np.zeros(size, dtype)
+    for name in dtype.names or ():
+        values = SCALES[scale](random, size)
+        field = dtype[name].base
+        if field == np.float64:
+            shape = made[name].shape
+            made[name] = random.choice((0.0, 1.0, 32.767)) * random.normal(size=shape) + random.choice((0.0, 5.0))
+        elif field == np.bool_:
+            made[name] = random.random(size) < random.choice((0.0, 0.5, 1.0))
+        else:
+            made[name] = values.astype(field) if field.kind == "i" else np.abs(values).astype(field)
+    return made
+
+
+@given(
+    sizes=st.tuples(SIZES, SIZES, SIZES, SIZES),
+    count=st.integers(0, 2),
+    samples=SIZES,
+    seed=st.integers(0, 2**32),
+    scale=st.sampled_from(sorted(SCALES)),
+)
+@settings(max_examples=120)
+def test_each_rule_is_a_total_function_of_rows(
+    sizes: tuple[int, ...], count: int, samples: int, seed: int, scale: str
+) -> None:
+    random = np.random.default_rng(seed)
+    dtypes = (STATE_DTYPE, COMMAND_DTYPE, TRAFFIC_DTYPE, CONNECTION_DTYPE)
+    windows = []
+    for _ in range(count):
+        states, commands, traffic, connections = (
+            rows(dtype, size, random, scale) for dtype, size in zip(dtypes, sizes, strict=True)
+        )
+        windows.append(replace(EMPTY, states=states, commands=commands, traffic=traffic, connections=connections))
+    poses = (PoseConfig(name="p", position_mm=(300.0, 0.0, 50.0)),)
+    given_rows = replace(evidence(windows, rows(SAMPLE_DTYPE, samples, random, scale)), poses=poses, watchdog_gaps=1)
+    found = [finding for rule in timing_causes.RULES if (finding := rule(given_rows)) is not None]
+    for observe in control_observations.OBSERVATIONS:
+        found += observe(given_rows, found)
+    for finding in found:
+        assert finding.sentence()
+        assert np.isfinite([*finding.evidence.values(), finding.gain_ms or 0.0]).all(), finding
+        assert finding.list == "control" or 0.0 <= finding.evidence["share"] <= 1.0, finding
+    chosen = diagnose(given_rows)
+    for name in ("timing", "control"):
+        assert sum(finding.list == name for finding in chosen) <= MAX_FINDINGS
+
+
+def test_names_and_suppressions_are_rules() -> None:
+    names = {rule.__name__ for rule in timing_causes.RULES}
+    assert set(timing_causes.SUPPRESSED) <= names
+    assert frozenset().union(*timing_causes.SUPPRESSED.values()) <= names
+    assert names >= timing_causes.RARE

@@ -1,14 +1,16 @@
 """Duplicate instances: the older one keeps running, the other one stops with the reason; clock offsets of hosts."""
 
 import threading
+import time
 
 import pytest
 
+from hilrig_runtime.bus.api import Reply
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.errors import InputError, OperationError
-from hilrig_runtime.process.discovery import ClockOffset, conflict, list_services, worst_offset
+from hilrig_runtime.process.discovery import ClockOffset, conflict, list_services, offset_of, worst_offset
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.clock import ManualClock
 from hilrig_schemas import Health, ServiceInfo
@@ -16,6 +18,7 @@ from hilrig_schemas.topics import HEALTH, SERVICE_INFO, alive_key
 from support.waiting import eventually
 
 LAB = parse_lab("[rigs]\ncount = 6\n")
+SECOND = 1_000_000_000
 
 
 def info(service: str = "edge", instance: str = "1", age: int = 5, rigs: tuple[str, ...] = ("rig1",)) -> ServiceInfo:
@@ -45,20 +48,40 @@ def test_one_of_two_equally_old_services_keeps_running() -> None:
     assert bool(conflict(one, [other])) != bool(conflict(other, [one]))
 
 
+def replied(service: str, wall_ns: int, round_trip_ns: int) -> ClockOffset:
+    """Offset of a service, from a reply that arrived when this host's wall clock was 1,000 s."""
+    found = info(service)
+    found.wall_ns = wall_ns
+    arrived_ns = time.monotonic_ns() - 3 * SECOND
+    reply = Reply("key", b"", arrived_ns=arrived_ns, round_trip_ns=round_trip_ns)
+    # The reply is evaluated later than it arrived: the query waits for other services.
+    return offset_of(found, reply, lambda: 1_000 * SECOND + time.monotonic_ns() - arrived_ns)
+
+
+def test_offset_is_from_the_times_of_its_own_reply() -> None:
+    exact = replied("sim", 1_000 * SECOND - 5_000_000, 10_000_000)
+    assert abs(exact.offset_ns) < 1_000_000
+    assert 5_000_000 <= exact.uncertainty_ns < 6_000_000
+    behind = replied("sim", 999 * SECOND, 10_000_000)
+    assert abs(behind.offset_ns + 995_000_000) < 1_000_000
+
+
 def test_largest_clock_offset_is_reported() -> None:
-    near, far = info("sim"), info("recorder")
-    near.wall_ns, far.wall_ns = 1_010, 400
-    assert worst_offset([(near, 20), (far, 20)], 1, 1_000) == ClockOffset("recorder/1", -610, 10)
-    assert worst_offset([(near, 20)], near.incarnation, 1_000) == ClockOffset()
+    near, far = ClockOffset("sim/1", 10, 20), ClockOffset("recorder/1", -610, 10)
+    assert worst_offset([near, far]) == far
+    assert worst_offset([]) == ClockOffset()
 
 
 def test_late_reply_does_not_hide_an_offset() -> None:
-    # The reply of the simulation took 3 s, of which its clock read the middle: no offset beyond its uncertainty.
-    late, ahead = info("sim"), info("recorder")
-    late.wall_ns, ahead.wall_ns = 2_500_000_000, 80_000_000
-    offset = worst_offset([(late, 3_000_000_000), (ahead, 2_000_000)], 1, 0)
-    assert offset == ClockOffset("recorder/1", 79_000_000, 1_000_000)
-    assert worst_offset([(late, 3_000_000_000)], 1, 0).certain_ns == 0
+    # The reply of the simulation took 3 s: no offset beyond its uncertainty.
+    late, ahead = (
+        replied("sim", 1_000 * SECOND, 3 * SECOND),
+        replied("recorder", 1_000 * SECOND + 80_000_000, 2_000_000),
+    )
+    assert late.certain_ns == 0
+    assert worst_offset([late, ahead]) == ahead
+    # Of several without an offset, the one that is known best.
+    assert worst_offset([late, ClockOffset("edge/1", 1, 2)]).peer == "edge/1"
 
 
 def service(hub: MemoryHub, instance: str, rigs: tuple[str, ...], wall_ns: int) -> Service:
@@ -176,7 +199,9 @@ def test_health_report_contains_clock_offset() -> None:
         one.ready()
         other.ready()
         other.health.report(0)
-    assert (heard[0].clock_peer, heard[0].clock_offset_ns) == ("edge/1", -700_000_000_000)
+    assert heard[0].clock_peer == "edge/1"
+    assert abs(heard[0].clock_offset_ns + 700_000_000_000) < 1_000_000_000
+    assert heard[0].clock_uncertainty_ns > 0
 
 
 def test_lost_and_returned_peers_are_logged(caplog: pytest.LogCaptureFixture) -> None:

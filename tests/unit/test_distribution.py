@@ -84,8 +84,3 @@ def test_ccdf_is_the_share_of_values_not_below(kind: str) -> None:
 def test_ccdf_of_equal_values_is_a_point() -> None:
     at, share = complementary_cdf(in_blocks(samples("same", 10), 3))
     assert (at.tolist(), share.tolist()) == ([12_500_000.0], [1.0])
-
-
-def test_values_of_seconds_fit_their_column() -> None:
-    statistics = Statistics(0.5, 20.0, 999.9994, 1000.0, 26019.94, 1234.5, 7498.4)
-    assert statistics.cells() == ["0.500", "20.000", "999.999", "1000", "26020", "1234", "7498"]

@@ -11,6 +11,7 @@ import pytest
 from hilrig_cli.doctor import CheckResult, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
 from hilrig_runtime.config.lab import LabConfig, parse_lab
+from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
 from hilrig_schemas import Health
@@ -197,7 +198,7 @@ def snapshot(*names: str, **fields: object) -> services.BusSnapshot:
     for name in names:
         service, _, instance = name.partition("/")
         report = {"software_version": "1.2.3", "wall_ns": 10**18} | fields
-        made.healths[name] = Health(service=service, instance=instance, **report), 10**18  # type: ignore[arg-type]
+        made.healths[name] = Health(service=service, instance=instance, **report)  # type: ignore[arg-type]
     return made
 
 
@@ -212,7 +213,7 @@ def test_missing_silent_or_alerting_service_is_an_error() -> None:
     del silent.healths["edge/1"]
     assert "edge/1: alive, but sends no health reports" in only_error(services.check_services(lab, silent))
     alerting = snapshot(*ALL_SERVICES)
-    alerting.healths["recorder/1"][0].alert = "the disk is full"
+    alerting.healths["recorder/1"].alert = "the disk is full"
     assert "recorder/1: the disk is full" in only_error(services.check_services(lab, alerting))
     assert by_level(services.check_services(lab, snapshot()))[Level.WARNING] == ["no service of lab 'lab' is running"]
 
@@ -222,8 +223,8 @@ def test_denied_realtime_policy_is_a_warning_with_a_fix() -> None:
     [granted] = services.check_realtime(lab, snapshot(*ALL_SERVICES, realtime_priority=1))
     assert (granted.level, granted.text) == (Level.OK, "granted to edge/1 (priority 1), sim/1 (priority 1)")
     refused = snapshot("sim/1", "edge/1", realtime_priority=2)
-    refused.healths["edge/1"][0].realtime_priority = 0
-    refused.healths["edge/1"][0].host = "left"
+    refused.healths["edge/1"].realtime_priority = 0
+    refused.healths["edge/1"].host = "left"
     [result] = services.check_realtime(lab, refused)
     assert result.level is Level.WARNING
     assert "edge/1 on left: real-time policy not granted" in result.text
@@ -265,11 +266,20 @@ def test_incompatible_version_is_an_error() -> None:
     ("offset_s", "level"), [(0.02, Level.OK), (-5.0, Level.WARNING), (5.0, Level.WARNING), (7200.0, Level.ERROR)]
 )
 def test_level_of_the_clock_check_depends_on_the_offset(offset_s: float, level: Level) -> None:
-    report = Health(service="sim", instance="1", host="left", wall_ns=round(1e18 + offset_s * 1e9))
-    [result] = services.check_clocks([(report, 10**18)])
+    near = ("edge/1 on right", ClockOffset("edge/1", 9_000_000_000, 9_000_000_000))
+    far = ("sim/1 on left", ClockOffset("sim/1", round(offset_s * 1e9), 500_000_000))
+    [result] = services.check_clocks([near, far])
     assert result.level is level
     if level is not Level.OK:
-        assert f"sim/1 on left is {abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'}" in result.text
+        where = "ahead of" if offset_s > 0 else "behind"
+        assert f"sim/1 on left is {abs(offset_s):.1f} ± 0.5 s {where} this" in result.text
+
+
+def test_offset_within_its_uncertainty_is_no_finding() -> None:
+    """The reply of a host took 140 s, because a service or link was stopped."""
+    clocks = [("sim/1 on left", ClockOffset("sim/1", 69_000_000_000, 70_000_000_000))]
+    assert [result.level for result in services.check_clocks(clocks)] == [Level.OK]
+    assert list(services.check_clocks([])) == []
 
 
 def test_missing_router_is_an_error_of_the_bus() -> None:

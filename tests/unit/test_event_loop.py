@@ -146,20 +146,16 @@ def test_asyncio_sockets_are_served_during_a_flood() -> None:
         assert flood.served > 1
 
 
-class Protocol(asyncio.BufferedProtocol):
+class Protocol(asyncio.Protocol):
     """Keeps received bytes; raises at the byte `!`."""
 
     def __init__(self) -> None:
-        self.buffer = bytearray(64)
         self.received = b""
         self.paused = False
         self.lost: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
 
-    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002
-        return self.buffer
-
-    def buffer_updated(self, nbytes: int) -> None:
-        self.received += bytes(self.buffer[:nbytes])
+    def data_received(self, data: bytes) -> None:
+        self.received += data
         if b"!" in self.received:
             raise ValueError("a fault in the protocol")
 

@@ -1,5 +1,6 @@
 """`lab.toml`: defaults, and errors with the place, the accepted value and the value found."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -97,6 +98,41 @@ def test_all_errors_are_reported_at_once() -> None:
     with pytest.raises(InputError) as caught:
         parse_lab("[sim]\nstep = 1\n[edge]\nhots = 2\n")
     assert len(str(caught.value).splitlines()) == 2
+
+
+TLS = "[edge.tls]\ncertificate = 'edge.pem'\nkey = 'edge.key'\nauthority = 'ca.pem'\n[edge.tls.clients]\n"
+
+
+def test_every_mistake_in_the_clients_is_reported() -> None:
+    clients = (
+        'alice = ["rig1"]\nAlice = ["*"]\n"CN=bob" = ["rig1"]\n"" = ["rig1"]\nnone = []\nall = ["*", "rig1"]\n'
+        'twice = ["rig1", "rig1"]\nplc7 = ["rig7", "rig8"]\n'
+    )
+    with pytest.raises(InputError) as caught:
+        parse_lab(TLS + clients)
+    found = str(caught.value).splitlines()
+    assert all(line.startswith("lab.toml: edge.tls.clients.") for line in found)
+    expected = [
+        r"alice: duplicate name",
+        r"Alice: duplicate name",
+        r"CN=bob: must be the common name .* without CN=",
+        r": must be the common name",
+        r"none: must have at least one rig",
+        r'all: "\*" is every rig',
+        r"twice: duplicate rig 'rig1'",
+        r"plc7: unknown rig 'rig7'",
+        r"plc7: unknown rig 'rig8'",
+    ]
+    assert len(found) == len(expected)
+    for line, text in zip(found, expected, strict=True):
+        assert re.match(rf"lab\.toml: edge\.tls\.clients\.{text}", line), line
+
+
+def test_clients_write_to_the_rigs_of_their_lists() -> None:
+    tls = parse_lab(TLS + 'alice = ["rig1"]\nplc7 = ["*"]\n').edge.tls
+    assert tls is not None
+    assert (tls.writers_of("rig1"), tls.writers_of("added")) == ({"alice", "plc7"}, {"plc7"})
+    assert parse_lab(TLS.removesuffix("[edge.tls.clients]\n")).edge.tls.writers_of("rig1") is None
 
 
 def test_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:

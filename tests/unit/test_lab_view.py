@@ -1,16 +1,12 @@
 """Status of a lab: `LabView` combines health reports; `hilrig top` and the Prometheus exporter show it."""
 
 import re
-import threading
-import urllib.error
-import urllib.request
-from contextlib import closing
 
 import pytest
 
 from hilrig_cli.commands.top import render
 from hilrig_monitoring.lab_view import SILENT_AFTER_S, WINDOW_S, LabView
-from hilrig_monitoring.prometheus import exposition, metrics_server
+from hilrig_monitoring.prometheus import exposition
 from hilrig_schemas import Health, RigReport
 
 
@@ -168,16 +164,3 @@ def test_silent_service_keeps_its_counters_only() -> None:
     assert f"hilrig_up{labels} 0\n" in later
     assert f"hilrig_overruns_total{labels} 3\n" in later
     assert f"hilrig_lateness_p99_seconds{labels}" not in later
-
-
-def test_metrics_are_served_at_one_path_only() -> None:
-    with metrics_server(("127.0.0.1", 0), lambda: "a 1\n") as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        address = f"http://127.0.0.1:{server.server_port}"
-        with closing(urllib.request.urlopen(f"{address}/metrics", timeout=5)) as answer:
-            assert (answer.read(), answer.headers["Content-Type"].split(";")[0]) == (b"a 1\n", "text/plain")
-        with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(f"{address}/", timeout=5)
-        server.shutdown()
-        thread.join(5)

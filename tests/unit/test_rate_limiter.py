@@ -27,12 +27,15 @@ def test_remainder_is_due_when_the_period_ends() -> None:
     assert list(limiter.pop_remainders(200)) == [(("lease", "session 1"), 1)]
 
 
-def test_oldest_key_is_forgotten_beyond_the_capacity() -> None:
+def test_reports_of_all_keys_are_limited() -> None:
+    """The addresses of a flood may all differ."""
     limiter: RateLimiter[int] = RateLimiter(PERIOD, keys=3)
-    for key in range(4):
-        assert limiter.record(key, key) == 1
-    assert [limiter.record(key, 10) for key in (3, 2, 1)] == [0, 0, 0]
-    assert limiter.record(0, 10) == 1
+    assert [limiter.record(key, key) for key in range(5)] == [1, 1, 1, 0, 0]
+    assert [limiter.record(key, 10) for key in (2, 1, 0)] == [0, 0, 0]
+    # The first report is a period old: its key gives way.
+    assert limiter.record(4, PERIOD) == 1
+    assert [limiter.record(key, PERIOD) for key in (3, 0)] == [0, 0]
+    assert limiter.record(1, PERIOD + 1) == 2
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 80), st.booleans()), max_size=60))

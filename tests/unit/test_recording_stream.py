@@ -7,6 +7,7 @@ from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.messaging.recording_stream import (
+    EVENTS_PERIOD_NS,
     FLUSH_PERIOD_NS,
     SESSIONS_PERIOD_NS,
     RecordingStream,
@@ -25,7 +26,7 @@ class Collecting(Publisher):
 
 def test_entries_leave_in_order_with_their_bytes_untouched() -> None:
     out = Collecting()
-    log = RecordingStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, out, "sim/1", incarnation=7)
     for number in range(3):
         log.append("hil/lab/rig1/state", number + 1, 100 + number, bytes([number, 255]))
     log.flush(0)
@@ -42,7 +43,7 @@ def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
     sent: list[bytes] = []
     out = Collecting()
     out.put = sent.append
-    log = RecordingStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, out, "sim/1", incarnation=7)
     log.append("hil/lab/rig1/state", 1, 100, b"payload")
     log.flush(0)
     (payload,) = sent
@@ -55,7 +56,7 @@ def test_a_batch_has_a_checksum_and_any_changed_byte_is_found() -> None:
 
 def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
     out = Collecting()
-    log = RecordingStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, out, "sim/1", incarnation=7)
     log.flush(0)
     for _ in range(2):
         log.append("k", 1, 0, b"")
@@ -65,7 +66,7 @@ def test_batches_are_numbered_and_an_empty_one_is_not_sent() -> None:
 
 def test_a_flush_is_due_once_a_period() -> None:
     out = Collecting()
-    log = RecordingStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, out, "sim/1", incarnation=7)
     for now in (1_000, 2_000, FLUSH_PERIOD_NS - 1_000, FLUSH_PERIOD_NS, FLUSH_PERIOD_NS + 1_000):
         log.append("k", 1, 0, b"")
         log.flush_if_due(now)
@@ -74,7 +75,7 @@ def test_a_flush_is_due_once_a_period() -> None:
 
 def test_open_sessions_are_sent_at_once_and_repeated() -> None:
     out = Collecting()
-    log = RecordingStream(out, "edge/1", incarnation=7)
+    log = RecordingStream(out, out, "edge/1", incarnation=7)
     log.set_sessions([OpenSession(rig="rig1", session="s1")])
     log.flush(10)
     log.flush(20)
@@ -87,7 +88,7 @@ def test_open_sessions_are_sent_at_once_and_repeated() -> None:
 
 def test_jittering_loop_sends_a_batch_each_turn() -> None:
     out = Collecting()
-    log = RecordingStream(out, "sim/1", incarnation=7)
+    log = RecordingStream(out, out, "sim/1", incarnation=7)
     jitter = random.Random(1)
     for turn in range(200):
         log.append("hil/lab/rig1/state", turn + 1, turn, b"")
@@ -98,6 +99,29 @@ def test_jittering_loop_sends_a_batch_each_turn() -> None:
         log.append("hil/lab/rig1/state", 201 + turn, turn, b"")
         log.flush_if_due((4_000 + turn) * 1_000_000)
     assert len(out.batches) <= 402
+
+
+def test_events_are_published_after_the_messages_before_them() -> None:
+    out, events = Collecting(), Collecting()
+    log = RecordingStream(out, events, "sim/1", incarnation=7)
+    log.append("hil/lab/rig1/state", 1, 100, b"")
+    log.events.append("hil/lab/rig1/event", 1, 100, b"zero torque")
+    log.flush_if_due(0)
+    assert [(batch.sequence, batch.events, list(batch.keys)) for batch in out.batches + events.batches] == [
+        (1, False, ["hil/lab/rig1/state"]),
+        (1, True, ["hil/lab/rig1/event"]),
+    ]
+
+
+def test_many_events_share_a_batch() -> None:
+    events = Collecting()
+    log = RecordingStream(Collecting(), events, "sim/1", incarnation=7)
+    for number in range(20):
+        log.events.append("hil/lab/rig1/event", number + 1, 100, b"")
+        log.flush_if_due(number * FLUSH_PERIOD_NS)
+    assert [len(batch.keys) for batch in events.batches] == [1, EVENTS_PERIOD_NS // FLUSH_PERIOD_NS]
+    log.flush(0)
+    assert sum(len(batch.keys) for batch in events.batches) == 20
 
 
 def test_a_few_rigs_are_kept_for_long_and_many_for_ten_seconds() -> None:

@@ -255,7 +255,7 @@ def test_report_is_a_self_contained_page(tmp_path: Path) -> None:
         "Not valid for latency measurements",
     ):
         assert expected in page.text, expected
-    assert "between reading the positions and writing the torques" in page.text
+    assert "the program waits 40 ms between read and write" in page.text
 
 
 def test_group_report_ranks_the_runs(tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ class FakeStore:
     flush: Callable[[], None] = lambda: None
     files: list[FakeFile] = field(default_factory=list)
     rejected: list[str] = field(default_factory=list)
+    outages: list[tuple[str, list[str]]] = field(default_factory=list)
     losses: list[tuple[str, int, int]] = field(default_factory=list)
     sources: list[tuple[str, int]] = field(default_factory=list)
     accepts: bool = True
@@ -89,6 +90,10 @@ class FakeStore:
 
     def record_source(self, _recording: Recording, source: str, incarnation: int) -> None:
         self.sources.append((source, incarnation))
+
+    def report_outage(self, recordings: Sequence[Recording], text: str, *, has_ended: bool) -> None:
+        assert has_ended == ("again" in text)
+        self.outages.append((text.partition(" since")[0], [recording.rig for recording in recordings]))
 
     def report_rejected(self, message: str) -> None:
         self.rejected.append(message)
@@ -370,6 +375,104 @@ def test_gap_within_the_preroll_is_counted(waited: int, set_back: int, counted: 
     bench.states(50 * waited)
     bench.start()
     assert bench.file.recording.counters.lost_transport == counted
+
+
+def test_lost_batches_before_a_session_resumes_are_counted() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(2)
+    bench.wait(OWNER_TIMEOUT_NS + SECOND)
+    assert bench.file.end == "keeper lost"
+    for source in (bench.sim, bench.edge):
+        for _ in range(7):
+            source.command("rig1", bench.wall)
+            source.batch()
+    bench.states(1)
+    bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+    assert [file.recording.counters.lost_batches for file in bench.store.files] == [0, 14]
+    assert bench.tracker.lost_batches == {"sim/1": 7, "edge/1": 7}
+
+
+def test_stream_that_stops_and_returns_is_reported() -> None:
+    bench = TrackerBench()
+    bench.states(100)
+    bench.wait(3 * SECOND)
+    assert bench.store.outages == [], "no recording is concerned"
+    bench.states(100)
+    bench.start()
+    for _ in range(20):
+        bench.wait(500 * MS)
+        bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+    bench.states(600)
+    assert bench.store.outages == [
+        ("no messages of sim/1", ["rig1"]),
+        ("no messages of edge/1", ["rig1"]),
+        ("messages of sim/1 received again", ["rig1"]),
+    ]
+
+
+def test_event_of_a_long_outage_is_recorded() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.states(2)
+    for _ in range(7):
+        bench.sim.state("rig1", bench.wall)
+        bench.sim.batch()
+    lost = bench.sim.put(EVENT, "rig1", Event(rig="rig1", session="s1", kind=Event.COMMAND_LOST), bench.wall)
+    bench.accept(bench.sim.events())
+    bench.states(1)
+    assert bench.file.payloads[-2:] == [bench.sim.sent[-1].payload, lost.payload]
+    assert bench.store.losses == [(STATE.key(LAB, "rig1"), 7, 0)]
+
+
+def test_events_wait_for_the_messages_before_them() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.edge.command("rig1", bench.wall)
+    last = bench.edge.batch()
+    bench.edge.end("rig1", "s1", bench.wall)
+    bench.accept(bench.edge.events())
+    assert bench.file.recording.end_wall_ns is None
+    bench.accept(last)
+    assert bench.file.recording.end_wall_ns == bench.wall
+
+
+def test_stream_has_passed_its_last_event() -> None:
+    bench = TrackerBench()
+    bench.start()
+    bench.wait(10 * MS)
+    bench.edge.end("rig1", "s1", bench.wall)
+    bench.accept(bench.edge.events())
+    bench.wait(300 * MS)
+    assert bench.file.end == "ended"
+
+
+def test_lost_event_is_stated() -> None:
+    bench = TrackerBench()
+    bench.states(1)
+    for number in range(3):
+        bench.edge.put(EVENT, "rig1", Event(rig="rig1", session="s1", kind=Event.RESET), bench.wall)
+        batch = bench.edge.events()
+        if number != 1:
+            bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+            bench.accept(batch)
+    assert bench.store.losses == [(EVENT.key(LAB, "rig1"), 1, 0)]
+
+
+def test_restarted_recorder_takes_old_events_of_open_sessions() -> None:
+    bench = TrackerBench()
+    for session in ("s0", "s1"):
+        bench.edge.start("rig1", session, bench.wall)
+        bench.edge.batch()
+        lost = bench.sim.put(EVENT, "rig1", Event(rig="rig1", session=session, kind=Event.COMMAND_LOST), bench.wall)
+        bench.accept(bench.sim.events())
+        bench.sim.batch()
+    bench.sim.batch()
+    bench.states(1)
+    assert bench.store.files == [], "an old event opens no file"
+    bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+    assert bench.file.payloads[0] == lost.payload
+    assert len(bench.file.payloads) == 2
 
 
 def test_gap_before_first_message_after_a_restart_is_counted() -> None:

@@ -159,6 +159,16 @@ def test_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
     assert rig.service.counters.overruns == 1
 
 
+def test_long_stall_is_an_event_of_each_rig() -> None:
+    with VirtualRig(LabConfig(rigs=(RigSettings(name="rig1"), RigSettings(name="rig2")))) as rig:
+        rig.tick(3)
+        rig.clock.advance(14_000_000_000)
+        rig.tick()
+        stalls = [event for event in rig.events if event.kind == Event.OVERRUN]
+        assert sorted(event.rig for event in stalls) == ["rig1", "rig2"]
+        assert {event.overrun_data.missed_steps for event in stalls} == {rig.states[-1].missed_steps}
+
+
 def test_burst_of_overruns_is_reported_together(rig: VirtualRig) -> None:
     for _ in range(30):
         rig.clock.advance(50_000_000)

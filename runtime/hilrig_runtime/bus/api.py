@@ -17,8 +17,6 @@ CACHE_DEPTH: Final = 500
 
 OnMessage = Callable[[str, bytes], None]
 """Called with the key and the payload of each message."""
-OnLoss = Callable[[str, int], None]
-"""Called with the key and the number of messages that can't be recovered."""
 OnLiveliness = Callable[[str, bool], None]
 """Called with a token's key, and whether it appeared (True) or disappeared (False)."""
 
@@ -60,6 +58,8 @@ class Reply:
     payload: bytes
     error: str = ""
     """Human-readable reason of a failure; empty: success."""
+    arrived_ns: int = 0
+    """Arrival of this reply, ns, monotonic clock of the system."""
     round_trip_ns: int = 0
     """Time from the query to the arrival of this reply, ns."""
 
@@ -86,13 +86,11 @@ class Bus(Handle):
         """
 
     @abstractmethod
-    def subscribe_recording(
-        self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
-    ) -> Handle:
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, cache_depth: int = CACHE_DEPTH) -> Handle:
         """Receive `Traffic.RECORDING` completely and in order, including messages published shortly before.
 
         Messages lost in an outage of the link are fetched from the publisher's cache, which has the newest
-        `cache_depth` messages; `on_loss` gets the key and the number of those that can't be recovered.
+        `cache_depth` messages. Those that can't be recovered are skipped: the receiver finds them by their numbers.
         """
 
     @abstractmethod

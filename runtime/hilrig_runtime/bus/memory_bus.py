@@ -1,11 +1,12 @@
 """The bus within one process, for tests and simulated time; delivery is synchronous and complete."""
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnMessage, Publisher, Reply
 from hilrig_runtime.errors import HilrigError
 from hilrig_schemas.topics import Traffic
 
@@ -90,7 +91,6 @@ class MemoryBus(Bus):
         self,
         key_expr: str,
         on_message: OnMessage,
-        on_loss: OnLoss,  # noqa: ARG002
         cache_depth: int = CACHE_DEPTH,  # noqa: ARG002
     ) -> Handle:
         """See `Bus.subscribe_recording`; nothing is lost."""
@@ -111,7 +111,10 @@ class MemoryBus(Bus):
         for key, handler in list(self.hub.queryables):
             if matches(key_expr, key):
                 try:
-                    replies.append(Reply(key, handler(payload)))
+                    sent_ns = time.monotonic_ns()
+                    content = handler(payload)
+                    now_ns = time.monotonic_ns()
+                    replies.append(Reply(key, content, arrived_ns=now_ns, round_trip_ns=now_ns - sent_ns))
                 except HilrigError as error:
                     replies.append(Reply(key, b"", str(error)))
         return replies

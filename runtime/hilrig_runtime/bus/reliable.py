@@ -17,7 +17,7 @@ from typing import Any, Final
 import zenoh
 import zenoh.ext
 
-from hilrig_runtime.bus.api import Handle, OnLoss, OnMessage
+from hilrig_runtime.bus.api import Handle, OnMessage
 from hilrig_runtime.bus.reorder_buffer import ReorderBuffer
 
 FETCH_PAGE_BYTES: Final = 256 * 1024
@@ -79,19 +79,15 @@ class _Source:
 
 
 class ReliableSubscriber(Handle):
-    """Subscribes to the recording publishers on `key_expr`; delivers the messages of each in order and without gaps.
+    """Subscribes to the recording publishers on `key_expr`; delivers the messages of each in order.
 
-    `on_loss` gets the key and the number of messages of a publisher that could not be recovered; each caches
-    `cache_depth`.
+    A gap remains only if its messages could not be recovered; each publisher caches `cache_depth` messages.
     """
 
-    def __init__(
-        self, session: zenoh.Session, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int
-    ) -> None:
+    def __init__(self, session: zenoh.Session, key_expr: str, on_message: OnMessage, cache_depth: int) -> None:
         self._session = session
         self._cache_depth = cache_depth
         self._on_message = on_message
-        self._on_loss = on_loss
         self._changed = threading.Condition()
         self._closing = False
         self._sources: dict[str, _Source] = {}
@@ -151,7 +147,7 @@ class ReliableSubscriber(Handle):
         source = self._sources.get(cache)
         if source is None:
             samples: ReorderBuffer[zenoh.Sample] = ReorderBuffer(
-                self._deliver, partial(self._on_loss, cache.partition("/@adv/")[0]), self._cache_depth
+                self._deliver, partial(logger.debug, "%s: %d samples lost", cache), self._cache_depth
             )
             source = self._sources[cache] = _Source(cache, samples)
         return source

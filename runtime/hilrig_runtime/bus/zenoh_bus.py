@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import zenoh
 
-from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnLoss, OnMessage, Publisher, Reply
+from hilrig_runtime.bus.api import CACHE_DEPTH, Bus, Handle, OnLiveliness, OnMessage, Publisher, Reply
 from hilrig_runtime.bus.reliable import ReliableSubscriber, declare_recording_publisher
 from hilrig_runtime.bus.zenoh_config import (
     FIRST_INSTANCE,
@@ -119,11 +119,9 @@ class ZenohBus(Bus):
         """See `Bus.subscribe_newest`."""
         return _NewestReader(self.session, key_expr, on_message, depth)
 
-    def subscribe_recording(
-        self, key_expr: str, on_message: OnMessage, on_loss: OnLoss, cache_depth: int = CACHE_DEPTH
-    ) -> Handle:
+    def subscribe_recording(self, key_expr: str, on_message: OnMessage, cache_depth: int = CACHE_DEPTH) -> Handle:
         """See `Bus.subscribe_recording`."""
-        return ReliableSubscriber(self.session, key_expr, on_message, on_loss, cache_depth)
+        return ReliableSubscriber(self.session, key_expr, on_message, cache_depth)
 
     def declare_queryable(self, key: str, handler: Callable[[bytes], bytes]) -> Handle:
         """See `Bus.declare_queryable`."""
@@ -144,10 +142,20 @@ class ZenohBus(Bus):
         """See `Bus.query`."""
         replies = []
         sent_ns = time.monotonic_ns()
-        for reply in self.session.get(key_expr, payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL):
+        # Without consolidation, each reply is delivered when it arrives. Otherwise zenoh keeps it back until all have
+        # arrived or the time is over, which a stopped service prolongs for all others.
+        found = self.session.get(
+            key_expr,
+            payload=payload,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        for reply in found:
             if reply.ok is not None:
-                round_trip_ns = time.monotonic_ns() - sent_ns
-                replies.append(Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), round_trip_ns=round_trip_ns))
+                now_ns = time.monotonic_ns()
+                key, content = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+                replies.append(Reply(key, content, arrived_ns=now_ns, round_trip_ns=now_ns - sent_ns))
             elif reply.err is not None:
                 text = reply.err.payload.to_bytes().decode(errors="replace")
                 # zenoh reports a query without a reply as an error of its own.

@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from hilrig_runtime.config.bus import BusConfig
+from hilrig_runtime.config.controller import ClientConfig, ControllerAddress, RegistersConfig, parse_controller
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.config.scene import SceneConfig
 from hilrig_runtime.config.task import TaskConfig
@@ -87,21 +89,6 @@ class SimConfig(Section):
         return round(self.command_timeout_ms * 1e6)
 
 
-class TlsConfig(Section):
-    """Modbus/TCP Security: each rig listens on a second port with mutual TLS (`hilrig certs`)."""
-
-    certificate: Path
-    """The edge's certificate with its chain, PEM."""
-    key: Path
-    """The certificate's private key, PEM."""
-    authority: Path
-    """Certificate of the authority that signs the clients' certificates, PEM."""
-    first_port: Port = 802
-    """Port of the first rig; the others follow."""
-    no_role: Literal["operator", "observer", "refuse"] = "observer"
-    """Rights of a client whose certificate has no role: operator (write), observer (read) or refuse (no access)."""
-
-
 class EdgeConfig(Section):
     """The Modbus servers of the rigs."""
 
@@ -175,6 +162,13 @@ class RigSettings(Section):
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
     allow: tuple[Network, ...] = ()
     """Networks whose hosts may connect, as "192.168.7.0/24"; empty: all."""
+    controller: ControllerAddress | None = None
+    """Address of a controller that is a Modbus server, "HOST" or "HOST:PORT" (default port 502): the edge is its
+    client, and the rig's own server is read-only."""
+    unit: Annotated[int, Field(strict=True, ge=0, le=255)] = 1
+    """Unit identifier of that controller."""
+    registers: RegistersConfig = RegistersConfig()
+    client: ClientConfig = ClientConfig()
     arm: ArmConfig = ArmConfig()
     scene: SceneConfig | None = None
     """Scene of this rig; default: the lab's."""
@@ -186,6 +180,22 @@ class RigSettings(Section):
         if self.name in RESERVED_RIG_NAMES or self.name in SERVICES:
             raise ValueError(f"{self.name!r} is a reserved name; choose another rig name")
         return self
+
+    @model_validator(mode="after")
+    def _controller_settings_are_used(self) -> "RigSettings":
+        defaults = (1, RegistersConfig(), ClientConfig())
+        if self.controller is None and (self.unit, self.registers, self.client) != defaults:
+            raise ValueError("unit, registers and client have no effect without controller; add it, or remove them")
+        if self.client.combined_request and self.registers.torque_block.table != "holding":
+            raise ValueError(
+                "client.combined_request: function 23 reads holding registers, and the torques are "
+                f"{self.registers.torque_block}"
+            )
+        return self
+
+    def describe_controller(self) -> str:
+        """Return the address of its controller, and which registers the edge writes and reads there."""
+        return f"client of {self.controller}, unit {self.unit}: {self.registers.describe()}"
 
 
 class RigsTable(Section):
@@ -237,11 +247,27 @@ class LabConfig(Section):
         tuple[RigSettings, ...], BeforeValidator(_expand_group), TableForm(RigsTable), Field(min_length=1)
     ] = (RigSettings(),)
     _source: str = PrivateAttr("")
+    _path: Path | None = PrivateAttr(None)
 
     @property
     def source(self) -> str:
         """Text of the file; empty: the defaults, or a configuration made by a program."""
         return self._source
+
+    @property
+    def path(self) -> Path | None:
+        """The file; None: the defaults, or a configuration made by a program."""
+        return self._path
+
+    def read_again(self) -> "LabConfig":
+        """Return the present content of the file.
+
+        Raises:
+            InputError: as `load_lab`, or the configuration is not from a file.
+        """
+        if self._path is None:
+            raise InputError("this lab has no lab.toml that could be read again")
+        return load_lab(self._path)
 
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
@@ -256,13 +282,45 @@ class LabConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _edges_command_rigs(self) -> "LabConfig":
+    def _controllers_are_distinct(self) -> "LabConfig":
+        served = {*self.ports.values(), *self.tls_ports.values()}
+        rig_of: dict[tuple[str, int], str] = {}
+        for rig in self.rigs:
+            if rig.controller is None:
+                continue
+            host, port = parse_controller(rig.controller)
+            other = rig_of.setdefault((host.lower(), port), rig.name)
+            if other != rig.name:
+                raise ValueError(
+                    f"rigs {other!r} and {rig.name!r}: both are clients of the controller {rig.controller}; a "
+                    "controller has one rig"
+                )
+            if port in served and host in ("localhost", "127.0.0.1", "::1", self.edge.host):
+                raise ValueError(
+                    f"rig {rig.name!r}: its controller {rig.controller} is the address of a rig of this lab"
+                )
+            lead_ms = rig.client.read_lead_ms
+            if lead_ms is not None and lead_ms >= self.sim.step_ms:
+                raise ValueError(
+                    f"rig {rig.name!r}: client.read_lead_ms must be < sim.step_ms ({self.sim.step_ms:g}), got "
+                    f"{lead_ms:g}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _edges_and_clients_have_rigs(self) -> "LabConfig":
         edges = {} if self.bus.tls is None else self.bus.tls.edges
         names = {rig.name for rig in self.rigs}
-        for edge, rigs in edges.items():
-            for rig in rigs:
-                if rig not in names:
-                    raise ValueError(f"bus.tls.edges.{edge}: {self.no_such_rig(rig)}")
+        mistakes = [
+            f"bus.tls.edges.{edge}: {self.no_such_rig(rig)}"
+            for edge, rigs in edges.items()
+            for rig in rigs
+            if rig not in names
+        ]
+        if self.edge.tls is not None:
+            mistakes += self.edge.tls.mistakes_in_clients(names)
+        if mistakes:
+            raise ValueError("\n".join(mistakes))
         return self
 
     @property
@@ -339,7 +397,11 @@ def load_lab(path: Path | None) -> LabConfig:
     Raises:
         InputError: the file can't be read, or is not a valid lab configuration; names every error.
     """
-    return LabConfig() if path is None else parse_lab(read_text(path), str(path))
+    if path is None:
+        return LabConfig()
+    lab = parse_lab(read_text(path), str(path))
+    lab._path = path
+    return lab
 
 
 def parse_lab(text: str, where: str = "lab.toml") -> LabConfig:

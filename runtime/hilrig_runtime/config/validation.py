@@ -85,7 +85,9 @@ def validate(model: type[SectionT], values: dict[str, Any], where: str = "") -> 
         return model.model_validate(values)
     except ValidationError as error:
         prefix = f"{where}: " if where else ""
-        raise InputError("\n".join(f"{prefix}{text}" for text in format_validation_error(error))) from error
+        raise InputError(
+            "\n".join(f"{prefix}{line}" for text in format_validation_error(error) for line in text.splitlines())
+        ) from error
 
 
 def format_validation_error(error: ValidationError) -> list[str]:

@@ -40,6 +40,8 @@ class LatestValueCache:
         self._by_rig: dict[str, TimestampedPayload] = {}
         self._monotonic_ns = clock.monotonic_ns
         self._counters = counters
+        self.notify: Callable[[], object] | None = None
+        """Called after each batch, on the thread of the bus; None: nothing."""
 
     def get(self, rig: str) -> TimestampedPayload | None:
         """Return the newest message of `rig`, the same object until the next one arrives; None: none has arrived."""
@@ -68,6 +70,8 @@ class LatestValueCache:
         if len(self._by_rig) > MAX_RIGS:
             newest = sorted(self._by_rig.items(), key=lambda item: -item[1].arrived_ns)[: MAX_RIGS // 2]
             self._by_rig = dict(newest)
+        if self.notify is not None:
+            self.notify()
 
     def reject(self, key: str, defect: object) -> None:
         """Count a malformed batch or message; its receiver drops it."""

@@ -6,7 +6,7 @@ from google.protobuf.message import Message
 
 from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.messaging.recording_stream import RecordingStream
+from hilrig_runtime.messaging.recording_stream import EventStream, RecordingStream
 from hilrig_runtime.timing.clock import Clock
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -16,7 +16,12 @@ class RigPublisher(Generic[MessageT]):
     """Publishes one rig's messages on one topic of the bus and appends them to the recording stream."""
 
     def __init__(
-        self, key: str, publisher: Publisher, recording_stream: RecordingStream, clock: Clock, counters: Counters
+        self,
+        key: str,
+        publisher: Publisher,
+        recording_stream: RecordingStream | EventStream,
+        clock: Clock,
+        counters: Counters,
     ) -> None:
         self.key = key
         self._publisher = publisher

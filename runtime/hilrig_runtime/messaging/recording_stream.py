@@ -4,6 +4,9 @@ Recording favors completeness over latency: entries are collected and published 
 later, on the service's own log topic, to which only the recorder subscribes. On the control path this costs one list
 entry per message.
 
+Events are few, and the most important messages after an outage. So they are published in batches of their own, by a
+publisher whose cache therefore covers minutes, not seconds: the states do not displace them.
+
 A batch has a checksum. A zenoh session that is closed while a peer reads too slowly cancels a write in the middle of a
 batch and then writes the rest of its queue: the peer receives the first part of the batch, followed by other bytes.
 """
@@ -20,6 +23,8 @@ from hilrig_schemas import LogBatch, OpenSession
 from hilrig_schemas.bounds import MAX_INTEGER, MAX_ITEMS, MAX_SEQUENCE, check_bounds
 
 FLUSH_PERIOD_NS: Final = 20_000_000
+EVENTS_PERIOD_NS: Final = 200_000_000
+"""Shortest time between two batches of events, ns: many events must not fill the cache of events within seconds."""
 SESSIONS_PERIOD_NS: Final = 500_000_000
 """Interval at which a service that owns sessions announces all of them, ns."""
 
@@ -97,10 +102,40 @@ def batch_cache_depth(rigs: int, step_ms: float) -> int:
     return round(min(max(seconds, MIN_CACHE_S), MAX_CACHE_S) * 1e9 / FLUSH_PERIOD_NS)
 
 
-class RecordingStream:
-    """Collects entries from any thread, and publishes them as `LogBatch` on the thread that calls `flush`."""
+class EventStream:
+    """Collects the events of a recording stream, from any thread; they are published by its owner."""
 
-    def __init__(self, publisher: Publisher, source: str, incarnation: int) -> None:
+    def __init__(self, publisher: Publisher) -> None:
+        self._publisher = publisher
+        self._entries: list[Entry] = []
+        self._due_ns = 0
+
+    def append(self, key: str, sequence: int, publish_wall_ns: int, payload: bytes) -> None:
+        """Add one event, as `RecordingStream.append`."""
+        self._entries.append((key, sequence, publish_wall_ns, payload))
+
+    def is_due(self, now_ns: int, *, at_once: bool) -> bool:
+        """Return whether there are events to publish now; `at_once`: also within `EVENTS_PERIOD_NS` of the last."""
+        return bool(self._entries) and (at_once or now_ns >= self._due_ns)
+
+    def flush(self, batch: LogBatch, now_ns: int) -> None:
+        """Publish the collected events in `batch`, which has the number of the last other batch."""
+        self._due_ns = now_ns + EVENTS_PERIOD_NS
+        count = len(self._entries)
+        batch.events = True
+        put_entries(batch, self._entries[:count])
+        del self._entries[:count]
+        self._publisher.put(encode_batch(batch))
+
+
+class RecordingStream:
+    """Collects entries from any thread, and publishes them as `LogBatch` on the thread that calls `flush`.
+
+    `events` publishes the batches of events.
+    """
+
+    def __init__(self, publisher: Publisher, events: Publisher, source: str, incarnation: int) -> None:
+        self.events = EventStream(events)
         self._publisher = publisher
         self._source = source
         self._incarnation = incarnation
@@ -128,22 +163,26 @@ class RecordingStream:
         if now_ns >= self._flush_due_ns:
             # Not relative to now: a loop with this period that is sometimes early would flush only every second time.
             self._flush_due_ns = max(self._flush_due_ns + FLUSH_PERIOD_NS, now_ns)
-            self.flush(now_ns)
+            self.flush(now_ns, at_once=False)
 
-    def flush(self, now_ns: int) -> None:
-        """Publish the collected entries now."""
+    def flush(self, now_ns: int, *, at_once: bool = True) -> None:
+        """Publish the collected entries now; events too with `at_once`, otherwise if they are due."""
         # A fixed length, because another thread may append meanwhile.
         entries = self._entries
         count = len(entries)
         sessions_due = self._sessions is not None and now_ns >= self._sessions_due_ns
-        if not count and not sessions_due:
-            return
-        self._sequence += 1
-        batch = LogBatch(source=self._source, incarnation=self._incarnation, sequence=self._sequence)
-        put_entries(batch, entries[:count])
-        del entries[:count]
-        if self._sessions is not None and sessions_due:
-            self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS
-            batch.sessions.extend(self._sessions)
-            batch.complete_sessions = True
-        self._publisher.put(encode_batch(batch))
+        if count or sessions_due:
+            self._sequence += 1
+            batch = self._new_batch()
+            put_entries(batch, entries[:count])
+            del entries[:count]
+            if self._sessions is not None and sessions_due:
+                self._sessions_due_ns = now_ns + SESSIONS_PERIOD_NS
+                batch.sessions.extend(self._sessions)
+                batch.complete_sessions = True
+            self._publisher.put(encode_batch(batch))
+        if self.events.is_due(now_ns, at_once=at_once):
+            self.events.flush(self._new_batch(), now_ns)
+
+    def _new_batch(self) -> LogBatch:
+        return LogBatch(source=self._source, incarnation=self._incarnation, sequence=self._sequence)

@@ -20,11 +20,11 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_runtime.bus.api import Bus, Handle
+from hilrig_runtime.bus.api import Bus, Handle, Reply
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError, list_names
 from hilrig_runtime.process.liveliness import PeerDownTracker
-from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_key
 
@@ -45,7 +45,7 @@ class ClockOffset:
     """The service, "<service>/<instance>"; empty: no service replied."""
     offset_ns: int = 0
     uncertainty_ns: int = 0
-    """Half of the round-trip time of its reply."""
+    """Half of the round-trip time of its own reply, ns."""
 
     @property
     def certain_ns(self) -> int:
@@ -59,33 +59,35 @@ def conflict(own: ServiceInfo, others: Iterable[ServiceInfo]) -> str:
     It must stop if an older service of its kind has its instance name or one of its rigs. If both started in the same
     nanosecond, the name decides, so that exactly one keeps running.
     """
-    for other in others:
+    taken = []
+    for other in sorted(others, key=lambda info: (info.instance, info.incarnation)):
         if other.service != own.service or (other.incarnation, other.instance) >= (own.incarnation, own.instance):
             continue
         where = f"{other.service}/{other.instance} on {other.host}"
         if other.instance == own.instance:
             return f"{where} has the same instance name; choose another --instance"
-        shared = sorted(set(own.rigs) & set(other.rigs))
-        if shared:
-            return f"{where} already serves {list_names(shared)}; each rig has one {own.service} (--rigs)"
-    return ""
+        if shared := sorted(set(own.rigs) & set(other.rigs)):
+            taken.append(f"{where} already serves {list_names(shared)}")
+    return f"{'; '.join(taken)}; each rig has one {own.service} (--rigs)" if taken else ""
 
 
-def worst_offset(others: Iterable[tuple[ServiceInfo, int]], own_incarnation: int, sent_ns: int) -> ClockOffset:
-    """Return the largest clock offset, less its uncertainty.
+def worst_offset(offsets: Iterable[ClockOffset]) -> ClockOffset:
+    """Return the offset that is largest without its uncertainty; of several within it, the one that is known best."""
+    return max(offsets, key=lambda offset: (offset.certain_ns, -offset.uncertainty_ns), default=ClockOffset())
 
-    Args:
-        others: the services that replied, each with the round-trip time of its reply, ns.
-        own_incarnation: the service itself, which also replies.
-        sent_ns: when the query was sent, wall clock.
+
+def offset_of(info: ServiceInfo, reply: Reply, wall_ns: Callable[[], int]) -> ClockOffset:
+    """Return the clock offset of a service that replied, from the times of its own reply.
+
+    The service read its clock between the query and the arrival of its reply: in the middle, or at most half of the
+    round-trip time earlier or later. `wall_ns` reads this host's wall clock.
     """
-    # A reply that is late because the query waits for a stopped service would otherwise look like an offset.
-    offsets = [
-        ClockOffset(f"{other.service}/{other.instance}", other.wall_ns - sent_ns - half_ns, half_ns)
-        for other, half_ns in ((other, round_trip_ns // 2) for other, round_trip_ns in others)
-        if other.incarnation != own_incarnation
-    ]
-    return max(offsets, key=lambda offset: offset.certain_ns, default=ClockOffset())
+    before_ns = time.monotonic_ns()
+    now_wall_ns = wall_ns()
+    # This process may have been stopped between the two clocks.
+    half_ns = reply.round_trip_ns // 2 + time.monotonic_ns() - before_ns
+    middle_wall_ns = now_wall_ns - (before_ns - reply.arrived_ns) - reply.round_trip_ns // 2
+    return ClockOffset(f"{info.service}/{info.instance}", info.wall_ns - middle_wall_ns, half_ns)
 
 
 def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = QUERY_TIMEOUT_S) -> list[ServiceInfo]:
@@ -95,13 +97,19 @@ def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = 
 
 
 def query_services(
-    bus: Bus, lab: str, service: str, counters: Counters, timeout_s: float
-) -> Iterator[tuple[ServiceInfo, int]]:
-    """Query the running services of a lab; yield each with the round-trip time of its reply, ns."""
+    bus: Bus,
+    lab: str,
+    service: str,
+    counters: Counters,
+    timeout_s: float,
+    wall_ns: Callable[[], int] = SYSTEM_CLOCK.wall_ns,
+) -> Iterator[tuple[ServiceInfo, ClockOffset]]:
+    """Query the running services of a lab; yield each with the offset of its clock from this host's, `wall_ns`."""
     for reply in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
         try:
             if not reply.error:
-                yield SERVICE_INFO.decode_from(reply.key, reply.payload), reply.round_trip_ns
+                info = SERVICE_INFO.decode_from(reply.key, reply.payload)
+                yield info, offset_of(info, reply, wall_ns)
         except DecodeError as error:
             counters.reject(reply.key, error)
 
@@ -196,9 +204,12 @@ class PeerRegistry:
         return self._info().SerializeToString()
 
     def _find_conflict(self) -> str:
-        sent_ns = self._clock.wall_ns()
-        replies = list(query_services(self._bus, self._lab, "*", self._counters, CLAIM_TIMEOUT_S))
-        self.clock_offset = worst_offset(replies, self._own.incarnation, sent_ns)
+        bus, lab, clock = self._bus, self._lab, self._clock
+        replies = list(query_services(bus, lab, "*", self._counters, CLAIM_TIMEOUT_S, clock.wall_ns))
+        # The service itself replies too.
+        self.clock_offset = worst_offset(
+            offset for other, offset in replies if other.incarnation != self._own.incarnation
+        )
         others = [other for other, _ in replies]
         for other in others:
             allowed = [rig for rig in other.rigs if self._may_serve(f"{other.service}/{other.instance}", rig)]

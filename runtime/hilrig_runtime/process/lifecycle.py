@@ -12,10 +12,12 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.service import Service
-from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, force_exit_after, stop_on_signals
+from hilrig_runtime.process.shutdown import CLOSE_TIMEOUT_S, call_on_hangup, force_exit_after, stop_on_signals
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime, lower_priority, set_short_slice
 
 ROUTER_RETRY_S: Final = 0.5
+DEFAULT_OPEN_FILES: Final = 1024
+"""Limit of open files on systems that do not report one."""
 
 logger = logging.getLogger(__name__)
 
@@ -39,10 +41,18 @@ def run_service(
     allow_open_files()
     stopping = stop_on_signals(stop_with_parent=stop_with_parent)
     force_exit_after(stopping, close_timeout_s)
+    running: list[Service] = []
+
+    def reload() -> None:
+        for service in running:
+            service.reload()
+
+    call_on_hangup(reload, stopping)
     bus = _open_bus(lab, name, instance, stopping)
     if bus is None:
         return
     with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
+        running.append(service)
         logger.debug("running as %s", service.source)
         with _stop_on_thread_crash(service):
             run(service)
@@ -79,15 +89,21 @@ def _set_scheduling(name: str, lab: LabConfig) -> None:
         logger.debug("no permission for a real-time scheduling policy: other programs may delay this one")
 
 
-def allow_open_files() -> None:
-    """Raise the limit of open files to the hard limit: each connection needs one, and the usual soft limit is 1,024."""
-    if sys.platform != "win32":
-        import resource
+def allow_open_files() -> int:
+    """Raise the limit of open files to the hard limit, and return it.
 
-        _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-        # Some systems report no limit, but accept less.
-        with contextlib.suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
+    Each connection needs one, and the usual soft limit is 1,024.
+    """
+    if sys.platform == "win32":
+        return DEFAULT_OPEN_FILES
+    import resource
+
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    # Some systems report no limit, but accept less.
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
+    soft_limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if soft_limit == resource.RLIM_INFINITY else soft_limit
 
 
 def _open_bus(lab: LabConfig, name: str, instance: str, stopping: threading.Event) -> Bus | None:

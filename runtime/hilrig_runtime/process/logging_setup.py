@@ -3,10 +3,14 @@
 import json
 import logging
 import sys
+import threading
 from datetime import UTC, datetime
 from typing import Any
 
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.process.shutdown import ErrorOutput
+
+logger = logging.getLogger(__name__)
 
 
 class JsonFormatter(logging.Formatter):
@@ -31,7 +35,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def start_logging(service: str, instance: str, log_format: str) -> None:
-    """Start logging to standard error in `log_format`, "text" or "json".
+    """Start logging to standard error in `log_format`, "text" or "json"; with "json" also warnings and final errors.
 
     Raises:
         InputError: unknown format.
@@ -41,8 +45,21 @@ def start_logging(service: str, instance: str, log_format: str) -> None:
     handler = logging.StreamHandler(sys.stderr)
     if log_format == "json":
         handler.setFormatter(JsonFormatter(service, instance))
+        logging.captureWarnings(True)
+        ErrorOutput.write = staticmethod(_log_final_error)  # type: ignore[method-assign]
+        sys.excepthook = lambda kind, error, trace: logger.critical(str(error), exc_info=(kind, error, trace))
+        threading.excepthook = _log_crash
     else:
         source = service if instance == "1" else f"{service} {instance}"
         text = logging.Formatter(f"%(asctime)s.%(msecs)03d {source}: %(levelname)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
         handler.setFormatter(text)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+def _log_final_error(line: str) -> None:
+    logger.error("%s", line.removeprefix("error: "))
+
+
+def _log_crash(crashed: threading.ExceptHookArgs) -> None:
+    name = "unknown" if crashed.thread is None else crashed.thread.name
+    logger.critical("thread %r crashed", name, exc_info=crashed.exc_value)

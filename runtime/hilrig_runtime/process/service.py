@@ -5,6 +5,7 @@ is set; everything that it declared is closed afterwards, in reverse order. The 
 publishers and caches of `messaging`.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -22,6 +23,7 @@ from hilrig_runtime.messaging.recording_stream import RecordingStream, batch_cac
 from hilrig_runtime.messaging.rig_batch import BatchPublisher
 from hilrig_runtime.process.discovery import PeerRegistry
 from hilrig_runtime.process.health import HealthReporter
+from hilrig_runtime.process.outage import STALL_NS, OutageLog
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 from hilrig_schemas import Event, RigBatch, ServiceInfo
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
@@ -29,6 +31,8 @@ from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, al
 MessageT = TypeVar("MessageT", bound=Message)
 EXTRA_QUEUED_BATCHES: Final = 64
 """Capacity of the queue of received batches beyond one batch per rig."""
+
+logger = logging.getLogger(__name__)
 
 
 class Service(Handle):
@@ -60,15 +64,23 @@ class Service(Handle):
         self._event_publishers: dict[str, RigPublisher[Event]] = {}
         self.batch_cache_depth = batch_cache_depth(len(lab.rigs), lab.sim.step_ms)
         """Cache depth of each recording stream of the lab, batches."""
-        log_publisher = self._closing.enter_context(
-            bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batch_cache_depth)
+        # Two publishers of one key: each has its own cache.
+        messages, events = (
+            self._closing.enter_context(
+                bus.publisher(LOG.key(lab.name, name, instance), LOG.traffic, self.batch_cache_depth)
+            )
+            for _ in range(2)
         )
-        self.recording_stream = RecordingStream(log_publisher, self.source, self.incarnation)
+        self.recording_stream = RecordingStream(messages, events, self.source, self.incarnation)
         self.health = HealthReporter(self.publisher(HEALTH), name, instance, self.incarnation, clock)
         self.counters = self.health.counters
+        self._outage_log = OutageLog()
+        self._beat_ns = clock.monotonic_ns()
         self._token: Handle | None = None
         self._failure = ""
         info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
+        self.reload: Callable[[], object] = lambda: logger.info("nothing to read again on SIGHUP")
+        """Called on SIGHUP, in any thread; set by the edge."""
         self.addresses: Callable[[str], str] = lambda _: ""
         """Returns the address of a rig for the service info; set by the edge."""
         self._registry = PeerRegistry(
@@ -113,7 +125,8 @@ class Service(Handle):
         """Create a publisher of a rig's topic."""
         key = topic.key(self.lab.name, rig)
         publisher = self._closing.enter_context(self.bus.publisher(key, topic.traffic))
-        return RigPublisher(key, publisher, self.recording_stream, self.clock, self.counters)
+        recording_stream = self.recording_stream.events if topic is EVENT else self.recording_stream
+        return RigPublisher(key, publisher, recording_stream, self.clock, self.counters)
 
     def latest_value_cache(
         self, topic: ServiceTopic[RigBatch], permitted: Mapping[str, Collection[str]] = MappingProxyType({})
@@ -150,9 +163,15 @@ class Service(Handle):
         if publisher is None:
             publisher = self._event_publishers[rig] = self.rig_publisher(EVENT, rig)
         publisher.publish(event)
+        self._outage_log.record(event, self.clock.monotonic_ns())
 
     def beat(self, now_ns: int) -> None:
         """Once per tick: publish the recording batch and the health report if due; `now_ns`: monotonic clock."""
+        if self._token is not None and now_ns - self._beat_ns > STALL_NS:
+            text = "stalled for %.1f s until now: this process was stopped, or its host was overloaded"
+            logger.warning(text, (now_ns - self._beat_ns) / 1e9)
+        self._beat_ns = now_ns
+        self._outage_log.flush_if_due(now_ns)
         self.recording_stream.flush_if_due(now_ns)
         self.health.report_if_due(now_ns)
 

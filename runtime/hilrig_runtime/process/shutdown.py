@@ -1,7 +1,8 @@
 """Shutdown of a process: signals, end of the parent process, exit codes, and a forced exit if closing hangs.
 
 The first signal requests a shutdown and the loop ends itself; a second signal ends the process at once. A service
-started by `hilrig up` also stops when its parent ends, which closes its standard input. Every command uses this
+started by `hilrig up` also stops when its parent ends, which closes its standard input. SIGHUP makes a service read its
+configuration again, and ends it only if its terminal was closed. Every command uses this
 module, so it imports nothing that is slow to import.
 """
 
@@ -34,6 +35,15 @@ _THREAD_LIMIT_MESSAGE: Final = "can't start new thread"
 """Text of Python's RuntimeError when the system refuses a new thread."""
 
 
+class ErrorOutput:
+    """Output of the errors that end this process; a service that logs JSON replaces `write`."""
+
+    @staticmethod
+    def write(line: str) -> None:
+        """Print one line on standard error."""
+        print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+
 def stop_on_signals(*, stop_with_parent: bool = False) -> threading.Event:
     """Return an event that the first SIGINT or SIGTERM sets, and on request the end of the parent process.
 
@@ -62,6 +72,35 @@ def stop_on_signals(*, stop_with_parent: bool = False) -> threading.Event:
     if stop_with_parent:
         stop_with_stdin(stopping)
     return stopping
+
+
+def call_on_hangup(callback: Callable[[], None], stopping: threading.Event) -> None:
+    """Call `callback`, in a thread, at each SIGHUP; set `stopping` instead if this process has lost its terminal."""
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is None:
+        return
+    # A program that was started with nohup runs on without its terminal.
+    stops_with_terminal = signal.getsignal(hangup) is not signal.SIG_IGN and _has_terminal()
+    received: SimpleQueue[int] = SimpleQueue()
+
+    def handle() -> None:
+        while True:
+            received.get()
+            if stops_with_terminal and not _has_terminal():
+                stopping.set()
+            else:
+                callback()
+
+    threading.Thread(target=handle, name="hangups", daemon=True).start()
+    signal.signal(hangup, lambda number, frame: received.put(number))  # noqa: ARG005
+
+
+def _has_terminal() -> bool:
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 def wait_for(stopping: threading.Event) -> None:
@@ -95,7 +134,7 @@ def force_exit_after(stopping: threading.Event, timeout_s: float) -> None:
         stopping.wait()
         # A daemon thread: it ends with the process if closing succeeds.
         threading.Event().wait(timeout_s)
-        print("hilrig: shutdown timed out; exiting anyway", file=sys.stderr)
+        ErrorOutput.write("error: shutdown timed out; exiting anyway")
         os._exit(3)
 
     threading.Thread(target=watch, name="close-guard", daemon=True).start()
@@ -112,7 +151,8 @@ def run_main(main: Callable[[], int | None]) -> int:
         # typer and rich turn a closed pipe into exit code 1, which means "check failed" here.
         if not isinstance(end.__context__, BrokenPipeError):
             raise
-    _drop_output()
+    # An error message that could not be written is still in the buffer of standard error.
+    _drop_output(1, 2)
     return EXIT_SIGPIPE
 
 
@@ -125,31 +165,27 @@ def _run_and_report(main: Callable[[], int | None]) -> int:
             sys.stdout.flush()
     except HilrigError as error:
         for line in str(error).splitlines():
-            print(f"hilrig: error: {printable(line)}", file=sys.stderr)
+            ErrorOutput.write(f"error: {printable(line)}")
         return error.exit_code
     except KeyboardInterrupt:
         return 130
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and str(error) != _THREAD_LIMIT_MESSAGE:
             raise
-        print(
-            "hilrig: error: out of memory or threads: raise the limits (ulimit -v, ulimit -u; mem_limit and pids_limit "
-            "of a container), or stop other programs",
-            file=sys.stderr,
+        ErrorOutput.write(
+            "error: out of memory or threads: raise the limits (ulimit -v, ulimit -u; mem_limit and pids_limit of a "
+            "container), or stop other programs"
         )
         return OperationError.exit_code
     except OSError as error:
         if error.errno in _FILE_LIMIT_ERRORS:
-            print(
-                "hilrig: error: too many open files: raise the limit (ulimit -n, or LimitNOFILE of a service)",
-                file=sys.stderr,
-            )
+            ErrorOutput.write("error: too many open files: raise the limit (ulimit -n, or LimitNOFILE of a service)")
             return OperationError.exit_code
         if error.errno not in _DISK_ERRORS:
             raise
-        _drop_output()
+        _drop_output(1)
         target = error.filename or "standard output"
-        print(f"hilrig: error: {printable(str(target))}: can't be written: {error.strerror}", file=sys.stderr)
+        ErrorOutput.write(f"error: {printable(str(target))}: can't be written: {error.strerror}")
         return OperationError.exit_code
 
 
@@ -163,6 +199,8 @@ def _open_output() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _drop_output() -> None:
-    """Discard buffered output, so that the process ends without another error."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+def _drop_output(*descriptors: int) -> None:
+    """Discard the buffered output of `descriptors`, so that the process ends without another error."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in descriptors:
+        os.dup2(null, descriptor)

@@ -99,6 +99,15 @@ def common_name_of(certificate_der: bytes) -> str:
     return str(names[0].value) if names else ""
 
 
+def expiry_ns_of(certificate_der: bytes) -> int:
+    """Return the end of a certificate's validity, ns since 1970-01-01 UTC; 0: the certificate is not readable."""
+    try:
+        end = x509.load_der_x509_certificate(certificate_der).not_valid_after_utc
+    except ValueError:
+        return 0
+    return int(end.timestamp()) * 1_000_000_000
+
+
 def role_of(certificate_der: bytes) -> str:
     """Return the role in a client's certificate; empty: no readable role, or more than one."""
     try:

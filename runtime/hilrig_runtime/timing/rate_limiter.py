@@ -10,11 +10,11 @@ class RateLimiter(Generic[KeyT]):
     """Allows one report per key and period, and counts the occurrences between two reports. Time is passed in.
 
     The first occurrence of a key is reported, later ones are counted. The count is reported with the first occurrence
-    after the period, or when the period ends if `pop_remainders` is called periodically. The table has the newest keys,
-    `keys` at most: counts of older ones are forgotten.
+    after the period, or when the period ends if `pop_remainders` is called periodically. At most `keys` keys are
+    reported in a period, because a sender may invent them; the table has as many, and counts of others are forgotten.
     """
 
-    def __init__(self, period_ns: int, keys: int = 256) -> None:
+    def __init__(self, period_ns: int, keys: int = 32) -> None:
         self._period_ns = period_ns
         self._keys = keys
         self._reported: dict[KeyT, tuple[int, int]] = {}
@@ -25,6 +25,10 @@ class RateLimiter(Generic[KeyT]):
 
         Returns the number of occurrences since the last report if a report is due, else 0.
         """
+        if key not in self._reported and len(self._reported) >= self._keys:
+            first_ns, _ = next(iter(self._reported.values()))
+            if now_ns - first_ns < self._period_ns:
+                return 0
         reported_ns, suppressed = self._reported.get(key, (now_ns - self._period_ns, 0))
         count = suppressed + 1
         if now_ns - reported_ns < self._period_ns:

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fhilrig_schemas/v1/control.proto\x12\thilrig.v1\"\x9f\x02\n\x0e\x43ontrolRequest\x12\x18\n\x10software_version\x18\t \x01(\t\x12$\n\x07\x61\x64\x64_rig\x18\n \x01(\x0b\x32\x11.hilrig.v1.AddRigH\x00\x12*\n\nremove_rig\x18\x0b \x01(\x0b\x32\x14.hilrig.v1.RemoveRigH\x00\x12(\n\treset_rig\x18\x0c \x01(\x0b\x32\x13.hilrig.v1.ResetRigH\x00\x12\x30\n\rstart_session\x18\r \x01(\x0b\x32\x17.hilrig.v1.StartSessionH\x00\x12.\n\x0cstop_session\x18\x0e \x01(\x0b\x32\x16.hilrig.v1.StopSessionH\x00\x42\t\n\x07requestJ\x04\x08\x01\x10\tJ\x04\x08\x10\x10\x18\"\x1f\n\x06\x41\x64\x64Rig\x12\x15\n\rsettings_json\x18\x01 \x01(\t\"\x18\n\tRemoveRig\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x17\n\x08ResetRig\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x1b\n\x0cStartSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x1a\n\x0bStopSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\"G\n\x0c\x43ontrolReply\x12\x18\n\x10software_version\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07session\x18\x03 \x01(\tb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1fhilrig_schemas/v1/control.proto\x12\thilrig.v1\"\xd1\x02\n\x0e\x43ontrolRequest\x12\x18\n\x10software_version\x18\t \x01(\t\x12$\n\x07\x61\x64\x64_rig\x18\n \x01(\x0b\x32\x11.hilrig.v1.AddRigH\x00\x12*\n\nremove_rig\x18\x0b \x01(\x0b\x32\x14.hilrig.v1.RemoveRigH\x00\x12(\n\treset_rig\x18\x0c \x01(\x0b\x32\x13.hilrig.v1.ResetRigH\x00\x12\x30\n\rstart_session\x18\r \x01(\x0b\x32\x17.hilrig.v1.StartSessionH\x00\x12.\n\x0cstop_session\x18\x0e \x01(\x0b\x32\x16.hilrig.v1.StopSessionH\x00\x12\x30\n\rrevoke_client\x18\x0f \x01(\x0b\x32\x17.hilrig.v1.RevokeClientH\x00\x42\t\n\x07requestJ\x04\x08\x01\x10\tJ\x04\x08\x10\x10\x18\"\x1f\n\x06\x41\x64\x64Rig\x12\x15\n\rsettings_json\x18\x01 \x01(\t\"\x18\n\tRemoveRig\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x17\n\x08ResetRig\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x1b\n\x0cStartSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x1a\n\x0bStopSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\"\x1c\n\x0cRevokeClient\x12\x0c\n\x04name\x18\x01 \x01(\t\"G\n\x0c\x43ontrolReply\x12\x18\n\x10software_version\x18\x01 \x01(\t\x12\x0c\n\x04text\x18\x02 \x01(\t\x12\x0f\n\x07session\x18\x03 \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,17 +32,19 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.control_p
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_CONTROLREQUEST']._serialized_start=47
-  _globals['_CONTROLREQUEST']._serialized_end=334
-  _globals['_ADDRIG']._serialized_start=336
-  _globals['_ADDRIG']._serialized_end=367
-  _globals['_REMOVERIG']._serialized_start=369
-  _globals['_REMOVERIG']._serialized_end=393
-  _globals['_RESETRIG']._serialized_start=395
-  _globals['_RESETRIG']._serialized_end=418
-  _globals['_STARTSESSION']._serialized_start=420
-  _globals['_STARTSESSION']._serialized_end=447
-  _globals['_STOPSESSION']._serialized_start=449
-  _globals['_STOPSESSION']._serialized_end=475
-  _globals['_CONTROLREPLY']._serialized_start=477
-  _globals['_CONTROLREPLY']._serialized_end=548
+  _globals['_CONTROLREQUEST']._serialized_end=384
+  _globals['_ADDRIG']._serialized_start=386
+  _globals['_ADDRIG']._serialized_end=417
+  _globals['_REMOVERIG']._serialized_start=419
+  _globals['_REMOVERIG']._serialized_end=443
+  _globals['_RESETRIG']._serialized_start=445
+  _globals['_RESETRIG']._serialized_end=468
+  _globals['_STARTSESSION']._serialized_start=470
+  _globals['_STARTSESSION']._serialized_end=497
+  _globals['_STOPSESSION']._serialized_start=499
+  _globals['_STOPSESSION']._serialized_end=525
+  _globals['_REVOKECLIENT']._serialized_start=527
+  _globals['_REVOKECLIENT']._serialized_end=555
+  _globals['_CONTROLREPLY']._serialized_start=557
+  _globals['_CONTROLREPLY']._serialized_end=628
 # @@protoc_insertion_point(module_scope)

@@ -11,7 +11,7 @@ class LeaseRequest(_message.Message):
     def __init__(self, release: _Optional[bool] = ...) -> None: ...
 
 class LeaseStatus(_message.Message):
-    __slots__ = ("rig", "holder", "released", "silent_ns", "session", "connections", "watchdog_tripped", "watchdog_timeout_ns")
+    __slots__ = ("rig", "holder", "released", "silent_ns", "session", "connections", "watchdog_tripped", "watchdog_timeout_ns", "client_of", "controller_fault", "skipped_states")
     RIG_FIELD_NUMBER: _ClassVar[int]
     HOLDER_FIELD_NUMBER: _ClassVar[int]
     RELEASED_FIELD_NUMBER: _ClassVar[int]
@@ -20,6 +20,9 @@ class LeaseStatus(_message.Message):
     CONNECTIONS_FIELD_NUMBER: _ClassVar[int]
     WATCHDOG_TRIPPED_FIELD_NUMBER: _ClassVar[int]
     WATCHDOG_TIMEOUT_NS_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_OF_FIELD_NUMBER: _ClassVar[int]
+    CONTROLLER_FAULT_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_STATES_FIELD_NUMBER: _ClassVar[int]
     rig: str
     holder: str
     released: str
@@ -28,4 +31,7 @@ class LeaseStatus(_message.Message):
     connections: int
     watchdog_tripped: bool
     watchdog_timeout_ns: int
-    def __init__(self, rig: _Optional[str] = ..., holder: _Optional[str] = ..., released: _Optional[str] = ..., silent_ns: _Optional[int] = ..., session: _Optional[str] = ..., connections: _Optional[int] = ..., watchdog_tripped: _Optional[bool] = ..., watchdog_timeout_ns: _Optional[int] = ...) -> None: ...
+    client_of: str
+    controller_fault: str
+    skipped_states: int
+    def __init__(self, rig: _Optional[str] = ..., holder: _Optional[str] = ..., released: _Optional[str] = ..., silent_ns: _Optional[int] = ..., session: _Optional[str] = ..., connections: _Optional[int] = ..., watchdog_tripped: _Optional[bool] = ..., watchdog_timeout_ns: _Optional[int] = ..., client_of: _Optional[str] = ..., controller_fault: _Optional[str] = ..., skipped_states: _Optional[int] = ...) -> None: ...

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!hilrig_schemas/v1/log_batch.proto\x12\thilrig.v1\"\x85\x02\n\x08LogBatch\x12\x0e\n\x06source\x18\x01 \x01(\t\x12\x13\n\x0bincarnation\x18\x02 \x01(\x04\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12(\n\x08sessions\x18\x05 \x03(\x0b\x32\x16.hilrig.v1.OpenSession\x12\x19\n\x11\x63omplete_sessions\x18\x06 \x01(\x08\x12\x0c\n\x04keys\x18\x07 \x03(\t\x12\x11\n\tsequences\x18\x08 \x03(\x04\x12\x17\n\x0fpublish_wall_ns\x18\t \x03(\x10\x12\x10\n\x08payloads\x18\n \x03(\x0c\x12\x15\n\x08\x63hecksum\x18\x0b \x01(\x07H\x00\x88\x01\x01\x42\x0b\n\t_checksumJ\x04\x08\x04\x10\x05R\x07\x65ntries\"V\n\x0bOpenSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07session\x18\x02 \x01(\t\x12\x12\n\ncontroller\x18\x03 \x01(\t\x12\x15\n\rstart_wall_ns\x18\x04 \x01(\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!hilrig_schemas/v1/log_batch.proto\x12\thilrig.v1\"\x95\x02\n\x08LogBatch\x12\x0e\n\x06source\x18\x01 \x01(\t\x12\x13\n\x0bincarnation\x18\x02 \x01(\x04\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12(\n\x08sessions\x18\x05 \x03(\x0b\x32\x16.hilrig.v1.OpenSession\x12\x19\n\x11\x63omplete_sessions\x18\x06 \x01(\x08\x12\x0c\n\x04keys\x18\x07 \x03(\t\x12\x11\n\tsequences\x18\x08 \x03(\x04\x12\x17\n\x0fpublish_wall_ns\x18\t \x03(\x10\x12\x10\n\x08payloads\x18\n \x03(\x0c\x12\x0e\n\x06\x65vents\x18\x0c \x01(\x08\x12\x15\n\x08\x63hecksum\x18\x0b \x01(\x07H\x00\x88\x01\x01\x42\x0b\n\t_checksumJ\x04\x08\x04\x10\x05R\x07\x65ntries\"k\n\x0bOpenSession\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07session\x18\x02 \x01(\t\x12\x12\n\ncontroller\x18\x03 \x01(\t\x12\x15\n\rstart_wall_ns\x18\x04 \x01(\x03\x12\x13\n\x0b\x63\x65rtificate\x18\x05 \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,7 +32,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.log_batch
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_LOGBATCH']._serialized_start=49
-  _globals['_LOGBATCH']._serialized_end=310
-  _globals['_OPENSESSION']._serialized_start=312
-  _globals['_OPENSESSION']._serialized_end=398
+  _globals['_LOGBATCH']._serialized_end=326
+  _globals['_OPENSESSION']._serialized_start=328
+  _globals['_OPENSESSION']._serialized_end=435
 # @@protoc_insertion_point(module_scope)

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class LogBatch(_message.Message):
-    __slots__ = ("source", "incarnation", "sequence", "sessions", "complete_sessions", "keys", "sequences", "publish_wall_ns", "payloads", "checksum")
+    __slots__ = ("source", "incarnation", "sequence", "sessions", "complete_sessions", "keys", "sequences", "publish_wall_ns", "payloads", "events", "checksum")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -17,6 +17,7 @@ class LogBatch(_message.Message):
     SEQUENCES_FIELD_NUMBER: _ClassVar[int]
     PUBLISH_WALL_NS_FIELD_NUMBER: _ClassVar[int]
     PAYLOADS_FIELD_NUMBER: _ClassVar[int]
+    EVENTS_FIELD_NUMBER: _ClassVar[int]
     CHECKSUM_FIELD_NUMBER: _ClassVar[int]
     source: str
     incarnation: int
@@ -27,17 +28,20 @@ class LogBatch(_message.Message):
     sequences: _containers.RepeatedScalarFieldContainer[int]
     publish_wall_ns: _containers.RepeatedScalarFieldContainer[int]
     payloads: _containers.RepeatedScalarFieldContainer[bytes]
+    events: bool
     checksum: int
-    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ..., checksum: _Optional[int] = ...) -> None: ...
+    def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ..., events: _Optional[bool] = ..., checksum: _Optional[int] = ...) -> None: ...
 
 class OpenSession(_message.Message):
-    __slots__ = ("rig", "session", "controller", "start_wall_ns")
+    __slots__ = ("rig", "session", "controller", "start_wall_ns", "certificate")
     RIG_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     CONTROLLER_FIELD_NUMBER: _ClassVar[int]
     START_WALL_NS_FIELD_NUMBER: _ClassVar[int]
+    CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
     controller: str
     start_wall_ns: int
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ...) -> None: ...
+    certificate: str
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ..., certificate: _Optional[str] = ...) -> None: ...

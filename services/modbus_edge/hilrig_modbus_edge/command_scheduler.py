@@ -80,10 +80,9 @@ class CommandScheduler:
         self._flush_due_ns = 0
         self._timer: TimerHandle | None = None
 
-    def send(self, rig: str, command: bytes) -> None:
-        """Send an encoded command of a rig, now or in time for the next tick."""
+    def send(self, rig: str, command: bytes, now_ns: int) -> None:
+        """Send an encoded command of a rig, now or in time for the next tick; ns, monotonic clock."""
         self._pending[rig] = command
-        now_ns = self._monotonic_ns()
         due_ns = self._send_time(rig, now_ns)
         if due_ns <= now_ns:
             self.flush()

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
+from hilrig_modbus_edge.client.exchange import Exchange, ExchangeSettings
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.settings import DeviceSettings
+from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
 from hilrig_modbus_edge.server.admission import Limits
 from hilrig_modbus_edge.server.listener import RigServer, bind
@@ -72,9 +73,16 @@ class RigEndpoint:
         self._edge = lab.edge
         self._output = BusOutput(rig.name, service, sessions_changed)
         settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
+        if rig.controller is not None:
+            settings = settings.of_reserved_rig(round(rig.client.timeout_ms * MS))
         publisher = service.rig_publisher(topics.COMMAND, rig.name)
         sender = CommandSender(rig.name, scheduler, publisher, service.clock, settings.repeat_ns)
         self.device = Device(rig.name, settings, service.clock, self._output, states, sender)
+        self.exchange: Exchange | None = None
+        """Exchange with the controller, if that is a server; None: the rig is a server only."""
+        if rig.controller is not None:
+            exchange_settings = ExchangeSettings.of(rig, lab.sim.step_ns)
+            self.exchange = Exchange(exchange_settings, self.device, states, service.clock)
         limits = Limits(
             lab.edge.max_connections,
             lab.edge.max_connections_per_host,
@@ -104,16 +112,21 @@ class RigEndpoint:
         if edge.tls is not None and tls_port is not None:
             listening = self.closing.enter_context(bind(rig, edge.host, tls_port, "edge.tls.first_port"))
             self._sockets.append((listening, TlsPolicy(edge.tls)))
-        self.address = ", ".join(f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in self._sockets)
+        addresses = [f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in self._sockets]
+        if self.exchange is not None:
+            addresses.append(f"client of {self.exchange.address}")
+        self.address = ", ".join(addresses)
 
     def bind_single(self, port: int) -> None:
         """Bind one address: without TLS, or with TLS if the lab has no plain connections. Raises as `bind`."""
         self.bind(port, None if self._edge.plain else port)
 
     async def listen(self) -> None:
-        """Serve clients."""
+        """Serve clients, and start the exchange with the controller if that is a server."""
         for listening, policy in self._sockets:
             await self._server.listen(listening, policy)
+        if self.exchange is not None:
+            self.exchange.start()
 
     def on_tick(self, now_ns: int) -> None:
         """Do the periodic work: device, idle connections, request log; ns, monotonic clock."""
@@ -122,6 +135,7 @@ class RigEndpoint:
         if server.connections:
             self.device.refresh_state()
             server.close_idle(now_ns)
+            server.close_expired(self._clock.wall_ns())
         count = server.request_log.count
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
             late_ns = max(0, now_ns - self.request_log_due_ns)
@@ -130,6 +144,10 @@ class RigEndpoint:
                 self._tcp_figures_due_ns = now_ns + TCP_FIGURES_PERIOD_NS
                 server.log_tcp_figures()
             self._publish_request_log()
+
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of clients with a certificate; see `RigServer.close_certificate`."""
+        return self._server.close_certificate(name, reason)
 
     def report(self) -> RigReport:
         """Return the part of the health report that describes the rig."""
@@ -144,6 +162,8 @@ class RigEndpoint:
 
     def stop(self, reason: str) -> None:
         """Set the torque to zero, end lease and session, and close all connections; `reason` is human-readable."""
+        if self.exchange is not None:
+            self.exchange.stop()
         self.device.stop(reason)
         self._output.follow_states(None)
         self._server.close(reason)
@@ -152,5 +172,6 @@ class RigEndpoint:
         self.closing.close()
 
     def _publish_request_log(self) -> None:
-        clock = self._clock
-        self._request_log.publish(self._server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))
+        clock, server = self._clock, self._server
+        server.counters.requests += server.request_log.count
+        self._request_log.publish(server.request_log.drain(clock.monotonic_ns(), clock.wall_ns()))

@@ -6,6 +6,8 @@ edge tick every 20 ms.
 """
 
 import asyncio
+import logging
+import platform
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Final
@@ -14,14 +16,15 @@ from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.control_api import handle_impairment_query, handle_lease_query
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
 from hilrig_modbus_edge.server.event_loop import DirectEventLoop
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.lab import RigSettings, read_rig
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.control import Handlers, handle_control_request
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
 from hilrig_runtime.timing.realtime import freeze_gc
-from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, ResetRig, topics
+from hilrig_schemas import AddRig, ControlReply, Event, RemoveRig, ResetRig, RevokeClient, topics
 
 TICK_NS: Final = 20_000_000
 """Period of the edge tick, ns."""
@@ -33,6 +36,8 @@ RIGS_PER_TURN: Final = 16
 128 rigs in one turn, the 99th percentile of a read is 60 % higher (`bench/ablation.py`)."""
 MAX_PORTS_TRIED: Final = 100
 """Number of ports that are tried for a rig that is added without one."""
+
+logger = logging.getLogger(__name__)
 
 
 def run(service: Service) -> None:
@@ -52,6 +57,8 @@ class EdgeService:
     def __init__(self, service: Service, loop: asyncio.AbstractEventLoop) -> None:
         self._service = service
         self._loop = loop
+        self._tls = service.lab.edge.tls
+        """Settings in use: its `clients` are those of the file when it was last read."""
         # A query arrives on a thread of the bus and is handled on the event loop.
         self._executor = OwnerThreadExecutor(loop.call_soon_threadsafe)
         self._states = service.latest_value_cache(topics.STATES)
@@ -72,9 +79,22 @@ class EdgeService:
         service.health.rig_reports = lambda: [endpoint.report() for endpoint in self._endpoints.values()]
         service.addresses = self._address_of
         self._closing = ExitStack()
+        self._notify_exchanges()
+
+    def _notify_exchanges(self) -> None:
+        """Let the bus wake the event loop when states arrive, if a rig is a client of its controller."""
+        if any(endpoint.exchange is not None for endpoint in self._endpoints.values()):
+            self._states.notify = partial(self._loop.call_soon_threadsafe, self._on_states)
+
+    def _on_states(self) -> None:
+        for endpoint in self._endpoints.values():
+            if endpoint.exchange is not None:
+                endpoint.exchange.on_states()
 
     def _new_endpoint(self, rig: RigSettings) -> RigEndpoint:
-        return RigEndpoint(rig, self._service, self._states, self._scheduler, self._announce_sessions)
+        endpoint = RigEndpoint(rig, self._service, self._states, self._scheduler, self._announce_sessions)
+        self._permit(endpoint)
+        return endpoint
 
     async def run(self) -> None:
         """Listen, serve, and close in order."""
@@ -100,7 +120,9 @@ class EdgeService:
                 "add_rig": self._add_rig,
                 "remove_rig": self._remove_rig,
                 "reset_rig": self._reset_rig,
+                "revoke_client": self._revoke_client,
             }
+            service.reload = self._reload
             key = topics.CONTROL.key(lab.name, service.name, service.instance)
             handler = partial(handle_control_request, handlers)
             self._closing.enter_context(self._executor.serve(service.bus, key, handler))
@@ -133,6 +155,7 @@ class EdgeService:
                 endpoint.bind_single(rig.port)
             undo.pop_all()
         self._endpoints[rig.name] = endpoint
+        self._notify_exchanges()
         self._declare_queries(endpoint)
         endpoint.device.start()
         listening = self._loop.create_task(endpoint.listen())
@@ -161,6 +184,43 @@ class EdgeService:
         """
         self._endpoint_of(request.rig).device.reset()
         return ControlReply(text=f"{request.rig} is reset to its start pose")
+
+    def _revoke_client(self, request: RevokeClient) -> ControlReply:
+        """Read lab.toml again, and close the connections of a client that it does not list any more.
+
+        Raises:
+            HilrigError: the file is invalid, still lists the client, or permits every client to write.
+        """
+        name, lab = request.name, self._service.lab.read_again()
+        if lab.edge.tls is None:
+            raise OperationError(f"{lab.path} has no [edge.tls], so every client may write")
+        lab.edge.tls.check_revoked(name, f"{lab.path} on {platform.node()}")
+        self._use(lab.edge.tls)
+        reason = f"the certificate of {name} was revoked (hilrig certs --revoke)"
+        closed = sum(endpoint.close_certificate(name, reason) for endpoint in self._endpoints.values())
+        logger.info("%s may only read, by order of an operator; connections closed: %d", name, closed)
+        return ControlReply(text=f"{name} may only read; connections closed: {closed}")
+
+    def _reload(self) -> None:
+        """Read [edge.tls.clients] again, because of SIGHUP; in another thread, because a large file takes a while."""
+        try:
+            tls = self._service.lab.read_again().edge.tls
+        except InputError as error:
+            logger.error("[edge.tls.clients] not read again, the previous one stays in force: %s", error)
+            return
+        # The event loop may be closed already.
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._use, tls)
+            logger.info("[edge.tls.clients] read again; other changes of lab.toml take effect at the next start")
+
+    def _use(self, tls: TlsConfig | None) -> None:
+        self._tls = tls
+        for endpoint in self._endpoints.values():
+            self._permit(endpoint)
+
+    def _permit(self, endpoint: RigEndpoint) -> None:
+        device = endpoint.device
+        device.permit(None if self._tls is None else self._tls.writers_of(device.rig))
 
     def _emit_result(self, kind: Event.Kind, rig: str, text: str) -> ControlReply:
         self._service.emit(Event(kind=kind, severity=Event.INFO, rig=rig, text=text))
@@ -250,6 +310,7 @@ class EdgeService:
         return deadline_ns + (state.arrived_ns - deadline_ns) % step_ns - step_ns // 2
 
     def _close(self) -> None:
+        self._states.notify = None
         self._closing.close()
         for endpoint in self._endpoints.values():
             endpoint.stop("edge stopped")

@@ -29,7 +29,7 @@ from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_runtime.process.service import Service
 from hilrig_runtime.timing.rate import Rate
 from hilrig_schemas import ControlReply, Event, OpenSession, RigConfig, RigReport, StartSession, StopSession
-from hilrig_schemas.topics import CONFIG, CONTROL, LOG, source_of_key
+from hilrig_schemas.topics import CONFIG, CONTROL, LOG
 
 TICK_PERIOD_NS: Final = SECOND_NS // 10
 """Period of the housekeeping between received batches."""
@@ -88,8 +88,6 @@ class Recorder:
         self._executor = OwnerThreadExecutor()
         """Processes control requests and the results of other threads on the recorder's thread."""
         self._config_due_ns: dict[str, int] = {}
-        self._lost_batches: dict[str, int] = {}
-        """Lost batches that are not logged yet, by source."""
         self._lost_batches_due_ns = 0
         self._config_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="config")
         self._queue = IngestQueue(config.queue_entries, service.clock, service.counters)
@@ -122,7 +120,7 @@ class Recorder:
         unfinished = [path for path in find_unfinished(self._store.folder) if partition.contains(path.parent.name)]
         self._restore(unfinished)
         self._stream = service.bus.subscribe_recording(
-            LOG.key(lab.name, "*", "*"), self._queue.put, self._on_loss, service.batch_cache_depth
+            LOG.key(lab.name, "*", "*"), self._queue.put, service.batch_cache_depth
         )
         handlers: Handlers = {"start_session": self._start_session, "stop_session": self._stop_session}
         self._control = self._executor.serve(
@@ -204,9 +202,10 @@ class Recorder:
             RigReport(rig=rig, recording=True) for rig in {recording.rig for recording in self._sessions.recordings}
         ]
 
-    def _emit(self, event: Event) -> None:
-        logger.warning("%s", event.text)
-        self._service.emit(event)
+    def _emit(self, *events: Event) -> None:
+        logger.log(logging.INFO if events[0].severity == Event.INFO else logging.WARNING, "%s", events[0].text)
+        for event in events:
+            self._service.emit(event)
 
     def _emit_error(self, text: str) -> None:
         self._emit(Event(kind=Event.RECORDING, severity=Event.ERROR, text=text))
@@ -214,19 +213,13 @@ class Recorder:
     def _on_failed(self, recording: Recording) -> None:
         self._sessions.drop(recording)
 
-    def _on_loss(self, key: str, batches: int) -> None:
-        # On a thread of the bus. Lost messages are counted by their sequence numbers, where their rig is known.
-        self._executor.post(lambda: self._count_lost_batches(source_of_key(key), batches))
-
-    def _count_lost_batches(self, source: str, batches: int) -> None:
-        self._lost_batches[source] = self._lost_batches.get(source, 0) + batches
-
     def _log_lost_batches(self, now_ns: int) -> None:
-        if self._lost_batches and now_ns >= self._lost_batches_due_ns:
+        lost = self._sessions.lost_batches
+        if lost and now_ns >= self._lost_batches_due_ns:
             self._lost_batches_due_ns = now_ns + _LOSS_LOG_PERIOD_NS
-            for source, batches in self._lost_batches.items():
+            for source, batches in lost.items():
                 logger.warning("%d batches of the recording stream of %s were lost in transport", batches, source)
-            self._lost_batches.clear()
+            lost.clear()
 
     # -- manual sessions --------------------------------------------------------------------------------------------
 

@@ -1,12 +1,13 @@
 """Events of the simulation: joint limits, parts, lost commands, resets, accuracy, divergence and overruns."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hilrig_runtime.process.outage import STALL_NS
 from hilrig_runtime.timing.rate import Tick
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
@@ -115,14 +116,19 @@ class SimulationEvents:
         event.rig, event.session, event.step = name, session, step
         self._emit(event)
 
-    def record_overrun(self, tick: Tick, step: int, step_ns: int, now_ns: int) -> None:
-        """Record a tick that was more than a step late, or skipped steps, and emit it, rate-limited."""
+    def record_overrun(self, tick: Tick, step: int, step_ns: int, now_ns: int, sessions: Sequence[str]) -> None:
+        """Record a tick that was more than a step late, or skipped steps, and emit it, rate-limited.
+
+        `sessions`: those of the rigs. A stall is an event of each rig, so that each recording has it.
+        """
         self._overrun_step = step
         self._missed += tick.missed_steps
         # Lateness against the original deadline: `lateness_ns` is against the one after the skipped steps.
         self._worst_ns = max(self._worst_ns, tick.lateness_ns + tick.missed_steps * step_ns)
         self.overran = True
-        if self._overruns.record(None, now_ns):
+        if self._worst_ns > STALL_NS:
+            self._emit_overruns(zip(self._rigs, sessions, strict=True))
+        elif self._overruns.record(None, now_ns):
             self._emit_overruns()
 
     def report_overruns(self, now_ns: int) -> None:
@@ -130,12 +136,16 @@ class SimulationEvents:
         for _ in self._overruns.pop_remainders(now_ns):
             self._emit_overruns()
 
-    def _emit_overruns(self) -> None:
+    def _emit_overruns(self, rigs: Iterable[tuple[str, str]] = (("", ""),)) -> None:
+        """Emit the overruns as events of the rigs, each with its session; by default as an event of the service."""
         data = OverrunData(lateness_ns=self._worst_ns, missed_steps=self._missed)
         steps = f"{self._missed} step{'' if self._missed == 1 else 's'}"
         text = f"simulation overrun: up to {self._worst_ns / 1e6:.1f} ms late, {steps} skipped"
         step = self._overrun_step
-        self._emit(Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data))
+        for rig, session in rigs:
+            event = Event(kind=Event.OVERRUN, severity=Event.WARNING, text=text, step=step, overrun_data=data)
+            event.rig, event.session = rig, session
+            self._emit(event)
         self._missed = self._worst_ns = 0
         self.overran = False
 

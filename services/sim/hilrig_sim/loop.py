@@ -115,7 +115,8 @@ class Simulation:
         self._update_motion()
         self._counters.count_tick(tick, self._step_ns)
         if overrun:
-            self._events.record_overrun(tick, step, self._step_ns, sampled_ns)
+            sessions = [latch.session for latch in latches]
+            self._events.record_overrun(tick, step, self._step_ns, sampled_ns, sessions)
         elif self._events.overran:
             self._events.report_overruns(sampled_ns)
 

@@ -18,6 +18,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from hilrig_console.login_throttle import LoginThrottle
+from hilrig_replay.report.assets import content_policy
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 
 MIN_PASSWORD_CHARS: Final = 8
@@ -26,11 +27,8 @@ PAGE_POLICY: Final = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Content security policy of the page: only files of this server, no inline scripts or styles."""
-REPORT_POLICY: Final = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'"
-)
-"""Content security policy of a report: a self-contained file without scripts."""
+REPORT_POLICY: Final = f"{content_policy()}; frame-ancestors 'none'"
+"""Content security policy of a report: a self-contained file, which no other site may embed."""
 SECURITY_HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",

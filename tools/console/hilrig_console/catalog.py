@@ -26,7 +26,7 @@ MEASURE_BUDGET_S: Final = 0.5
 LIST_TIMEOUT_S: Final = 120.0
 REPORT_TIMEOUT_S: Final = 180.0
 MAX_CACHED_REPORTS: Final = 50
-"""Upper limit of cached reports; a report has about 300 KB."""
+"""Upper limit of cached reports; a report has 0.5 to 4 MB."""
 MAX_LISTED: Final = 100
 """Upper limit of recordings in one reply."""
 

@@ -1,61 +1,144 @@
 """HTTP protocol of the console with a time limit for requests and limits for connections, in total and per host.
 
-uvicorn waits for the rest of a request without a limit: a client that sends half a request on each of a thousand
-connections would take all file descriptors of the process.
+uvicorn waits for the rest of a request without a limit, and for the TLS handshake for a minute: a client that sends
+half a request on each of a thousand connections would take all file descriptors of the process. Connections that wait
+for a request have limits of their own, and beyond them the oldest one is closed, so that a new browser is served.
 """
 
 import asyncio
+import ssl
 from collections import Counter
-from typing import ClassVar, Final
+from typing import Any, Final
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from hilrig_runtime.pending_connections import PendingConnections
+
 REQUEST_TIMEOUT_S: Final = 10.0
-"""Time in which a request, header and body, must be received."""
+"""Time in which a request, header and body, must be received; with TLS, also the handshake."""
 MAX_CONNECTIONS: Final = 512
-"""Maximum number of connections; below the usual soft limit of open files."""
+"""Maximum number of connections."""
 MAX_CONNECTIONS_PER_HOST: Final = 256
 """Maximum number of connections of one host, which may be a proxy of all browsers."""
 
 
-class LimitedProtocol(H11Protocol):
-    """The protocol of one connection."""
+class ConnectionTable:
+    """The connections of one server; at most half of them wait for a request."""
 
-    connections_of: ClassVar[Counter[str]] = Counter()
-    """Open connections by host."""
-    _host: str = ""
-    _timer: asyncio.TimerHandle | None = None
+    def __init__(self, limit: int = MAX_CONNECTIONS, limit_per_host: int = MAX_CONNECTIONS_PER_HOST) -> None:
+        self.limit = limit
+        self.limit_per_host = min(limit, limit_per_host)
+        self.counts: Counter[str] = Counter()
+        """Open connections by host."""
+        self.waiting: PendingConnections[LimitedProtocol] = PendingConnections(
+            max(1, limit // 2), max(1, self.limit_per_host // 2)
+        )
+
+    def is_exceeded(self, host: str) -> bool:
+        """Return whether there are more connections, of a host or in total, than allowed."""
+        return self.counts[host] > self.limit_per_host or self.counts.total() > self.limit
+
+
+class LimitedProtocol(H11Protocol):
+    """The protocol of one connection; with a TLS context it does the handshake first."""
+
+    def __init__(self, table: ConnectionTable, context: ssl.SSLContext | None = None, **uvicorn: Any) -> None:
+        super().__init__(**uvicorn)
+        self._table = table
+        self._context = context
+        self._host = ""
+        self._is_counted = False
+        self._is_secured = context is None
+        self._early = b""
+        self._handshake: asyncio.Task[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """See `asyncio.Protocol.connection_made`."""
-        super().connection_made(transport)
         self._host = str((transport.get_extra_info("peername") or ("",))[0])
-        self.connections_of[self._host] += 1
-        if self.connections_of[self._host] > MAX_CONNECTIONS_PER_HOST or self.connections_of.total() > MAX_CONNECTIONS:
-            transport.abort()
+        self.transport = transport
+        self._table.counts[self._host] += 1
+        self._is_counted = True
+        self._wait()
+        if self._table.is_exceeded(self._host):
+            self._drop()
+        elif self._context is None:
+            super().connection_made(transport)
         else:
-            self._update_timer()
+            self._handshake = self.loop.create_task(self._secure(transport, self._context))
 
     def data_received(self, data: bytes) -> None:
         """See `asyncio.Protocol.data_received`."""
+        if not self._is_secured:
+            # The first bytes of a request may arrive with the end of the handshake.
+            self._early += data
+            return
         super().data_received(data)
-        self._update_timer()
+        if self._is_waiting():
+            self._wait()
+        else:
+            self._stop_waiting()
+
+    def on_response_complete(self) -> None:
+        """See `H11Protocol.on_response_complete`."""
+        super().on_response_complete()
+        if self._is_waiting() and not self.transport.is_closing():
+            self._wait()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.Protocol.connection_lost`."""
-        self.connections_of[self._host] -= 1
-        if not self.connections_of[self._host]:
-            del self.connections_of[self._host]
+        self._forget()
+        if self._is_secured:
+            super().connection_lost(exc)
+
+    async def _secure(self, transport: asyncio.Transport, context: ssl.SSLContext) -> None:
+        try:
+            secured = await self.loop.start_tls(
+                transport, self, context, server_side=True, ssl_handshake_timeout=REQUEST_TIMEOUT_S
+            )
+        except (OSError, TimeoutError):
+            secured = None
+        # asyncio raises no exception if the peer disconnects during the handshake.
+        if secured is None or secured.is_closing():
+            self._drop()
+            return
+        self._is_secured = True
+        super().connection_made(secured)
+        if self._early:
+            self.data_received(self._early)
+
+    def _is_waiting(self) -> bool:
+        """Return whether the rest of a request, or the next one, is missing."""
+        return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+
+    def _wait(self) -> None:
+        """Start to wait for a request, unless it has begun; close an older connection that waits if there are many."""
+        if self._timer is not None:
+            return
+        self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._drop)
+        oldest = self._table.waiting.add(self, self._host)
+        if oldest is not None:
+            oldest._drop()
+
+    def _stop_waiting(self) -> None:
+        self._table.waiting.discard(self)
         if self._timer is not None:
             self._timer.cancel()
-        super().connection_lost(exc)
-
-    def _update_timer(self) -> None:
-        """Start the timer of an incomplete request, which it ends; uvicorn closes idle connections itself."""
-        is_incomplete = self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
-        if is_incomplete and self._timer is None:
-            self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self.transport.abort)
-        elif not is_incomplete and self._timer is not None:
-            self._timer.cancel()
             self._timer = None
+
+    def _drop(self) -> None:
+        """Close the connection at once."""
+        self._forget()
+        if self._handshake is not None:
+            self._handshake.cancel()
+        self.transport.abort()
+
+    def _forget(self) -> None:
+        """Remove the connection from the table: at once, because many may be accepted before it is lost."""
+        self._stop_waiting()
+        if self._is_counted:
+            self._is_counted = False
+            self._table.counts[self._host] -= 1
+            if not self._table.counts[self._host]:
+                del self._table.counts[self._host]

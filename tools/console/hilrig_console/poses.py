@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
-from hilrig_console.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
 from hilrig_monitoring.lab_view import SILENT_AFTER_S
+from hilrig_replay.geometry.arm_picture import Pose, Scene, parts_of, pose_of, scene_of
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import JointState, RigBatch, RigConfig
 from hilrig_schemas.topics import STATE

@@ -6,6 +6,7 @@ import ssl
 import threading
 import urllib.request
 from dataclasses import dataclass
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ import uvicorn
 from hilrig_console.app import Console
 from hilrig_console.auth import HEALTH_PATH, AccessPolicy
 from hilrig_console.catalog import RecordingCatalog
-from hilrig_console.http_limits import LimitedProtocol
+from hilrig_console.http_limits import MAX_CONNECTIONS, ConnectionTable, LimitedProtocol
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import InputError, OperationError, listen_failure
@@ -24,6 +25,10 @@ from hilrig_runtime.process.lifecycle import allow_open_files
 SHUTDOWN_GRACE_S: Final = 1
 """Time limit for downloads to finish on shutdown, s."""
 HEALTH_TIMEOUT_S: Final = 5.0
+BACKLOG: Final = 128
+"""Connections that the system queues until they are accepted."""
+READ_TIMEOUT_MS: Final = 30_000
+"""Time in which a client must read more of its response, ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +67,16 @@ class ListenAddress:
         """
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         try:
-            return socket.create_server((self.host, self.port), family=family, backlog=128)
+            listening = socket.create_server((self.host, self.port), family=family, backlog=BACKLOG)
         except OSError as error:
             where = f"{self.host or '0.0.0.0'}:{self.port}"
             raise OperationError(
                 f"can't listen on {where}: {listen_failure(error)}; choose another address with --listen"
             ) from error
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            # The connections inherit it: a client that does not read its response is disconnected.
+            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, READ_TIMEOUT_MS)
+        return listening
 
     def url(self, port: int, scheme: str) -> str:
         """Return the URL to open in a browser."""
@@ -82,16 +91,21 @@ class TlsFiles:
     certificate: Path
     key: Path
 
-    def check(self) -> None:
-        """Check that the files can be loaded and match.
+    def context(self) -> ssl.SSLContext:
+        """Return the TLS context of the server.
 
         Raises:
-            InputError: they can't be loaded or do not match.
+            InputError: the files can't be loaded or do not match.
         """
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        # A renegotiation costs the server more than the client that requests it.
+        context.options |= ssl.OP_NO_RENEGOTIATION
         try:
-            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key)
+            context.load_cert_chain(self.certificate, self.key)
         except (ssl.SSLError, OSError) as error:
             raise InputError(f"--certificate, --key: not a certificate with its private key (PEM): {error}") from error
+        return context
 
 
 class ConsoleServer:
@@ -105,9 +119,9 @@ class ConsoleServer:
     def __init__(
         self, lab: LabConfig, address: ListenAddress, policy: AccessPolicy, tls: TlsFiles | None = None
     ) -> None:
-        if tls is not None:
-            tls.check()
-        allow_open_files()
+        context = None if tls is None else tls.context()
+        # Half of the files are left for everything else.
+        table = ConnectionTable(min(MAX_CONNECTIONS, allow_open_files() // 2))
         self._socket = address.open_socket()
         self.url = address.url(self._socket.getsockname()[1], "http" if tls is None else "https")
         self._subscriber = LabSubscriber(lab)
@@ -115,14 +129,13 @@ class ConsoleServer:
         self._console = Console(self._subscriber, self._catalog, policy)
         config = uvicorn.Config(
             self._console.app,
-            http=LimitedProtocol,
+            http=partial(LimitedProtocol, table, context),  # type: ignore[arg-type]  # called like the class
+            backlog=BACKLOG,
             log_config=None,
             access_log=False,
             server_header=False,
             ws="none",
             timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
-            ssl_certfile=None if tls is None else tls.certificate,
-            ssl_keyfile=None if tls is None else tls.key,
         )
         # Lower levels only log aborted connections.
         logging.getLogger("uvicorn").setLevel(logging.CRITICAL)

@@ -1,8 +1,6 @@
-"""Prometheus exporter of a lab: text exposition format, version 0.0.4, and its HTTP server."""
+"""Metrics of a lab in the text exposition format of Prometheus, version 0.0.4."""
 
 from collections.abc import Callable, Iterable, Iterator
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
 
 from hilrig_monitoring.lab_view import LabView, RigStatus, ServiceStatus
@@ -33,6 +31,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("recordings", "gauge", "Open recordings.", "recordings", 1),
     ("written_bytes_total", "counter", "Bytes written to recordings.", "bytes_written", 1),
     ("clock_offset_seconds", "gauge", "Largest wall clock offset to another service.", "clock_offset_ns", 1e-9),
+    ("clock_uncertainty_seconds", "gauge", "Uncertainty of this offset.", "clock_uncertainty_ns", 1e-9),
 )
 
 
@@ -88,33 +87,3 @@ def _labels(**labels: str) -> str:
         return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
 
     return ",".join(f'{name}="{escaped(value)}"' for name, value in labels.items())
-
-
-def metrics_server(address: tuple[str, int], text: Callable[[], str]) -> ThreadingHTTPServer:
-    """Create a server that answers GET /metrics with the result of `text`; the caller runs and closes it.
-
-    Raises:
-        OSError: the address is unavailable.
-    """
-
-    class Handler(BaseHTTPRequestHandler):
-        timeout = 10.0
-
-        def do_GET(self) -> None:
-            """Answer one request."""
-            if self.path.partition("?")[0] != "/metrics":
-                self.send_error(HTTPStatus.NOT_FOUND, "the metrics are at /metrics")
-                return
-            body = text().encode()
-            self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", CONTENT_TYPE)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Do not log requests: there is one per scrape."""
-
-    server = ThreadingHTTPServer(address, Handler)
-    server.daemon_threads = True
-    return server

@@ -1,7 +1,7 @@
 """A connected Modbus client as a device sees it: identity, permission, and the states that it was served."""
 
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from hilrig_modbus_edge.registers.image import NO_STATE_REF, StateRef
 
@@ -10,6 +10,17 @@ ServedState = tuple[StateRef, int]
 
 NO_STATE: Final[ServedState] = (NO_STATE_REF, 0)
 """No state was served."""
+
+
+class PollTimes(NamedTuple):
+    """How the torques of a controller that is a server were read."""
+
+    positions_acknowledged_ns: int
+    """Time at which the controller acknowledged the write of the positions of the basis, ns, monotonic clock."""
+    read_sent_ns: int
+    """Time at which the request was sent that read the torques, ns, monotonic clock."""
+    basis_is_bound: bool
+    """Whether the basis is only the newest state that the torques can answer."""
 
 
 def address_of(host: str, port: int) -> str:
@@ -51,6 +62,7 @@ class Client:
     certificate: str = ""
     """Name in its certificate; empty: it has none."""
     may_write: bool = True
+    """Whether the role in its certificate allows writes."""
     controller: ConnectedController = field(init=False)
     """The controller that it belongs to, by `controller_of`."""
     last_request_ns: int = 0
@@ -67,6 +79,17 @@ class Client:
     """`served` when its newest bytes arrived: they cannot be based on a newer one."""
     other_basis: ServedState | None = None
     """`ConnectedController.served` when its newest bytes arrived: the basis of a client that was itself served none."""
+    polled: PollTimes | None = None
+    """How its newest torques were read, if it is a controller whose client the edge is; else None."""
+    fault: str = ""
+    """Reason why that controller does not command the rig now; empty: it does."""
+    skipped_states: int = 0
+    """Number of states that were not written to that controller, because a newer one was there."""
+
+    @property
+    def label(self) -> str:
+        """Address, and the name in its certificate if it has one: for texts."""
+        return f"{self.address} (CN={self.certificate})" if self.certificate else self.address
 
     def record_request(self, now_ns: int) -> None:
         """Record that a request arrived."""

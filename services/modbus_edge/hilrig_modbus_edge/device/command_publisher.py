@@ -28,6 +28,9 @@ _FIELDS_OF_A_WRITE: Final = (
     "state_injected_ns",
     "write_arrived_ns",
     "write_received_ns",
+    "positions_acknowledged_ns",
+    "read_sent_ns",
+    "basis_is_bound",
 )
 
 
@@ -116,6 +119,8 @@ class CommandPublisher:
             on_other = basis is not client.basis and not client.was_served(basis)
             if on_other != self._basis_on_other:
                 command.basis_on_other_connection = self._basis_on_other = on_other
+        if client.polled is not None:
+            command.positions_acknowledged_ns, command.read_sent_ns, command.basis_is_bound = client.polled
         command.write_arrived_ns = arrived_ns
         command.write_received_ns = received_ns
         self._set_effort_and_session()

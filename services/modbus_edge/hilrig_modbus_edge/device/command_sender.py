@@ -36,12 +36,12 @@ class CommandSender:
         command.sent_ns = now_ns = self._monotonic_ns()
         self._repeat_due_ns = now_ns + self._repeat_ns
         payload = self._held = command.SerializeToString()
-        self._scheduler.send(self._rig, payload)
+        self._scheduler.send(self._rig, payload, now_ns)
         self._publisher.publish_encoded(payload, wall_ns)
 
     def repeat_if_due(self, now_ns: int) -> None:
         """Send the held command again if none was sent for the repetition period; ns, monotonic clock."""
         if now_ns >= self._repeat_due_ns and self._held:
             self._repeat_due_ns = now_ns + self._repeat_ns
-            self._scheduler.send(self._rig, self._held)
+            self._scheduler.send(self._rig, self._held, now_ns)
             self._publisher.republish_encoded(self._held)

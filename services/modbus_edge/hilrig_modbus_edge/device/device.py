@@ -6,14 +6,22 @@ owner calls `check` every few milliseconds; the device schedules its own deadlin
 """
 
 import random
+from collections.abc import Set as AbstractSet
 from typing import Final
 
 from pymodbus.constants import ExcCodes
 
-from hilrig_modbus_edge.device.client import Client, ConnectedController, address_of, controller_of
+from hilrig_modbus_edge.device.client import (
+    Client,
+    ConnectedController,
+    PollTimes,
+    ServedState,
+    address_of,
+    controller_of,
+)
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
-from hilrig_modbus_edge.device.events import EventEmitter
+from hilrig_modbus_edge.device.events import STATE_TIMEOUT_NS, EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
@@ -39,6 +47,7 @@ from hilrig_modbus_edge.registers.map import (
     struct_of,
 )
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
+from hilrig_runtime.process.outage import OutageDetector
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.rate_limiter import repeat_suffix
 from hilrig_schemas import Event, LeaseStatus
@@ -68,6 +77,8 @@ class Device:
         self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
         self._monotonic_ns = clock.monotonic_ns
+        self._wall_ns = clock.wall_ns
+        self._state_outages = OutageDetector(STATE_TIMEOUT_NS)
         self._session = SessionState()
         self._states = StateReader(rig, clock, output, states)
         self._sender = sender
@@ -106,6 +117,18 @@ class Device:
         client.controller = self._controllers.setdefault(name, ConnectedController(name))
         client.controller.clients.add(client)
         self.clients.add(client)
+        return client
+
+    def reserve(self, host: str, port: int, session_note: str) -> Client:
+        """Reserve the rig for a controller that is a server, and return it as a client: no other one may write.
+
+        Args:
+            host: host of the controller.
+            port: its port.
+            session_note: added to the event of each session's start; empty: nothing.
+        """
+        client = self.connect(host, port)
+        self._write_access.reserve(client, session_note)
         return client
 
     def disconnect(self, client: Client, reason: str) -> None:
@@ -262,6 +285,39 @@ class Device:
             self._commands.reset()
         self._publish_write(client, arrived_ns, received_ns)
 
+    def command(
+        self, client: Client, torque: bytes, magnet: bool, basis: ServedState, polled: PollTimes, arrived_ns: int
+    ) -> None:
+        """Publish torques and magnet that were read from the controller that the rig is reserved for.
+
+        Args:
+            client: that controller, as `reserve` returned it.
+            torque: the four torque registers, big-endian.
+            magnet: whether the magnet is on.
+            basis: state that the torques answer, and the time at which its positions were sent (ns, monotonic clock).
+            polled: how the torques were read.
+            arrived_ns: time at which they had been read, ns, monotonic clock.
+
+        Raises:
+            ModbusError: 06 its lease was revoked a moment ago.
+        """
+        client.record_request(arrived_ns)
+        client.basis, client.polled = basis, polled
+        self._write_access.authorize_write(client, TORQUES, TORQUES + POSITION_ADDRESS, arrived_ns)
+        if magnet != self._commands.magnet:
+            self._write_access.authorize_write(client, MAGNET, MAGNET + 1, arrived_ns)
+            self._commands.magnet = magnet
+        self._commands.torque[:] = torque
+        self._publish_write(client, arrived_ns, 0)
+
+    def report_fault(self, client: Client, text: str, reason: str) -> None:
+        """Emit an event for a failed request to the controller that the rig is reserved for."""
+        self._events.emit_for_controller(Event.CONTROLLER_FAULT, Event.WARNING, text, client.address, reason=reason)
+
+    def report_back(self, client: Client, text: str) -> None:
+        """Emit an event, because that controller answers again."""
+        self._events.emit_for_controller(Event.CONTROLLER_BACK, Event.INFO, text, client.address)
+
     def _publish_write(self, client: Client, arrived_ns: int, received_ns: int) -> None:
         """Publish the written registers; a command that the emulated network drops does not feed the watchdog."""
         if self._commands.publish_write(client, arrived_ns, received_ns):
@@ -270,7 +326,13 @@ class Device:
     # -- time
 
     def check(self, now_ns: int) -> None:
-        """Do everything that is due: trip, lease expiry, end of session, repetition, schedule; ns, monotonic clock."""
+        """Do everything that is due: trip, lease expiry, end of session, repetition, schedule, outages.
+
+        `now_ns`: monotonic clock.
+        """
+        outage = self._state_outages.check(self._states.last_arrived_ns, now_ns)
+        if outage is not None:
+            self._events.emit_state_outage(outage, self._wall_ns() - now_ns)
         self._write_access.check(now_ns)
         self._sender.repeat_if_due(now_ns)
         self.impairment.check(now_ns)
@@ -289,11 +351,20 @@ class Device:
         """Whether a state was received, so that positions can be read."""
         return self.refresh_state().arrival is not None
 
+    @property
+    def next_state_ns(self) -> int | None:
+        """Time at which the impaired state link delivers the next state, ns, monotonic clock; None: not known."""
+        return self._states.next_ns
+
     def refresh_state(self) -> StateImage:
         """Update the register image to the newest state, without serving it to a client, and return the image."""
         return self._states.refresh()
 
     # -- operator
+
+    def permit(self, names: AbstractSet[str] | None) -> None:
+        """Set the certificates whose clients may write; see `WriteAccess.permit`."""
+        self._write_access.permit(names)
 
     def release(self, reason: str) -> str:
         """Revoke the lease; return the previous holder, empty: none. See `WriteAccess.release`."""
@@ -347,6 +418,6 @@ class Device:
             status |= Status.WATCHDOG_ON
         if self.watchdog.state is WatchdogState.TRIPPED:
             status |= Status.WATCHDOG_TRIPPED
-        if not client.may_write:
+        if not self._write_access.may_write(client):
             status |= Status.READ_ONLY
         return status

@@ -7,11 +7,14 @@ from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
+from hilrig_runtime.process.outage import Outage, describe_outage
 from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two lease events of one kind and host, ns."""
+STATE_TIMEOUT_NS: Final = 500 * MS
+"""Time without a state after which the states are lost, ns."""
 STALL_EVENT_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two events about stalls of the edge, ns."""
 
@@ -41,14 +44,27 @@ class EventEmitter:
         text: str,
         controller: str,
         *,
+        certificate: str = "",
         reason: str = "",
         holder: str = "",
     ) -> None:
         """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
+        event.controller_data.certificate = certificate
         event.controller_data.reason = reason
         event.controller_data.holder = holder
+        self.emit(event)
+
+    def emit_state_outage(self, outage: Outage, wall_offset_ns: int) -> None:
+        """Publish that states stopped or arrive again; `wall_offset_ns`: wall clock minus monotonic clock."""
+        text = describe_outage("states", outage, wall_offset_ns)
+        if outage.has_ended:
+            event = self.event(Event.STATE_BACK, Event.INFO, text)
+        else:
+            text += ": controllers read the last one; is the simulation running, and its link up (hilrig doctor)?"
+            event = self.event(Event.STATE_LOST, Event.WARNING, text)
+        event.watchdog_data.silent_ns, event.watchdog_data.timeout_ns = outage.silent_ns, STATE_TIMEOUT_NS
         self.emit(event)
 
 
@@ -65,45 +81,55 @@ class LeaseEventReporter:
         self._events = events
         self._acquisitions: RateLimiter[str] = RateLimiter(LEASE_EVENT_PERIOD_NS)
         self._denials: RateLimiter[tuple[str, bool]] = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._pending_acquire: tuple[str, int] | None = None
-        """Address of the lease holder and time of the acquisition (ns), if it was suppressed."""
+        self._pending_acquire: tuple[Client, int] | None = None
+        """Connection of the lease holder and time of the acquisition (ns), if it was suppressed."""
 
     def lease_acquired(self, client: Client, now_ns: int) -> None:
         """Report that a client acquired the lease; ns, monotonic clock."""
         count = self._acquisitions.record(client.host, now_ns)
-        self._pending_acquire = None if count else (client.address, now_ns)
+        self._pending_acquire = None if count else (client, now_ns)
         if count:
-            self._emit_acquired(client.address, count)
+            self._emit_acquired(client, count)
 
-    def lease_released(self, address: str, reason: str, *, disconnected: bool) -> None:
+    def lease_released(self, client: Client, reason: str, *, disconnected: bool) -> None:
         """Report that the holder has no lease any more; `disconnected`: its last writing connection was closed."""
         if self._pending_acquire is not None:
             self._pending_acquire = None
             if disconnected:
                 return
-            self._emit_acquired(address)
+            self._emit_acquired(client)
         verb = "released" if disconnected else "lost"
-        text = f"{address} {verb} the lease of {self._rig}: {reason}"
-        self._events.emit_for_controller(Event.LEASE_LOST, Event.INFO, text, address, reason=reason)
+        text = f"{client.label} {verb} the lease of {self._rig}: {reason}"
+        self._events.emit_for_controller(
+            Event.LEASE_LOST, Event.INFO, text, client.address, certificate=client.certificate, reason=reason
+        )
 
     def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
         """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""
         count = self._denials.record((client.host, bool(holder)), now_ns)
         if count:
-            text = f"{client.address}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
+            text = f"{client.label}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
             self._events.emit_for_controller(
-                Event.LEASE_REFUSED, Event.WARNING, text, client.address, reason=reason, holder=holder
+                Event.LEASE_REFUSED,
+                Event.WARNING,
+                text,
+                client.address,
+                certificate=client.certificate,
+                reason=reason,
+                holder=holder,
             )
 
     def check(self, now_ns: int) -> None:
         """Report a suppressed acquisition after its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`."""
         if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
-            address, self._pending_acquire = self._pending_acquire[0], None
-            self._emit_acquired(address)
+            client, self._pending_acquire = self._pending_acquire[0], None
+            self._emit_acquired(client)
 
-    def _emit_acquired(self, address: str, count: int = 1) -> None:
-        text = f"{address} acquired the lease of {self._rig}{repeat_suffix(count)}"
-        self._events.emit_for_controller(Event.LEASE_GRANTED, Event.INFO, text, address)
+    def _emit_acquired(self, client: Client, count: int = 1) -> None:
+        text = f"{client.label} acquired the lease of {self._rig}{repeat_suffix(count)}"
+        self._events.emit_for_controller(
+            Event.LEASE_GRANTED, Event.INFO, text, client.address, certificate=client.certificate
+        )
 
 
 class StallReporter:

@@ -20,6 +20,8 @@ class Session:
     """Number among the rig's sessions since the edge started, from 1."""
     address: str
     """Address of the client that started it, "host:port"."""
+    certificate: str
+    """Name in the certificate of that client; empty: it has none."""
     controller: ConnectedController
     """The controller of that client."""
     start_wall_ns: int
@@ -32,7 +34,13 @@ class Session:
 
     def as_message(self) -> OpenSession:
         """Return the session as it is announced to the recorder."""
-        return OpenSession(rig=self.rig, session=self.id, controller=self.address, start_wall_ns=self.start_wall_ns)
+        return OpenSession(
+            rig=self.rig,
+            session=self.id,
+            controller=self.address,
+            certificate=self.certificate,
+            start_wall_ns=self.start_wall_ns,
+        )
 
 
 @dataclass(slots=True)

@@ -1,6 +1,6 @@
 """Settings of a device, converted from lab.toml to nanoseconds."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -22,6 +22,15 @@ class DeviceSettings:
     grace_ns: int
     repeat_ns: int
     impairment: ImpairmentConfig
+
+    def of_reserved_rig(self, timeout_ns: int) -> "DeviceSettings":
+        """Return the settings of a rig that is reserved for a controller whose requests have this timeout, ns.
+
+        Lease timeout and grace time together are the grace time: a lost lease has no other meaning, because no other
+        controller can acquire it.
+        """
+        lease_ns = min(self.lease_ns, max(self.grace_ns, timeout_ns))
+        return replace(self, lease_ns=lease_ns, grace_ns=max(0, self.grace_ns - lease_ns))
 
     @classmethod
     def of(cls, edge: EdgeConfig, impairment: ImpairmentConfig) -> "DeviceSettings":

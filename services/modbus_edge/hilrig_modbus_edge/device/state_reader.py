@@ -20,6 +20,17 @@ class StateReader:
         self._states = states
         self._received: TimestampedPayload | None = None
 
+    @property
+    def next_ns(self) -> int | None:
+        """Time at which the next state is due on the impaired link, ns, monotonic clock; None: none is in flight."""
+        return None if self.delayed is None else self.delayed.line.next_ns
+
+    @property
+    def last_arrived_ns(self) -> int:
+        """Arrival of the newest state at this process, ns, monotonic clock; 0: none."""
+        state = self._states.get(self._rig)
+        return 0 if state is None else state.arrived_ns
+
     def refresh(self) -> StateImage:
         """Update the register image to the newest state, and return the image."""
         state = self._states.get(self._rig)

@@ -109,11 +109,21 @@ class WriteAccess:
         self.stalls = StallReporter(events)
         self._writers = Writers()
         self._session_count = 0
-        self._last_writer = ""
-        """Address of the newest writing connection."""
+        self._reserved_for: Client | None = None
+        """The only client that may write; None: any."""
+        self._session_note = ""
+        self._last_writer: Client | None = None
+        """The newest writing connection, which may be closed."""
+        self._permitted: AbstractSet[str] | None = None
+        """Names in the certificates of the clients that may write; None: all clients."""
         self._controller_change_ns = 0
         """Earliest time at which another controller may end a session, ns, monotonic clock."""
         self._watchdog_timer: TimerHandle | None = None
+
+    def reserve(self, client: Client, session_note: str) -> None:
+        """Let only `client` write; `session_note` is added to the event of each session's start."""
+        self._reserved_for = client
+        self._session_note = session_note
 
     def authorize_write(self, client: Client, begin: int, end: int, now_ns: int) -> None:
         """Authorize a valid write of the items of `Writers` from `begin` to before `end`; ns, monotonic clock.
@@ -132,7 +142,22 @@ class WriteAccess:
             self._acquire_lease(client, now_ns)
         self._writers.record(client, begin, end, now_ns)
         client.writes = True
-        self._last_writer = client.address
+        self._last_writer = client
+
+    def permit(self, names: AbstractSet[str] | None) -> None:
+        """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
+        self._permitted = names
+        for client in self._clients:
+            if not self.may_write(client):
+                self._writers.remove(client)
+        holder = self.lease.holder
+        if holder is not None and not any(client.writes and self.may_write(client) for client in holder.clients):
+            self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
+
+    def may_write(self, client: Client) -> bool:
+        """Return whether a client may write if the rig is free: by the role and the name in its certificate."""
+        is_permitted = self._permitted is None or client.certificate in self._permitted or client is self._reserved_for
+        return client.may_write and is_permitted
 
     def authorize(self, client: Client, begin: int, end: int, now_ns: int) -> Refusal | None:
         """Return why a client may not write to the rig now; None: it may. The only place of these reasons.
@@ -148,12 +173,23 @@ class WriteAccess:
                 "read-only: the client certificate lacks the role operator; use a certificate with that role",
                 ExcCodes.ILLEGAL_FUNCTION,
             )
+        reserved_for = self._reserved_for
+        if reserved_for not in (None, client):
+            return Refusal(
+                f"the edge is a client of {reserved_for.address}, which alone commands {self._rig}; to write to the "
+                "rig, remove its controller from lab.toml",
+                ExcCodes.DEVICE_BUSY,
+                reserved_for.address,
+            )
+        if not self.may_write(client):
+            return Refusal(self._not_listed(client), ExcCodes.ILLEGAL_FUNCTION)
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
             return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
         if self.lease.holder not in (None, client.controller):
             return Refusal(
-                f"{self._holder} holds the lease; stop that client, or run: hilrig lease {self._rig} --release",
+                f"{self._last_writer_label} holds the lease; stop that client, or run: "
+                f"hilrig lease {self._rig} --release",
                 ExcCodes.DEVICE_BUSY,
                 self._holder,
             )
@@ -180,7 +216,8 @@ class WriteAccess:
             watchdog.fed_ns = now_ns
             return
         if watchdog.feed(now_ns):
-            text = f"watchdog of {self._rig} re-armed: {client.address} writes again"
+            verb = "writes" if self._reserved_for is None else "answers"
+            text = f"watchdog of {self._rig} re-armed: {client.label} {verb} again"
             event = self._events.event(Event.WATCHDOG_REARM, Event.INFO, text)
             event.watchdog_data.timeout_ns = watchdog.timeout_ns
             self._events.emit(event)
@@ -217,10 +254,14 @@ class WriteAccess:
         self._lease_events.check(now_ns)
         self.stalls.check(now_ns)
         if self.lease.expired(now_ns):
-            self._release_lease(f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)")
+            self._release_lease(self._lease_end())
         session = self._session.current
         if session is not None and session.expired(now_ns, self._settings.grace_ns):
-            self._end_session("no lease holder for the grace time (edge.session_grace_ms)")
+            self._end_session(
+                "no lease holder for the grace time (edge.session_grace_ms)"
+                if self._reserved_for is None
+                else f"{self._lease_end()} (edge.session_grace_ms)"
+            )
 
     def release(self, reason: str) -> str:
         """Revoke the lease, on request of an operator; return the previous holder, empty: none.
@@ -255,18 +296,37 @@ class WriteAccess:
             session=self._session.id,
             watchdog_tripped=self.watchdog.tripped,
             watchdog_timeout_ns=self.watchdog.timeout_ns,
+            client_of="" if self._reserved_for is None else self._reserved_for.address,
+            controller_fault="" if self._reserved_for is None else self._reserved_for.fault,
+            skipped_states=0 if self._reserved_for is None else self._reserved_for.skipped_states,
         )
 
     @property
     def _holder(self) -> str:
         """Address of the newest writing connection of the lease holder; empty: none."""
-        return "" if self.lease.holder is None else self._last_writer
+        return "" if self.lease.holder is None or self._last_writer is None else self._last_writer.address
+
+    @property
+    def _last_writer_label(self) -> str:
+        return "" if self._last_writer is None else self._last_writer.label
+
+    def _not_listed(self, client: Client) -> str:
+        """Reason why a client may only read, because [edge.tls.clients] does not permit it."""
+        if not client.certificate:
+            return (
+                "read-only: lab.toml has [edge.tls.clients], so writing needs a certificate; connect to the TLS port "
+                "with one that is listed there"
+            )
+        return (
+            f"read-only: [edge.tls.clients] does not list {self._rig} for {client.certificate}; add it in lab.toml, "
+            "then send SIGHUP to the edge"
+        )
 
     def _acquire_lease(self, client: Client, now_ns: int) -> None:
         session = self._session.current
         if session is not None and session.controller is not client.controller:
             self._controller_change_ns = now_ns + CONTROLLER_CHANGE_PERIOD_NS
-            self._end_session(f"{client.address} acquired the lease")
+            self._end_session(f"{client.label} acquired the lease")
         self.lease.acquire(client.controller)
         self._start_or_continue_session(client)
         self._lease_events.lease_acquired(client, now_ns)
@@ -283,7 +343,8 @@ class WriteAccess:
         if not self._commands.has_torque:
             # There is no torque to stop.
             self.watchdog.disarm()
-        self._lease_events.lease_released(self._last_writer, reason, disconnected=disconnected)
+        if self._last_writer is not None:
+            self._lease_events.lease_released(self._last_writer, reason, disconnected=disconnected)
 
     def _start_or_continue_session(self, client: Client) -> None:
         if self._session.current is not None:
@@ -293,15 +354,26 @@ class WriteAccess:
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._rng)
         number = self._session_count
-        self._session.current = Session(self._rig, identity, number, client.address, client.controller, wall_ns)
+        self._session.current = Session(
+            self._rig, identity, number, client.address, client.certificate, client.controller, wall_ns
+        )
         # What another connection read before the session is no basis in it: it may have been another program.
         client.controller.clear_served()
         # Watchdog timeout and echo value were written by the client of the previous session: restore the defaults.
         self.watchdog.timeout_ns = self._settings.watchdog_ns
         self._commands.echo = 0
-        event = self._events.event(Event.SESSION_START, Event.INFO, f"session {identity} started by {client.address}")
+        text, reason = f"session {identity} started by {client.label}", "lease acquired"
+        if self._reserved_for is not None:
+            text, reason = (
+                f"session {identity} started as client of {client.address}",
+                "torques read from the controller",
+            )
+        if self._session_note:
+            text, reason = f"{text}: {self._session_note}", f"{reason}: {self._session_note}"
+        event = self._events.event(Event.SESSION_START, Event.INFO, text)
         event.session_data.controller = client.address
-        event.session_data.reason = "lease acquired"
+        event.session_data.certificate = client.certificate
+        event.session_data.reason = reason
         self._events.emit(event)
         self._output.sessions_changed()
         self._impairment.start_session()
@@ -316,6 +388,7 @@ class WriteAccess:
         self.stalls.flush()
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.address
+        event.session_data.certificate = session.certificate
         event.session_data.reason = reason
         # This command tells the simulation that the session has ended. It is a new one, because it has no session.
         self._session.current = None
@@ -326,22 +399,34 @@ class WriteAccess:
     def _trip(self, silent_ns: int, now_ns: int) -> None:
         self._commands.zero()
         self._commands.publish_internal()
-        holder = self.lease.holder
-        if holder is None:
-            cause = f"{self._last_writer} no longer holds the lease"
+        holder, writer = self.lease.holder, self._last_writer_label
+        missing, rearming = "write", "write"
+        if self._reserved_for is not None:
+            missing, rearming = "torque of its program", "one"
+            cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
+        elif holder is None:
+            cause = f"{writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:
             # It may have been unplugged after a read.
-            cause = f"no request from {self._last_writer} for {quiet_ns / 1e9:.1f} s"
+            cause = f"no request from {writer} for {quiet_ns / 1e9:.1f} s"
         else:
-            cause = f"{self._last_writer} reads but does not write"
+            cause = f"{writer} reads but does not write"
         text = (
-            f"watchdog of {self._rig} tripped: no write for {silent_ns // MS} ms, torque set to zero: {cause}; "
-            "the next write re-arms it"
+            f"watchdog of {self._rig} tripped: no {missing} for {silent_ns // MS} ms, torque set to zero: {cause}; "
+            f"the next {rearming} re-arms it"
         )
         event = self._events.event(Event.WATCHDOG_TRIP, Event.WARNING, text)
         event.watchdog_data.silent_ns = silent_ns
         event.watchdog_data.timeout_ns = self.watchdog.timeout_ns
         self._events.emit(event)
+
+    def _lease_end(self) -> str:
+        """Reason for the end of the lease after its timeout."""
+        client = self._reserved_for
+        if client is None:
+            return f"no request for {self._settings.lease_ns / 1e9:g} s (edge.lease_timeout_ms)"
+        silent_s = (self._monotonic_ns() - client.last_request_ns) / 1e9
+        return f"no new torque was read for {silent_s:.1f} s: {client.fault or 'its requests take longer'}"
 
     def _schedule_check(self) -> None:
         """Schedule a check at the deadline of the watchdog.

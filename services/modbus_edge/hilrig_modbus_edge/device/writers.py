@@ -5,6 +5,7 @@ that write the same are two programs that disturb each other. Items are the writ
 order. Time is passed in.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
@@ -20,38 +21,49 @@ MAGNET: Final = _ITEMS.index("magnet")
 RESET: Final = _ITEMS.index("reset")
 
 
+@dataclass(slots=True)
+class _Write:
+    """The last write of a range of items; shared by them."""
+
+    client: Client
+    begin: int
+    end: int
+    """Item after the last one; 0: one of the items was written otherwise since."""
+    written_ns: int
+
+
 class Writers:
     """The connection that wrote each item last; items are numbered, and written in ranges."""
 
     def __init__(self) -> None:
-        self._clients: list[Client | None] = [None] * _COUNT
-        self._written_ns = [0] * _COUNT
+        self._writes: list[_Write | None] = [None] * _COUNT
 
     def rewrite(self, client: Client, begin: int, end: int, now_ns: int) -> bool:
-        """Record a write of items that `client` wrote last; return False if another one, or none, wrote one of them."""
-        count = end - begin
-        if self._clients[begin:end].count(client) != count:
+        """Record a write of items that `client` last wrote with one write too; return False if it did not."""
+        write = self._writes[begin]
+        if write is None or write.client is not client or write.begin != begin or write.end != end:
             return False
-        self._written_ns[begin:end] = [now_ns] * count
+        write.written_ns = now_ns
         return True
 
     def record(self, client: Client, begin: int, end: int, now_ns: int) -> None:
         """Record a write of items; ns, monotonic clock."""
-        self._clients[begin:end] = [client] * (end - begin)
-        self._written_ns[begin:end] = [now_ns] * (end - begin)
+        for replaced in self._writes[begin:end]:
+            if replaced is not None:
+                replaced.end = 0
+        self._writes[begin:end] = [_Write(client, begin, end, now_ns)] * (end - begin)
 
     def other(self, client: Client, begin: int, end: int, since_ns: int) -> Client | None:
         """Return another open connection that wrote one of the items since a time (ns, monotonic clock); None: none."""
-        for item in range(begin, end):
-            writer = self._clients[item]
-            if writer is not None and writer is not client and self._written_ns[item] > since_ns:
-                return writer
+        for write in self._writes[begin:end]:
+            if write is not None and write.client is not client and write.written_ns > since_ns:
+                return write.client
         return None
 
     def remove(self, client: Client) -> None:
         """Remove a closed connection."""
-        self._clients = [None if writer is client else writer for writer in self._clients]
+        self._writes = [None if write is None or write.client is client else write for write in self._writes]
 
     def clear(self) -> None:
         """Remove all connections, because the lease was released."""
-        self._clients = [None] * _COUNT
+        self._writes = [None] * _COUNT

@@ -36,18 +36,20 @@ class DecodedFrames(NamedTuple):
     """Human-readable defect of the remainder; empty: it is valid so far."""
 
 
-def decode_frames(data: bytes | bytearray) -> DecodedFrames:
-    """Decode the complete requests of `data`, in order."""
+def decode_frames(data: bytes, limit: int) -> DecodedFrames:
+    """Decode the complete requests of `data`, in order, at most `limit`."""
     requests: list[Request] = []
     start, size = 0, len(data)
     while size - start > 6:
+        if len(requests) == limit:
+            return DecodedFrames(requests, start, "")
         transaction, protocol, length, unit = HEADER.unpack_from(data, start)
         end = start + 6 + length
         if protocol or not MIN_LENGTH <= length <= MAX_LENGTH:
             break
         if end > size:
             return DecodedFrames(requests, start, "")
-        requests.append(Request(transaction, unit, bytes(data[start + 7 : end])))
+        requests.append(Request(transaction, unit, data[start + 7 : end]))
         start = end
     return DecodedFrames(requests, start, _defect(data[start : start + 6]))
 
@@ -57,7 +59,7 @@ def encode_frame(transaction: int, unit: int, pdu: bytes) -> bytes:
     return HEADER.pack(transaction, 0, len(pdu) + 1, unit) + pdu
 
 
-def _defect(header: bytes | bytearray) -> str:
+def _defect(header: bytes) -> str:
     # Reported as soon as the bytes are received: the remainder of a malformed request may never arrive.
     if any(header[2:4]):
         return f"protocol identifier 0x{header[2:4].hex()} in the MBAP header, expected 0"

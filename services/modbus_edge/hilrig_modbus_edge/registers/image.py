@@ -66,6 +66,11 @@ class StateImage:
         self._floats = ()
         return True
 
+    @property
+    def position(self) -> Sequence[float]:
+        """Position of the joints; rad, rad, m, rad."""
+        return self._message.position
+
     def status(self, now_ns: int) -> int:
         """Return the status bits that depend on the simulation; ns, monotonic clock."""
         message = self._message

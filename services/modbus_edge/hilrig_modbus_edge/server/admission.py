@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from hilrig_modbus_edge.device.client import address_of
 from hilrig_modbus_edge.device.device import Device
 from hilrig_runtime.counters import Counters
+from hilrig_runtime.pending_connections import PendingConnections
 from hilrig_runtime.timing.rate_limiter import RateLimiter
 
 REFUSED_EVENT_PERIOD_NS: Final = 1_000_000_000
@@ -40,9 +41,10 @@ class Limits:
 
 
 class PendingHandshake(Protocol):
-    """A connection that was admitted and whose TLS handshake is not complete."""
+    """A connection whose TLS handshake is not complete."""
 
-    host: str
+    peer: tuple[str, int]
+    """Host and port."""
 
     def close(self) -> None:
         """Abort the handshake and close the connection."""
@@ -52,8 +54,10 @@ class Admission:
     """Admission control of one rig."""
 
     def __init__(self, device: Device, limits: Limits, monotonic_ns: Callable[[], int], counters: Counters) -> None:
-        self.pending_handshakes: set[PendingHandshake] = set()
-        """They count as connections: otherwise one host could block all others with incomplete handshakes."""
+        self.pending_handshakes: PendingConnections[PendingHandshake] = PendingConnections(
+            limits.connections, limits.connections_per_host
+        )
+        """They are limited like connections, but do not count as such: they take no place of a controller."""
         self._device = device
         self._limits = limits
         self._monotonic_ns = monotonic_ns
@@ -61,7 +65,10 @@ class Admission:
         self._rate_limiter: RateLimiter[tuple[str, str]] = RateLimiter(REFUSED_EVENT_PERIOD_NS)
 
     def admit(self, transport: asyncio.Transport) -> tuple[str, int] | None:
-        """Return host and port of an admitted connection; else close the connection and return None."""
+        """Return host and port of an admitted connection; else close the connection and return None.
+
+        With TLS it is called again after the handshake, because others may have been admitted since.
+        """
         peer = transport.get_extra_info("peername")
         # A peer that has already disconnected has no name.
         if peer:
@@ -76,20 +83,27 @@ class Admission:
 
     def rejection_reason(self, host: str) -> str:
         """Return why a host may not connect now, human-readable; empty: it may."""
-        limits, device, pending = self._limits, self._device, self.pending_handshakes
+        limits, device = self._limits, self._device
         if limits.allow and not any(ip_address(host.partition("%")[0]) in network for network in limits.allow):
             return "its address is not in the allow-list; add it to `allow` of the rig in lab.toml"
-        if len(device.clients) + len(pending) >= limits.connections:
+        if len(device.clients) >= limits.connections:
             return (
                 f"the rig has its maximum of {limits.connections} connections; close unused ones, or raise "
                 "edge.max_connections"
             )
-        if device.connections_of(host) + sum(one.host == host for one in pending) >= limits.connections_per_host:
+        if device.connections_of(host) >= limits.connections_per_host:
             return (
                 f"the host has its maximum of {limits.connections_per_host} connections; close unused ones, or raise "
                 "edge.max_connections_per_host"
             )
         return ""
+
+    def begin_handshake(self, handshake: PendingHandshake) -> None:
+        """Track an incomplete handshake; close an older one if there are too many."""
+        oldest = self.pending_handshakes.add(handshake, handshake.peer[0])
+        if oldest is not None:
+            oldest.close()
+            self.refuse(*oldest.peer, "TLS handshake not completed before too many others were started")
 
     def refuse(self, host: str, port: int, reason: str) -> None:
         """Count a refused connection and report it, rate-limited."""

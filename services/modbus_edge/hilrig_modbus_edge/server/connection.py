@@ -22,8 +22,6 @@ from hilrig_modbus_edge.server.event_loop import SocketTransport
 from hilrig_modbus_edge.server.pdu import exception_response, execute
 from hilrig_runtime.counters import Counters
 
-BUFFER_BYTES: Final = 2048
-"""Size of the receive buffer: several of the longest requests, and few enough for a short turn."""
 MAX_REQUESTS_PER_TURN: Final = 16
 """Requests of one connection per turn of the event loop; also the TCP guide's limit of transactions."""
 _PDU: Final = HEADER.size
@@ -51,11 +49,13 @@ class ConnectionOwner(Protocol):
         """Count and log a connection that is closed because of its malformed data."""
 
 
-class Connection(asyncio.BufferedProtocol):
+class Connection(asyncio.Protocol):
     """Protocol object of one client's connection."""
 
     def __init__(self, server: ConnectionOwner, transport: asyncio.Transport, client: Client) -> None:
         self.client = client
+        self.expiry_ns = 0
+        """End of the validity of the client's certificate, ns since 1970-01-01 UTC; 0: it has none."""
         self.socket: socket.socket = transport.get_extra_info("socket")
         self._server = server
         self._transport = transport
@@ -64,14 +64,12 @@ class Connection(asyncio.BufferedProtocol):
         self._device = server.device
         self._monotonic_ns = server.monotonic_ns
         self._log_request = server.request_log.record
-        self._counters = server.counters
-        self._buffer = bytearray(BUFFER_BYTES)
-        self._view = memoryview(self._buffer)
-        self._filled = 0
-        self._backlog: list[Request] = []
+        self._pending = b""
+        """Received bytes that are not executed yet: more requests than one turn executes, or an incomplete one."""
         self._arrived_ns = self._received_ns = 0
-        """Of the backlog: arrival at this process and the kernel's receive timestamp, as in `buffer_updated`."""
-        self._malformed = ""
+        """Of the newest requests: arrival at this process, and the kernel's receive timestamp; 0: unavailable."""
+        self._draining = False
+        """Whether reading is paused until the pending requests are executed, in further turns."""
         self._blocked = False
         self._reason = ""
 
@@ -86,19 +84,14 @@ class Connection(asyncio.BufferedProtocol):
         cause = f"connection lost: {exc}" if exc else "connection closed by the client"
         self._device.disconnect(self.client, self._reason or cause)
 
-    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
-        """See `asyncio.BufferedProtocol`."""
-        return self._view[self._filled :] if self._filled else self._view
-
-    def buffer_updated(self, nbytes: int) -> None:
-        """See `asyncio.BufferedProtocol`."""
+    def data_received(self, data: bytes) -> None:
+        """See `asyncio.Protocol`."""
         now_ns = self._monotonic_ns()
-        if MIN_FRAME <= nbytes <= MAX_FRAME and not self._filled and not self._backlog:
+        if not self._pending and MIN_FRAME <= len(data) <= MAX_FRAME:
             # Fast path for the most common case, exactly one request; same result as the general path below.
-            transaction, protocol, length, unit = _unpack_header(self._buffer)
-            if nbytes == 6 + length and not protocol:
-                pdu = self._view[_PDU:nbytes].tobytes()
-                client = self.client
+            transaction, protocol, length, unit = _unpack_header(data)
+            if len(data) == 6 + length and not protocol:
+                client, pdu = self.client, data[_PDU:]
                 received_ns = self._kernel_received_ns(client.last_request_ns, now_ns) if pdu[0] in _WRITES else 0
                 client.record_request(now_ns)
                 self._transport.write(self._reply(transaction, unit, pdu, now_ns, received_ns))
@@ -106,28 +99,14 @@ class Connection(asyncio.BufferedProtocol):
         if self._transport.is_closing():
             # asyncio's TLS transport still delivers data that was already received.
             return
-        filled = self._filled + nbytes
-        requests, used, malformed = decode_frames(self._buffer[:filled])
-        self._filled = filled - used
-        if self._filled:
-            self._buffer[: self._filled] = self._buffer[used:filled]
-        received_ns = 0
+        self._pending += data
+        requests, used, malformed = decode_frames(self._pending, MAX_REQUESTS_PER_TURN)
         if requests:
-            if any(request.pdu[0] in _WRITES for request in requests):
-                received_ns = self._kernel_received_ns(self.client.last_request_ns, now_ns)
+            received_ns = self._kernel_received_ns(self.client.last_request_ns, now_ns)
+            self._arrived_ns, self._received_ns = now_ns, received_ns
             self.client.record_request(now_ns)
-        if len(requests) <= MAX_REQUESTS_PER_TURN and not self._backlog:
-            self._answer(requests, now_ns, received_ns)
-            if malformed:
-                self._close_malformed(malformed)
-            return
-        is_draining = bool(self._backlog)
-        self._backlog += requests
-        self._arrived_ns, self._received_ns = now_ns, received_ns
-        self._malformed = malformed
-        self._transport.pause_reading()
-        if not is_draining:
-            self._drain_backlog()
+        if not self._draining:
+            self._execute(requests, used, malformed)
 
     def pause_writing(self) -> None:
         """See `asyncio.BaseProtocol`."""
@@ -137,18 +116,12 @@ class Connection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         """See `asyncio.BaseProtocol`."""
         self._blocked = False
-        self._drain_backlog()
+        if self._draining:
+            self._drain()
+        else:
+            self._transport.resume_reading()
 
     # -- called by the server
-
-    def feed(self, data: bytes) -> None:
-        """Process data that was received before the connection was attached."""
-        while data and not self._transport.is_closing():
-            room = self.get_buffer(-1)
-            count = min(len(room), len(data))
-            room[:count] = data[:count]
-            self.buffer_updated(count)
-            data = data[count:]
 
     def close(self, reason: str) -> None:
         """Close the connection; `reason` is reported."""
@@ -157,24 +130,27 @@ class Connection(asyncio.BufferedProtocol):
 
     # -- inside
 
-    def _drain_backlog(self) -> None:
-        """Execute the next requests of the backlog; resume reading when it is empty."""
-        if self._blocked or self._transport.is_closing():
-            return
-        if not self._backlog:
-            self._transport.resume_reading()
-            return
-        turn, self._backlog = self._backlog[:MAX_REQUESTS_PER_TURN], self._backlog[MAX_REQUESTS_PER_TURN:]
-        self._answer(turn, self._arrived_ns, self._received_ns)
-        if not self._backlog and self._malformed:
-            self._close_malformed(self._malformed)
-        else:
-            asyncio.get_running_loop().call_soon(self._drain_backlog)
+    def _drain(self) -> None:
+        """Execute the next pending requests; resume reading when none is left."""
+        if self._draining and not self._blocked and not self._transport.is_closing():
+            self._draining = False
+            self._execute(*decode_frames(self._pending, MAX_REQUESTS_PER_TURN))
+            if not self._draining and not self._blocked:
+                self._transport.resume_reading()
 
-    def _answer(self, requests: list[Request], arrived_ns: int, received_ns: int) -> None:
+    def _execute(self, requests: list[Request], used: int, malformed: str) -> None:
+        """Execute the first pending requests; the others, if there are more, in the next turn."""
+        self._pending = self._pending[used:]
         if requests:
+            arrived_ns, received_ns = self._arrived_ns, self._received_ns
             replies = [self._reply(*request, arrived_ns, received_ns) for request in requests]
             self._transport.write(b"".join(replies))
+        if malformed:
+            self._close_malformed(malformed)
+        elif len(requests) == MAX_REQUESTS_PER_TURN and self._pending:
+            self._draining = True
+            self._transport.pause_reading()
+            asyncio.get_running_loop().call_soon(self._drain)
 
     def _reply(self, transaction: int, unit: int, pdu: bytes, arrived_ns: int, received_ns: int) -> bytes:
         client = self.client
@@ -184,7 +160,6 @@ class Connection(asyncio.BufferedProtocol):
             reply = exception_response(pdu[0], _TARGET_SILENT)
         code = reply[1] if reply[0] & 0x80 else 0
         self._log_request(pdu, arrived_ns, self._monotonic_ns(), code, client.address)
-        self._counters.requests += 1
         return _pack_header(transaction, 0, len(reply) + 1, unit) + reply
 
     def _close_malformed(self, defect: str) -> None:
@@ -192,6 +167,3 @@ class Connection(asyncio.BufferedProtocol):
         self._reason = f"not Modbus TCP: {defect}"
         # Not aborted: the responses to the valid requests before are sent first.
         self._transport.close()
-
-
-assert BUFFER_BYTES > MAX_FRAME

@@ -19,7 +19,7 @@ from hilrig_modbus_edge.server.event_loop import (
     set_receive_timestamps,
 )
 from hilrig_modbus_edge.server.tcp_figures import tcp_figures
-from hilrig_modbus_edge.server.tls import TlsHandshake, TlsPolicy
+from hilrig_modbus_edge.server.tls import ClientCertificate, TlsHandshake, TlsPolicy
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError, listen_failure
 from hilrig_runtime.timing.clock import Clock
@@ -29,6 +29,9 @@ BACKLOG: Final = 128
 """Connections that the system queues until they are accepted."""
 MALFORMED_LOG_PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two log messages about malformed data of one host, ns."""
+
+NO_CERTIFICATE: Final = ClientCertificate("", may_write=True, expiry_ns=0)
+"""Of a connection without TLS."""
 
 logger = logging.getLogger(__name__)
 
@@ -74,17 +77,18 @@ class RigServer:
         transport: asyncio.Transport,
         host: str,
         port: int,
-        may_write: bool = True,
-        certificate: str = "",
+        certificate: ClientCertificate = NO_CERTIFICATE,
         early: bytes = b"",
     ) -> None:
-        """Serve an admitted client; `certificate`: name in its certificate, `early`: data that it has already sent."""
-        client = self.device.connect(host, port, may_write=may_write, certificate=certificate)
+        """Serve an admitted client; `early`: data that it has already sent."""
+        client = self.device.connect(host, port, may_write=certificate.may_write, certificate=certificate.name)
         connection = Connection(self, transport, client)
+        connection.expiry_ns = certificate.expiry_ns
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
-        connection.feed(early)
+        if early:
+            connection.data_received(early)
 
     def report_malformed(self, client: Client, defect: str) -> None:
         """Count a connection that is closed because of malformed data, and log it, rate-limited."""
@@ -115,13 +119,26 @@ class RigServer:
             if now_ns - connection.client.last_request_ns >= self._idle_ns:
                 connection.close(f"no request for {self._idle_ns / 1e9:g} s (edge.idle_timeout_s)")
 
+    def close_certificate(self, name: str, reason: str) -> int:
+        """Close the connections of the clients with this name in their certificate; return their number."""
+        found = [connection for connection in self.connections if connection.client.certificate == name]
+        for connection in found:
+            connection.close(reason)
+        return len(found)
+
+    def close_expired(self, wall_ns: int) -> None:
+        """Close the connections whose certificate has expired; `wall_ns`: wall clock."""
+        for connection in list(self.connections):
+            if 0 < connection.expiry_ns <= wall_ns:
+                connection.close("its certificate has expired; renew it with hilrig certs")
+
     def close(self, reason: str) -> None:
         """Stop listening and close every connection."""
         for acceptor in self._acceptors:
             acceptor.cancel()
         for server in self._tls_servers:
             server.close()
-        for handshake in list(self._admission.pending_handshakes):
+        for handshake in self._admission.pending_handshakes:
             handshake.close()
         for connection in list(self.connections):
             connection.close(reason)

@@ -13,18 +13,29 @@ import stat
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from hilrig_modbus_edge.server.admission import Admission
-from hilrig_runtime.config.lab import TlsConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.errors import InputError
 
 Role = Literal["operator", "observer", "refuse"]
 """Permission of a client: write and read, read only, or no connection."""
 
-Serve = Callable[[asyncio.Transport, str, int, bool, str, bytes], None]
-"""Serves a client: its transport, host and port, whether it may write, the name in its certificate, and the data that
-it has already sent."""
+
+class ClientCertificate(NamedTuple):
+    """Properties of a client's certificate."""
+
+    name: str
+    """Common name."""
+    may_write: bool
+    """By its role."""
+    expiry_ns: int
+    """End of its validity, ns since 1970-01-01 UTC."""
+
+
+Serve = Callable[[asyncio.Transport, str, int, ClientCertificate, bytes], None]
+"""Serves a client: its transport, host and port, its certificate, and the data that it has already sent."""
 
 HANDSHAKE_TIMEOUT_S: Final = 5.0
 """Timeout of the TLS handshake and of the TLS shutdown, s."""
@@ -40,10 +51,11 @@ class TlsPolicy:
 
     def __init__(self, tls: TlsConfig) -> None:
         # Imported here: an edge without TLS does not load the certificate library.
-        from hilrig_runtime.security.x509 import common_name_of, role_of
+        from hilrig_runtime.security.x509 import common_name_of, expiry_ns_of, role_of
 
         self._role_of = role_of
-        self.name_of = common_name_of
+        self._name_of = common_name_of
+        self._expiry_ns_of = expiry_ns_of
         self._no_role: Role = tls.no_role
         self.context = context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -65,11 +77,15 @@ class TlsPolicy:
         except (ssl.SSLError, OSError) as error:
             raise InputError(f"edge.tls.authority: {tls.authority} contains no PEM certificates: {error}") from error
 
-    def role_of(self, certificate_der: bytes) -> Role:
-        """Return the role of a client with this certificate."""
+    def examine(self, certificate_der: bytes) -> ClientCertificate | None:
+        """Return the properties of a client's certificate; None: its role permits no connection."""
         role = self._role_of(certificate_der)
         # An unknown role counts as no role.
-        return "operator" if role == "operator" else "observer" if role == "observer" else self._no_role
+        permission = "operator" if role == "operator" else "observer" if role == "observer" else self._no_role
+        if permission == "refuse":
+            return None
+        name, expiry_ns = self._name_of(certificate_der), self._expiry_ns_of(certificate_der)
+        return ClientCertificate(name, permission == "operator", expiry_ns)
 
 
 class TlsHandshake(asyncio.Protocol):
@@ -81,7 +97,7 @@ class TlsHandshake(asyncio.Protocol):
         self._admission = admission
         self._policy = policy
         self._serve = serve
-        self.host = ""
+        self.peer = ("", 0)
         self._early = bytearray()
         self._task: asyncio.Task[None] | None = None
 
@@ -91,8 +107,8 @@ class TlsHandshake(asyncio.Protocol):
         self._transport = transport
         peer = self._admission.admit(transport)
         if peer is not None:
-            self.host = peer[0]
-            self._admission.pending_handshakes.add(self)
+            self.peer = peer
+            self._admission.begin_handshake(self)
             self._task = asyncio.get_running_loop().create_task(self._complete(*peer))
 
     def data_received(self, data: bytes) -> None:
@@ -127,17 +143,16 @@ class TlsHandshake(asyncio.Protocol):
             self._admission.pending_handshakes.discard(self)
         if secured.is_closing():
             return
-        certificate = secret.getpeercert(binary_form=True) or b""
-        role = self._policy.role_of(certificate)
-        if role == "refuse":
+        certificate = self._policy.examine(secret.getpeercert(binary_form=True) or b"")
+        if certificate is None:
             self._admission.refuse(
                 host,
                 port,
                 "its certificate has no role that may connect; use a certificate with the role operator or observer",
             )
             secured.abort()
-            return
-        self._serve(secured, host, port, role == "operator", self._policy.name_of(certificate), bytes(self._early))
+        elif self._admission.admit(secured) is not None:
+            self._serve(secured, host, port, certificate, bytes(self._early))
 
 
 def _reason(error: Exception) -> str:

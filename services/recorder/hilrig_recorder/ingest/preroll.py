@@ -8,7 +8,7 @@ large lab these are a hundred thousand, and buffering must cost less than record
 from collections import deque
 from dataclasses import dataclass, field
 
-from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.ingest.recording import LossCounters, Recording
 from hilrig_recorder.ingest.sources import PublisherState
 
 
@@ -25,7 +25,7 @@ class PreRollBuffer:
     pending: list[bytes] = field(default_factory=list)
     """Encoded messages that are not in a block yet. `SessionTracker.accept` appends to this list object."""
     _blocks: deque[tuple[int, list[bytes]]] = field(default_factory=deque)
-    _losses: deque[tuple[int, int, int]] = field(default_factory=deque)
+    _losses: deque[tuple[int, LossCounters]] = field(default_factory=deque)
 
     def flush_block(self, wall_ns: int) -> None:
         """Move the pending messages into a block and write it to the open recordings."""
@@ -38,24 +38,18 @@ class PreRollBuffer:
         for recording in self.recordings.copy():
             recording.write(block)
 
-    def record_loss(self, wall_ns: int, transport: int, recorder: int) -> None:
-        """Count lost messages, in the open recordings and in those that start within the pre-roll time."""
-        self._losses.append((wall_ns, transport, recorder))
+    def record_loss(self, wall_ns: int, lost: LossCounters) -> None:
+        """Count lost messages or batches, in the open recordings and in those that start within the pre-roll time."""
+        self._losses.append((wall_ns, lost))
         for recording in self.recordings:
-            self._count_loss(recording, transport, recorder)
+            recording.count_loss(lost)
 
     def add(self, recording: Recording, horizon_ns: int) -> None:
         """Add a recording and write the messages that arrived since `horizon_ns`. Call `flush_block` before."""
-        for _, transport, recorder in self._losses:
-            self._count_loss(recording, transport, recorder)
+        for _, lost in self._losses:
+            recording.count_loss(lost)
         self.recordings.append(recording)
         recording.write([record for _, block in self._blocks for record in block], horizon_ns)
-
-    @staticmethod
-    def _count_loss(recording: Recording, transport: int, recorder: int) -> None:
-        recording.counters.lost_transport += transport
-        recording.counters.lost_recorder += recorder
-        recording.counted_losses += transport + recorder
 
     def evict(self, horizon_ns: int, wall_ns: int) -> None:
         """Remove blocks and losses older than `horizon_ns`."""

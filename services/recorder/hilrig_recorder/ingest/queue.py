@@ -112,8 +112,9 @@ class IngestQueue:
             dropped.last_sequence = sequence
             self.dropped += 1
         put_entries(marker.batch, kept)
-        marker.batch.sequence = batch.sequence
-        marker.batch_count += 1
+        if not batch.events:
+            marker.batch.sequence = batch.sequence
+            marker.batch_count += 1
         if batch.complete_sessions or batch.sessions:
             marker.batch.complete_sessions = batch.complete_sessions
             del marker.batch.sessions[:]

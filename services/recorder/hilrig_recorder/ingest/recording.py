@@ -45,6 +45,8 @@ class Recording:
     """When the recording was opened, monotonic clock, ns."""
     store: "RecordingStore" = field(repr=False)
     """Has its file."""
+    certificate: str = ""
+    """Name in the controller's certificate; empty: it has none."""
     counters: LossCounters = field(default_factory=LossCounters)
     seen: set[tuple[int, int, int]] | None = None
     """(channel id, sequence, publish time) of messages in the previous segment; None: no duplicates are expected."""
@@ -61,6 +63,13 @@ class Recording:
     """When the end was received, monotonic clock, ns."""
     missing_announcements: int = 0
     """Consecutive session announcements of the owner that did not contain this session."""
+
+    def count_loss(self, lost: LossCounters) -> None:
+        """Add lost messages and batches to the counters of the file."""
+        self.counters.lost_transport += lost.lost_transport
+        self.counters.lost_recorder += lost.lost_recorder
+        self.counters.lost_batches += lost.lost_batches
+        self.counted_losses += lost.lost_transport + lost.lost_recorder
 
     def write(self, records: Sequence[bytes], not_before_ns: int = 0) -> None:
         """Write those messages that belong to this file and arrived at `not_before_ns` (wall clock) or later."""
@@ -112,6 +121,9 @@ class RecordingStore(Protocol):
 
     def record_source(self, recording: Recording, source: str, incarnation: int) -> None:
         """Record in the file that an instance of a service contributes to the recording."""
+
+    def report_outage(self, recordings: Sequence[Recording], text: str, *, has_ended: bool) -> None:
+        """Report to the operator, and in these recordings, that messages stopped or arrive again."""
 
     def report_rejected(self, message: str) -> None:
         """Report input that is not recorded to the operator."""

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 
 from hilrig_recorder.ingest.preroll import PreRollBuffer
 from hilrig_recorder.ingest.queue import ReceivedBatch
-from hilrig_recorder.ingest.recording import SECOND_NS, Recording, RecordingStore
+from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording, RecordingStore
 from hilrig_recorder.ingest.sources import (
     MAX_GAP,
     SETTLE_TIME_NS,
@@ -27,7 +27,8 @@ from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
-from hilrig_schemas import Event, LogBatch
+from hilrig_runtime.process.outage import OutageDetector, describe_outage
+from hilrig_schemas import Event, LogBatch, OpenSession
 from hilrig_schemas.topics import EVENT, SERVICES, is_name, parse_rig_key
 
 BLOCK_PERIOD_NS: Final = 8 * SECOND_NS // 10
@@ -40,6 +41,8 @@ DRAIN_MAX_NS: Final = 10 * SECOND_NS
 """Maximum time that a file stays open after the end of its session; the caches of recording streams are not longer."""
 OWNER_TIMEOUT_NS: Final = 30 * SECOND_NS
 """A session ends when its owner is silent for this time."""
+STREAM_TIMEOUT_NS: Final = 8 * SECOND_NS // 10
+"""Time without a batch of a service after which its messages are missing; an idle edge sends two a second."""
 RETRY_PERIOD_NS: Final = 10 * SECOND_NS
 """Time until a session that could not be recorded is tried again."""
 MAX_REJECTIONS: Final = 100
@@ -95,6 +98,9 @@ class SessionTracker:
         self._rejected: set[str] = set()
         self.lost_transport = 0
         self.lost_recorder = 0
+        self.lost_batches: dict[str, int] = {}
+        """Lost batches of each publisher that are not logged yet: the recorder logs and removes them."""
+        self._outages: dict[str, OutageDetector] = {}
 
     @property
     def recordings(self) -> list[Recording]:
@@ -108,11 +114,22 @@ class SessionTracker:
     # -- messages ---------------------------------------------------------------------------------------------------
 
     def accept(self, received: ReceivedBatch, now_ns: int) -> None:
-        """Process one batch."""
-        batch = received.batch
-        log_time = self._wall_ns = received.wall_ns
-        publisher = self._update_publisher(received, now_ns)
-        streams = publisher.streams
+        """Process one batch, and the batches of events that wait for it."""
+        self._wall_ns = received.wall_ns
+        publisher = self._publishers.publisher_of(received, now_ns)
+        if received.batch.events:
+            publisher.held.append(received)
+        else:
+            self._update_publisher(publisher, received, now_ns)
+            self._accept_messages(publisher, received.batch, now_ns)
+            self._accept_dropped(publisher, received, now_ns)
+            if received.batch.sessions or received.batch.complete_sessions:
+                self._handle_announcement(publisher, received.batch, now_ns)
+        while (events := publisher.next_events()) is not None:
+            self._accept_messages(publisher, events, now_ns)
+
+    def _accept_messages(self, publisher: PublisherState, batch: LogBatch, now_ns: int) -> None:
+        streams, log_time = publisher.streams, self._wall_ns
         for key, sequence, publish_ns, payload in entries_of(batch):
             stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is None:
@@ -135,28 +152,43 @@ class SessionTracker:
                     self._reject(f"{publisher.name}: event on {key}: {error}")
                     continue
             stream.expected = sequence + 1
-            stream.pending.append(encode_message(channel_id, sequence, log_time, publish_ns, payload))
+            record = encode_message(channel_id, sequence, log_time, publish_ns, payload)
+            if event is not None and publisher.is_before_first(batch):
+                self._accept_earlier_event(publisher, stream, event.session, record)
+                continue
+            stream.pending.append(record)
             if event is not None:
+                publisher.passed_ns = max(publisher.passed_ns, publish_ns)
                 self._handle_event(publisher, event, publish_ns, now_ns)
+
+    def _accept_earlier_event(self, publisher: PublisherState, stream: KeyStream, session: str, record: bytes) -> None:
+        """Record an event that precedes everything else that was received of its publisher, if its session continues.
+
+        A restarted recorder may receive events of hours ago.
+        """
+        if session in self._recordings:
+            stream.pending.append(record)
+        elif session:
+            publisher.earlier_events.setdefault(session, []).append(record)
+
+    def _accept_dropped(self, publisher: PublisherState, received: ReceivedBatch, now_ns: int) -> None:
         for key, dropped in received.dropped.items():
-            stream = streams.get(key) or self._add_stream(publisher, key, now_ns)
+            stream = publisher.streams.get(key) or self._add_stream(publisher, key, now_ns)
             if stream is not None:
                 missing = dropped.last_sequence + 1 - stream.expected if stream.expected else dropped.count
                 missing = min(missing, MAX_GAP)
                 stream.expected = dropped.last_sequence + 1
                 self._record_loss(publisher, stream, max(0, missing - dropped.count), dropped.count)
-        if batch.sessions or batch.complete_sessions:
-            self._handle_announcement(publisher, batch, now_ns)
 
-    def _update_publisher(self, received: ReceivedBatch, now_ns: int) -> PublisherState:
-        publisher = self._publishers.publisher_of(received, now_ns)
+    def _update_publisher(self, publisher: PublisherState, received: ReceivedBatch, now_ns: int) -> None:
         missing, clock_stepped = publisher.update(received, now_ns)
         if missing:
-            for recording in self._recordings_of(publisher):
-                recording.counters.lost_batches += missing
+            self.lost_batches[publisher.name] = self.lost_batches.get(publisher.name, 0) + missing
+            for rig in self._rigs.values():
+                if rig.publishers.get(publisher.name) is publisher:
+                    rig.record_loss(self._wall_ns, LossCounters(lost_batches=missing))
         if clock_stepped:
             self._count_clock_step(now_ns)
-        return publisher
 
     def _add_stream(self, publisher: PublisherState, key: str, now_ns: int) -> KeyStream | None:
         if key in publisher.streams or len(publisher.streams) >= MAX_KEYS:
@@ -209,7 +241,7 @@ class SessionTracker:
         self.lost_transport += transport
         self.lost_recorder += recorder
         rig = self._rigs[stream.rig]
-        rig.record_loss(self._wall_ns, transport, recorder)
+        rig.record_loss(self._wall_ns, LossCounters(transport, recorder))
         for recording in rig.recordings:
             self._store.record_loss(recording, publisher.name, stream.key, transport, recorder)
 
@@ -231,7 +263,15 @@ class SessionTracker:
 
     def _handle_event(self, publisher: PublisherState, event: Event, publish_ns: int, now_ns: int) -> None:
         if event.kind == Event.SESSION_START:
-            self._open(publisher.name, event.rig, event.session, event.session_data.controller, event.wall_ns, now_ns)
+            data = event.session_data
+            session = OpenSession(
+                rig=event.rig,
+                session=event.session,
+                controller=data.controller,
+                certificate=data.certificate,
+                start_wall_ns=event.wall_ns,
+            )
+            self._open(publisher.name, session, now_ns)
         elif event.kind == Event.SESSION_END:
             recording = self._recordings.get(event.session)
             if recording is not None and recording.owner != publisher.name:
@@ -250,7 +290,7 @@ class SessionTracker:
     def _handle_announcement(self, publisher: PublisherState, batch: LogBatch, now_ns: int) -> None:
         listed = {session.session: session for session in batch.sessions}
         for session in listed.values():
-            self._open(publisher.name, session.rig, session.session, session.controller, session.start_wall_ns, now_ns)
+            self._open(publisher.name, session, now_ns)
         if not batch.complete_sessions:
             return
         for recording in self._recordings.values():
@@ -265,7 +305,8 @@ class SessionTracker:
                 reason = f"{publisher.name} no longer announces the session"
                 self._end(recording, reason, publisher.last_publish_ns, now_ns)
 
-    def _open(self, owner: str, rig_name: str, session: str, controller: str, start_wall_ns: int, now_ns: int) -> None:
+    def _open(self, owner: str, opened: OpenSession, now_ns: int) -> None:
+        rig_name, session = opened.rig, opened.session
         if session in self._recordings or session in self._blocked_until or not self._is_assigned(rig_name):
             return
         if not _SESSION_ID.fullmatch(session) or not is_name(rig_name):
@@ -278,7 +319,16 @@ class SessionTracker:
         if rig is None or len(rig.recordings) >= MAX_RECORDINGS_PER_RIG:
             self._reject(f"{owner}: more sessions than {MAX_RECORDINGS_PER_RIG} of a rig, or too many rigs")
             return
-        recording = Recording(rig_name, session, controller, owner, start_wall_ns, now_ns, self._store)
+        recording = Recording(
+            rig_name,
+            session,
+            opened.controller,
+            owner,
+            opened.start_wall_ns,
+            now_ns,
+            self._store,
+            certificate=opened.certificate,
+        )
         if not self._store.open(recording):
             self._block(session, now_ns + RETRY_PERIOD_NS)
             return
@@ -286,6 +336,8 @@ class SessionTracker:
         for publisher in rig.publishers.values():
             self._store.record_source(recording, publisher.name, publisher.incarnation)
         rig.flush_block(self._wall_ns)
+        for publisher in rig.publishers.values():
+            recording.write(publisher.earlier_events.pop(session, ()))
         rig.add(recording, self._wall_ns - self._preroll_ns)
 
     def _end(self, recording: Recording, reason: str, end_wall_ns: int, now_ns: int) -> None:
@@ -315,6 +367,7 @@ class SessionTracker:
                 rig.flush_block(wall_ns)
                 rig.evict(wall_ns - self._preroll_ns, wall_ns)
         last_received = self._publishers.last_received()
+        self._check_outages(last_received, now_ns, wall_ns)
         for recording in self.recordings:
             if recording.seen is not None and now_ns - recording.opened_ns > SETTLE_TIME_NS:
                 # All cached messages were received: no more duplicates.
@@ -330,6 +383,23 @@ class SessionTracker:
             for rig in self._rigs.values():
                 if rig.publishers.get(publisher.name) is publisher:
                     del rig.publishers[publisher.name]
+
+    def _check_outages(self, last_received: dict[str, int], now_ns: int, wall_ns: int) -> None:
+        """Report the publishers of open recordings whose recording streams stopped or arrive again."""
+        for name, last_ns in last_received.items():
+            outage = self._outages.setdefault(name, OutageDetector(STREAM_TIMEOUT_NS)).check(last_ns, now_ns)
+            if outage is None:
+                continue
+            recordings = [
+                recording
+                for recording in self._recordings.values()
+                if recording.end_wall_ns is None and name in self._rigs[recording.rig].publishers
+            ]
+            text = describe_outage(f"messages of {name}", outage, wall_ns - now_ns)
+            if recordings:
+                self._store.report_outage(recordings, text, has_ended=outage.has_ended)
+        for name in self._outages.keys() - last_received:
+            del self._outages[name]
 
     def _check_owner(self, recording: Recording, last_received_ns: int, now_ns: int) -> None:
         if now_ns - max(last_received_ns, recording.opened_ns) > OWNER_TIMEOUT_NS:
@@ -347,7 +417,7 @@ class SessionTracker:
         # A stream is in order. It has passed the end when its publish times have. A publisher without messages has
         # passed the end when one of its batches arrived well after the end.
         return draining_ns >= DRAIN_MIN_NS and all(
-            publisher.last_publish_ns >= end_wall_ns or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            publisher.passed_ns >= end_wall_ns or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
             for publisher in self._rigs[recording.rig].publishers.values()
             if recording.rig in publisher.continuous_rigs
         )

@@ -43,7 +43,7 @@ class FileStore:
         sync_worker: syncs and finishes the files.
         instance: instance name of the recorder.
         repeated_ns: maximum age of the messages that publishers send again after a restart of the recorder, ns.
-        emit: publishes an event for the operator.
+        emit: publishes events for the operator, of several rigs about the same; logs them as one message.
         request_config: requests the configuration of a rig.
         on_failed: called with a recording whose file failed.
     """
@@ -57,7 +57,7 @@ class FileStore:
         *,
         instance: str,
         repeated_ns: int,
-        emit: Callable[[Event], None],
+        emit: Callable[..., None],
         request_config: Callable[[str], None],
         on_failed: Callable[[Recording], None],
     ) -> None:
@@ -136,6 +136,16 @@ class FileStore:
         file = self._files.get(recording)
         if file is not None and file.record_source(source, incarnation):
             self._request_config(recording.rig)
+
+    def report_outage(self, recordings: Sequence[Recording], text: str, *, has_ended: bool) -> None:
+        """Emit an event of each recording's rig, and log one message."""
+        severity = Event.INFO if has_ended else Event.WARNING
+        self._emit(
+            *(
+                Event(kind=Event.RECORDING, severity=severity, text=text, rig=recording.rig, session=recording.session)
+                for recording in recordings
+            )
+        )
 
     def report_rejected(self, message: str) -> None:
         """Emit a warning about input that is not recorded."""
@@ -222,6 +232,7 @@ class FileStore:
             "rig": recording.rig,
             "lab": self._lab,
             "controller": recording.controller,
+            "certificate": recording.certificate,
             "keeper": recording.owner,
             "start": start.strftime("%Y-%m-%dT%H:%M:%SZ"),
             "start_wall_ns": str(recording.start_wall_ns),

@@ -27,6 +27,14 @@ def certs(
     days: Annotated[
         int, typer.Option(min=1, max=36_500, help="Validity, days; the authorities are valid ten times as long.")
     ] = 365,
+    revoke: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Instead of creating certificates: make all edges read lab.toml again, which must no longer list NAME "
+            "in \\[edge.tls.clients], and close the connections of NAME.",
+        ),
+    ] = "",
     renew: Annotated[bool, typer.Option("--renew", help="Renew all certificates except the authorities.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -36,16 +44,24 @@ def certs(
     separate authority, are for the services, the router and the commands. Existing certificates are kept until they
     are about to expire, except those named with --client. Authorities are always kept, so controllers can be added
     later. Keep the private keys of the authorities (ca.key) secret.
+
+    To withdraw a controller's certificate, remove it from \\[edge.tls.clients] of lab.toml on all hosts of edges, then
+    use --revoke.
     """
     from datetime import UTC, datetime
 
     from hilrig_cli.cert_store import CertificateStore
+    from hilrig_cli.revocation import revoke_client
     from hilrig_runtime.bus.acl import identities
     from hilrig_runtime.config.bus import BusTlsConfig
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.security.x509 import issue_client, issue_peer, issue_server
 
     lab = load_lab(config)
+    if revoke:
+        results = revoke_client(lab, revoke)
+        print(json.dumps({"revoked": revoke, "edges": results}) if as_json else "\n".join(results.values()))
+        return
     now = datetime.now(UTC)
     clients = dict(_parse_client(text) for text in client or ["operator=operator", "observer=observer"])
     loopback = ["localhost", "127.0.0.1"]

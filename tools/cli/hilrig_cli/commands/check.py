@@ -49,5 +49,8 @@ def check(
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
         table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
     TerminalConsole().print(table)
+    for rig in lab.rigs:
+        if rig.controller is not None:
+            print(f"{rig.name}: {rig.describe_controller()}")
     for warning in accuracy_warnings(rigs):
         print(f"warning: {warning}", file=sys.stderr)

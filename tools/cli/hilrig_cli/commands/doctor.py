@@ -61,8 +61,8 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     # Without the bus the services are unknown; the checks of this host still run.
     snapshot = joined or services.BusSnapshot()
     results += services.check_realtime(lab, snapshot)
-    results += services.check_versions((health for health, _ in snapshot.healths.values()), version("hilrig"))
-    results += services.check_clocks(list(snapshot.healths.values()))
+    results += services.check_versions(snapshot.healths.values(), version("hilrig"))
+    results += services.check_clocks(snapshot.clocks)
     if lab.bus.tls is not None or lab.edge.tls is not None:
         results += _check_certificates(lab)
     results += host.check_ports(lab, snapshot.services)
@@ -106,7 +106,7 @@ def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[Check
         return [CheckResult.error(service, str(error), "see the service's log")]
     if service == "router":
         return [CheckResult.ok(service, "running")]
-    for name, (health, _) in snapshot.healths.items():
+    for name, health in snapshot.healths.items():
         if matches(name, wanted):
             if health.alert:
                 return [CheckResult.error(service, health.alert, "see the service's log")]

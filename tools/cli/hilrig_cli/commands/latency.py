@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hilrig_replay.analysis.latency import LatencyReport
+    from hilrig_replay.io.run import Run
+    from hilrig_runtime.config.task import TaskConfig
 
 
 def latency(
@@ -37,6 +40,7 @@ def latency(
     Exit code 1: a recording is not valid for latency measurements, or one of several is unreadable; the reasons are
     printed.
     """
+    from hilrig_replay.analysis.intervals import aggregate
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.isolation import isolated
     from hilrig_replay.io.paths import display_names, find_recordings
@@ -57,7 +61,7 @@ def latency(
         try:
             with isolated(path):
                 run = open_run(path)
-                report = measure(run)
+                report = measure(run, task=_task(run))
         except HilrigError as error:
             # An unreadable recording of several is reported in its own line.
             if len(paths) == 1:
@@ -69,7 +73,8 @@ def latency(
         # Of each recording only the statistics are kept, not the samples.
         reports.append((path, report.without_table()))
     if as_json:
-        overview = {"runs": [{"path": str(path), **each.as_dict()} for path, each in reports], "unreadable": unreadable}
+        every = [{"path": str(path), **each.as_dict()} for path, each in reports]
+        overview = {"runs": every, "aggregate": aggregate(every), "unreadable": unreadable}
         print(json.dumps(reports[0][1].as_dict() if len(paths) == 1 else overview))
     elif len(paths) == 1:
         print_report(reports[0][1])
@@ -82,6 +87,16 @@ def latency(
         raise typer.Exit(1)
 
 
+def _task(run: "Run") -> "TaskConfig | None":
+    """The recorded task; None: not recorded, or of another version, which only a grade reports."""
+    from hilrig_replay.grading.task_loading import recorded_task
+    from hilrig_runtime.errors import InputError
+
+    with suppress(InputError):
+        return recorded_task(run)
+    return None
+
+
 def print_report(report: "LatencyReport") -> None:
     """Print the latency report of one run: a table, losses, findings and the verdict."""
     from rich.box import SIMPLE_HEAD
@@ -89,7 +104,9 @@ def print_report(report: "LatencyReport") -> None:
     from rich.text import Text
 
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_replay.analysis.diagnosis.evidence import sections
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
+    from hilrig_replay.analysis.intervals import cells
     from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = TerminalConsole()
@@ -100,13 +117,13 @@ def print_report(report: "LatencyReport") -> None:
     for title in STATISTICS_TITLES:
         table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
-        table.add_row("loop", *report.loop_ms.cells(), style="bold", end_section=True)
+        table.add_row("loop", *cells(report.loop_ms, report.intervals_ms["loop"]), style="bold", end_section=True)
         for stage in LOOP_STAGES:
-            table.add_row(f"  {stage.title}", *report.stages_ms[stage.key].cells())
+            table.add_row(f"  {stage.title}", *cells(report.stages_ms[stage.key], report.intervals_ms[stage.key]))
         table.add_section()
     if report.age_ms is not None:
-        table.add_row("age", *report.age_ms.cells(), style="bold", end_section=True)
-    table.add_row("tick lateness", *report.jitter_ms.tick_lateness.cells())
+        table.add_row("age", *cells(report.age_ms, report.intervals_ms["age"]), style="bold", end_section=True)
+    table.add_row("tick lateness", *cells(report.jitter_ms.tick_lateness))
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
     lost = f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"
@@ -115,8 +132,10 @@ def print_report(report: "LatencyReport") -> None:
     console.print(lost if report.loop_ms is None else jitter + lost)
     for note in report.notes():
         console.print(Text(note))
-    for finding in report.findings:
-        console.print(Text(f"• {finding.text}"))
+    for title, sentences in sections(report.findings):
+        console.print(f"{title}:")
+        for sentence in sentences:
+            console.print(Text(f"• {sentence}"))
     if report.fit:
         console.print(Text("valid for latency measurements", style="green"))
     else:
@@ -124,12 +143,13 @@ def print_report(report: "LatencyReport") -> None:
 
 
 def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
-    """Print a table of runs by name, one line each, and below it their findings or reasons."""
+    """Print a table of runs by name, one line each, their medians, and below it their findings or reasons."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text
 
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_replay.analysis.intervals import aggregate, rounded
 
     console = TerminalConsole()
     title = f"Loop latency of {len(reports)} runs, ms"
@@ -138,14 +158,33 @@ def print_overview(reports: "Mapping[str, LatencyReport]") -> None:
     for column in ("samples", "p50", "p99", "p99.9", "max", "age p50", "age p99"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("valid")
+    columns = [("loop", name) for name in ("p50", "p99", "p999", "max")] + [("age", name) for name in ("p50", "p99")]
     for name, report in reports.items():
-        loop = report.loop_ms
-        figures = [f"{value:.2f}" for value in (loop.p50, loop.p99, loop.p999, loop.max)] if loop else ["–"] * 4
-        age = report.age_ms
-        figures += [f"{value:.2f}" for value in (age.p50, age.p99)] if age else ["–"] * 2
+        found = {"loop": report.loop_ms, "age": report.age_ms}
+        figures = [
+            "–"
+            if (statistics := found[quantity]) is None
+            else rounded(getattr(statistics, key), report.intervals_ms[quantity].get("p999" if key == "max" else key))
+            for quantity, key in columns
+        ]
         table.add_row(name, str(report.samples), *figures, "yes" if report.fit else "no")
+    over_runs = aggregate([report.as_dict() for report in reports.values()])
+    if over_runs:
+        table.add_section()
+        medians = [over_runs.get(f"{quantity}_ms", {}).get(key) for quantity, key in columns]
+        texts = ["–" if found is None else rounded(found["median"], found["interval"]) for found in medians]
+        table.add_row("median over runs", "", *texts, "", style="bold")
+        if any(found and found["interval"] for found in medians):
+            texts = ["–" if not (found and found["interval"]) else _range(found["interval"]) for found in medians]
+            table.add_row("its 95 % interval", "", *texts, "")
     console.print(table)
     for name, report in reports.items():
-        note = report.reason_text() or ", ".join(finding.kind.replace("_", " ") for finding in report.findings)
+        note = report.reason_text() or ", ".join(finding.code.replace("_", " ") for finding in report.findings)
         if note:
             console.print(Text(f"{name}: {'' if report.fit else 'not valid: '}{note}"))
+
+
+def _range(interval: tuple[float, float]) -> str:
+    from hilrig_replay.analysis.intervals import rounded
+
+    return " to ".join(rounded(bound, interval) for bound in interval)

@@ -51,6 +51,9 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
         "connections": status.connections,
         "watchdog_tripped": status.watchdog_tripped,
         "watchdog_timeout_ms": status.watchdog_timeout_ns / 1e6,
+        "client_of": status.client_of,
+        "controller_fault": status.controller_fault,
+        "skipped_states": status.skipped_states,
     }
 
 
@@ -61,12 +64,13 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
 
     table = Table()
     for column in ("rig", "lease holder", "last request", "session", "connections", "watchdog"):
-        table.add_column(column, no_wrap=column in ("rig", "lease holder"), overflow="fold")
+        table.add_column(column, no_wrap=column == "rig", overflow="fold")
     for status in statuses:
         timeout = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
+        holder = f"client of {status.client_of}" if status.client_of else status.holder or "none"
         table.add_row(
             status.rig,
-            status.holder or "none",
+            f"{holder}: {status.controller_fault}" if status.controller_fault else holder,
             f"{status.silent_ns / 1e9:.1f} s ago" if status.holder else "",
             status.session,
             str(status.connections),

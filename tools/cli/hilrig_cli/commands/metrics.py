@@ -1,6 +1,5 @@
 """`hilrig metrics`: Prometheus exporter of the lab."""
 
-import threading
 import time
 from typing import Annotated
 
@@ -20,15 +19,18 @@ def metrics(
     One process serves the whole lab. It uses the health reports that the services publish anyway.
     """
     from hilrig_monitoring.lab_watch import LabWatch
-    from hilrig_monitoring.prometheus import exposition, metrics_server
+    from hilrig_monitoring.metrics_server import MetricsServer
+    from hilrig_monitoring.prometheus import exposition
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError, OperationError
     from hilrig_runtime.process.shutdown import stop_on_signals, wait_for
+    from hilrig_runtime.timing.realtime import lower_priority
 
     lab = load_lab(config)
     host, colon, port = listen.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise InputError(f"--listen: expected HOST:PORT, for example 127.0.0.1:9464, got {listen!r}")
+    lower_priority()
     stopping = stop_on_signals()
     with LabWatch(lab) as watch:
 
@@ -37,13 +39,11 @@ def metrics(
                 return exposition(watch.view, lab.name, time.monotonic())
 
         try:
-            server = metrics_server((host.strip("[]"), int(port)), text)
+            server = MetricsServer((host.strip("[]"), int(port)), text)
         except OSError as error:
             raise OperationError(
                 f"can't listen on {listen}: {error.strerror}; choose another address with --listen"
             ) from error
         with server:
-            threading.Thread(target=server.serve_forever, name="metrics", daemon=True).start()
             print(f"metrics of lab {lab.name}: http://{host or '0.0.0.0'}:{server.server_port}/metrics", flush=True)
             wait_for(stopping)
-            server.shutdown()

@@ -51,6 +51,10 @@ def add(
         int | None,
         typer.Option(help="Modbus TCP port; default: the next free port after the lab's ports."),
     ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(metavar="HOST[:PORT]", help="Controller that is a Modbus server; the edge becomes its client."),
+    ] = None,
     settings: Annotated[
         Path | None,
         typer.Option(
@@ -69,7 +73,7 @@ def add(
     from hilrig_schemas import AddRig, ControlRequest, RemoveRig
 
     with _join(config) as (lab, bus, found):
-        new = _settings(found, rig, port, settings)
+        new = _settings(found, rig, {"port": port, "controller": controller}, settings)
         simulation = _least_loaded(found, "sim", lab)
         edge = _least_loaded(found, "edge", lab)
         request = ControlRequest(add_rig=AddRig(settings_json=new.model_dump_json()))
@@ -150,7 +154,7 @@ def _rows(lab: "LabConfig", infos: "list[ServiceInfo]") -> list[dict[str, Any]]:
     return rows
 
 
-def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: Path | None) -> "RigSettings":
+def _settings(infos: "list[ServiceInfo]", rig: str, options: dict[str, Any], settings: Path | None) -> "RigSettings":
     from hilrig_runtime.config.lab import read_rig
     from hilrig_runtime.config.validation import parse_toml, read_text
     from hilrig_runtime.errors import InputError
@@ -158,9 +162,8 @@ def _settings(infos: "list[ServiceInfo]", rig: str, port: int | None, settings: 
     if any(rig in info.rigs for info in infos if info.service in ("sim", "edge")):
         raise InputError(f"rig {rig!r} already exists in the lab: choose another name")
     values = {} if settings is None else parse_toml(read_text(settings), str(settings))
-    if port is not None:
-        values["port"] = port
-    return read_rig(json.dumps(values | {"name": rig}))
+    given = {key: value for key, value in options.items() if value is not None}
+    return read_rig(json.dumps(values | given | {"name": rig}))
 
 
 def _least_loaded(infos: "list[ServiceInfo]", service: str, lab: "LabConfig") -> "ServiceInfo":

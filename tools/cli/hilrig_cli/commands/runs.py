@@ -43,7 +43,9 @@ def runs(
     ] = None,
     config: Config = None,
     rig: Annotated[str, typer.Option(help="Only recordings of this rig.")] = "",
-    controller: Annotated[str, typer.Option(help="Only controllers whose address starts with this text.")] = "",
+    controller: Annotated[
+        str, typer.Option(help="Only controllers whose address or certificate's name starts with this text.")
+    ] = "",
     since: Annotated[
         str,
         typer.Option(metavar="TIME", help="Only recordings started at or after this time, UTC: 2026-01-31[T14:30]."),
@@ -77,7 +79,7 @@ def runs(
         entry
         for entry in entries
         if (not rig or entry.rig == rig)
-        and (not controller or entry.controller.startswith(controller))
+        and (not controller or any(text.startswith(controller) for text in (entry.controller, entry.certificate)))
         and (since_ns is None or entry.start_wall_ns >= since_ns)
         and (until_ns is None or entry.start_wall_ns < until_ns)
     ]
@@ -194,7 +196,7 @@ def _print_table(folder: Path, entries: "list[RunEntry]", total: int, read: int)
             _number(entry.loop_p99_ms),
             _number(entry.age_p99_ms),
             Text(str(lost), style="red" if lost else ""),
-            *([entry.controller, _yes_no(entry.verified)] if wide else []),
+            *([entry.certificate or entry.controller, _yes_no(entry.verified)] if wide else []),
             _yes_no(entry.fit),
             _ending(entry),
         )

@@ -49,6 +49,7 @@ def _command(name: str, package: str, summary: str) -> Callable[..., None]:
         from hilrig_runtime.process.logging_setup import start_logging
         from hilrig_schemas.topics import is_name
 
+        start_logging(name, instance, log_format)
         service = import_module(f"{package}.service")
         if not is_name(instance):
             raise InputError(
@@ -61,7 +62,6 @@ def _command(name: str, package: str, summary: str) -> Callable[..., None]:
             if count > 1:
                 raise InputError(f"--rigs: duplicate rig {rig!r}")
             lab.rig(rig)
-        start_logging(name, instance, log_format)
         run_service(name, service.run, lab, instance=instance, rigs=names, stop_with_parent=stop_with_parent)
 
     run.__name__, run.__doc__ = name, summary

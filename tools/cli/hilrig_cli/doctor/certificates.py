@@ -15,7 +15,8 @@ from hilrig_cli.doctor import CheckResult
 from hilrig_runtime.bus.acl import identities
 from hilrig_runtime.bus.zenoh_config import MESH_ORDER
 from hilrig_runtime.config.bus import BusTlsConfig
-from hilrig_runtime.config.lab import LabConfig, TlsConfig
+from hilrig_runtime.config.edge_tls import TlsConfig
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.security.x509 import names_in
 
 EXPIRY_WARNING_PERIOD: Final = timedelta(days=30)

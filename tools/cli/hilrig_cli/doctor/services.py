@@ -11,15 +11,18 @@ from google.protobuf.message import DecodeError
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.control import release_series
-from hilrig_runtime.timing.clock import SYSTEM_CLOCK
+from hilrig_runtime.process.discovery import ClockOffset, query_services, worst_offset
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
 from hilrig_schemas import Health
 from hilrig_schemas.topics import HEALTH, SERVICES, alive_key, source_of_key
 
 COLLECT_TIMEOUT_S: Final = 2.5
 """Time to collect health reports; each service publishes one a second."""
+CLOCK_TIMEOUT_S: Final = 0.5
+"""Timeout of the query for the clocks; it ends early when all services have replied."""
 CLOCK_WARNING_S: Final = 1.0
 CLOCK_ERROR_S: Final = 60.0
 _REALTIME_FIX: Final = (
@@ -34,8 +37,10 @@ class BusSnapshot:
 
     alive: set[str] = field(default_factory=set)
     """ "<service>/<instance>" of each service with a liveliness token."""
-    healths: dict[str, tuple[Health, int]] = field(default_factory=dict)
-    """Last report of each service, and this host's wall clock when it arrived, ns."""
+    healths: dict[str, Health] = field(default_factory=dict)
+    """Last report of each service."""
+    clocks: list[tuple[str, ClockOffset]] = field(default_factory=list)
+    """Each service that replied, as "sim/1 on host", and the offset of its wall clock from this host's."""
 
     @property
     def services(self) -> set[str]:
@@ -70,7 +75,7 @@ def collect(
         except DecodeError:
             return
         with lock:
-            snapshot.healths[f"{health.service}/{health.instance}"] = health, SYSTEM_CLOCK.wall_ns()
+            snapshot.healths[f"{health.service}/{health.instance}"] = health
 
     def on_alive(key: str, alive: bool) -> None:
         name = source_of_key(key)
@@ -88,6 +93,9 @@ def collect(
                 if until and any(matches(name, until) for name in snapshot.healths):
                     break
             time.sleep(0.02)
+        if not until:
+            for info, offset in query_services(bus, lab.name, "*", Counters(), CLOCK_TIMEOUT_S):
+                snapshot.clocks.append((f"{info.service}/{info.instance} on {info.host}", offset))
     return snapshot
 
 
@@ -128,7 +136,7 @@ def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResul
         yield CheckResult.error("services", text, "restart it")
     if not missing and not silent:
         yield CheckResult.ok("services", f"running: {', '.join(sorted(snapshot.alive))}")
-    for name, (health, _) in sorted(snapshot.healths.items()):
+    for name, health in sorted(snapshot.healths.items()):
         if health.alert:
             yield CheckResult.error("services", f"{name}: {health.alert}", "see the service's log")
         if health.lost_transport or health.lost_recorder:
@@ -143,7 +151,7 @@ def check_realtime(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResul
         text = "not requested (realtime = false): other programs can delay the loop"
         yield CheckResult.ok("real-time", text)
         return
-    reports = [health for health, _ in snapshot.healths.values() if health.service in REALTIME_PRIORITIES]
+    reports = [health for health in snapshot.healths.values() if health.service in REALTIME_PRIORITIES]
     if not reports:
         if _is_granted_here():
             yield CheckResult.ok("real-time", "this host grants the real-time policy")
@@ -183,31 +191,33 @@ def check_versions(healths: Iterable[Health], own: str) -> Iterator[CheckResult]
         yield CheckResult.ok("versions", f"all services: {own}")
 
 
-def check_clocks(reports: Sequence[tuple[Health, int]]) -> Iterator[CheckResult]:
+def check_clocks(clocks: Sequence[tuple[str, ClockOffset]]) -> Iterator[CheckResult]:
     """Check that the hosts' wall clocks agree. No latency depends on them; they date the recordings.
 
     Args:
-        reports: each health report and this host's wall clock when it arrived, ns.
+        clocks: each service with its host, and the offset of its clock from this host's.
     """
-    if not reports:
+    if not clocks:
         return
-    offsets = {
-        f"{health.service}/{health.instance}" + (f" on {health.host}" if health.host else ""): (
-            (health.wall_ns - arrived_ns) / 1e9
-        )
-        for health, arrived_ns in reports
-    }
-    name, offset_s = max(offsets.items(), key=lambda item: abs(item[1]))
-    if abs(offset_s) < CLOCK_WARNING_S:
-        yield CheckResult.ok("time", f"all clocks within {abs(offset_s) * 1e3:.0f} ms of this host's")
+    worst = worst_offset(offset for _, offset in clocks)
+    name = next(name for name, offset in clocks if offset is worst)
+    certain_s = worst.certain_ns / 1e9
+    if certain_s < CLOCK_WARNING_S:
+        text = f"all clocks agree with this host's: {name} by {_milliseconds(worst)}, the others are nearer"
+        yield CheckResult.ok("time", text)
         return
-    ahead = "ahead of" if offset_s > 0 else "behind"
+    ahead = "ahead of" if worst.offset_ns > 0 else "behind"
     yield CheckResult(
         "time",
-        Level.ERROR if abs(offset_s) >= CLOCK_ERROR_S else Level.WARNING,
-        f"the clock of {name} is {abs(offset_s):.1f} s {ahead} this host's; recordings are dated by it",
+        Level.ERROR if certain_s >= CLOCK_ERROR_S else Level.WARNING,
+        f"the clock of {name} is {abs(worst.offset_ns) / 1e9:.1f} ± {worst.uncertainty_ns / 1e9:.1f} s {ahead} this "
+        "host's; recordings are dated by it",
         "synchronize the hosts' clocks (NTP); latencies do not depend on them",
     )
+
+
+def _milliseconds(offset: ClockOffset) -> str:
+    return f"{offset.offset_ns / 1e6:.1f} ± {offset.uncertainty_ns / 1e6:.1f} ms"
 
 
 def _is_granted_here() -> bool:

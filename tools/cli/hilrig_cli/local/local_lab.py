@@ -1,5 +1,6 @@
 """A lab on this host: checks its ports, starts its services, and waits until controllers can connect."""
 
+import json
 import socket
 import sys
 import threading
@@ -7,13 +8,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, ProcessSpec, Supervisor
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import MESH_ORDER
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_schemas.topics import alive_key
 
 POLL_S: Final = 0.05
@@ -44,6 +46,21 @@ def running_lab(
         _wait_until_ready(lab, processes, supervisor, stopping)
         supervisor.mark_ready()
         yield supervisor
+
+
+@contextmanager
+def lab_file_of_controller(controller: str, config: Path | None) -> Iterator[Path]:
+    """Write a temporary file of a lab with one rig that is a client of `controller`, and yield its path.
+
+    Raises:
+        InputError: there is a file already.
+    """
+    if config is not None:
+        raise InputError(f"--controller: {config} defines the rigs; set controller there, in [[rigs]]")
+    with TemporaryDirectory(prefix="hilrig-") as folder:
+        path = Path(folder) / "lab.toml"
+        path.write_text(f'[[rigs]]\nname = "rig1"\ncontroller = {json.dumps(controller)}\n')
+        yield path
 
 
 def _check_ports(lab: LabConfig) -> None:

@@ -6,6 +6,7 @@ when the supervisor dies.
 """
 
 import contextlib
+import signal
 import subprocess
 import sys
 import time
@@ -120,6 +121,13 @@ class Supervisor(Handle):
             elif child.process is None and child.restart_at_s is not None and now_s >= child.restart_at_s:
                 self._spawn(child)
                 self._log(f"{child.spec.name} restarted")
+
+    def reload(self) -> None:
+        """Make every child read its configuration again; may be called from any thread."""
+        for child in self._children.values():
+            process = child.process
+            if process is not None and hasattr(signal, "SIGHUP"):
+                process.send_signal(signal.SIGHUP)
 
     def close(self) -> None:
         """Stop the children in order; kill those that do not stop in time."""

@@ -88,6 +88,8 @@ class Stalls:
     """Time of the longest stall, from the first state of the run."""
     shortest_ns: int = 0
     """0: not known."""
+    area_ns2: float = 0.0
+    """Integral over time of the age that grew during the stalls: half the sum of their squared lengths."""
 
     def __str__(self) -> str:
         """Count and length as text."""
@@ -130,7 +132,7 @@ class DataQuality:
         self._read = dict.fromkeys(("state", "command", "event"), 0)
         self._dropped_commands = 0
         """Commands that have a number, but were not sent: the emulated network dropped them."""
-        self._bases, self._last_basis = 0, -1
+        self.bases, self._last_basis = 0, -1
         """Number of different bases of the samples, and the basis of the last sample."""
         self._first_step: tuple[int, int] | None = None
         """Incarnation and step of the first state."""
@@ -140,6 +142,9 @@ class DataQuality:
         self._inaccurate_steps = 0
         self._largest_error = np.zeros(4)
         self._session_ended = False
+        self._tripped = False
+        self.watchdog_gaps = 0
+        """Trips of the watchdog after which the controller wrote again."""
 
     def add(self, block: Records, samples: Rows) -> None:
         """Add the next block and its samples, fields as `SAMPLE_DTYPE`."""
@@ -154,7 +159,7 @@ class DataQuality:
         self._samples += len(samples)
         if len(samples):
             bases = samples["basis_step"].astype(np.int64)
-            self._bases += int((np.diff(bases, prepend=self._last_basis) != 0).sum())
+            self.bases += int((np.diff(bases, prepend=self._last_basis) != 0).sum())
             self._last_basis = int(bases[-1])
         self._negative += sum(int((samples[stage] < 0).sum()) for stage in STAGES)
 
@@ -211,6 +216,11 @@ class DataQuality:
             message = event["message"]
             if event["kind"] == "SESSION_END":
                 self._session_ended |= message.session == self._run.session
+            elif event["kind"] == "WATCHDOG_TRIP":
+                self._tripped = message.session == self._run.session
+            elif event["kind"] == "WATCHDOG_REARM":
+                self.watchdog_gaps += self._tripped
+                self._tripped = False
             elif event["kind"] == "OVERRUN" and event["source"].startswith("edge/"):
                 stalls, stalled_ns = self.edge_stalls, message.overrun_data.lateness_ns
                 longest_ns, at_ns = stalls.longest_ns, stalls.at_ns
@@ -218,8 +228,9 @@ class DataQuality:
                     longest_ns, at_ns = stalled_ns, int(event["wall_ns"]) - self._run.start_wall_ns - stalled_ns
                 shortest_ns = min(stalls.shortest_ns or stalled_ns, stalled_ns)
                 # Stalls within a second are one event.
-                count = stalls.count + max(1, message.overrun_data.stalls)
-                self.edge_stalls = Stalls(count, longest_ns, at_ns, shortest_ns)
+                count = max(1, message.overrun_data.stalls)
+                area_ns2 = stalls.area_ns2 + count * float(stalled_ns) ** 2 / 2
+                self.edge_stalls = Stalls(stalls.count + count, longest_ns, at_ns, shortest_ns, area_ns2)
                 self._edge_overruns += 1
 
     def _add_stalls(self, states: Rows, lateness: NDArray[np.int64]) -> None:
@@ -228,7 +239,8 @@ class DataQuality:
         longest_ns, at_ns = stalls.longest_ns, stalls.at_ns
         if lateness[worst] > max(longest_ns, self._run.step_ns):
             longest_ns, at_ns = int(lateness[worst]), int(self._run.time_ns(states[worst : worst + 1])[0])
-        self.stalls = Stalls(count, longest_ns, at_ns)
+        late_ns = lateness[lateness > self._run.step_ns].astype(np.float64)
+        self.stalls = Stalls(count, longest_ns, at_ns, area_ns2=stalls.area_ns2 + float((late_ns**2).sum()) / 2)
 
     def lateness(self) -> Statistics:
         """Statistics of the lateness of all ticks."""
@@ -273,8 +285,8 @@ class DataQuality:
             yield Reason("negative_stages", text)
         if loop_ms is not None and age is not None:
             yield from self._omitted(loop_ms, age)
-        if self._bases < MIN_READ_SHARE * self._samples:
-            read = _count(self._bases, "state")
+        if self.bases < MIN_READ_SHARE * self._samples:
+            read = _count(self.bases, "state")
             text = f"{_count(self._samples, 'command')} are based on {read}: the controller writes without reading"
             yield Reason("few_reads", text)
         if not self._samples and not unmatched:

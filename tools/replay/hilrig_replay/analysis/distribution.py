@@ -5,7 +5,7 @@ requested ranks are collected and sorted. Means and standard deviations are merg
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -33,10 +33,6 @@ class Statistics:
     max: float
     mean: float
     std: float
-
-    def cells(self) -> list[str]:
-        """The values as text, whole from 1,000 on so that they fit a terminal, in the order of `STATISTICS_TITLES`."""
-        return [f"{value:.3f}" if abs(value) < 1_000 else f"{value:.0f}" for value in astuple(self)]
 
     @classmethod
     def of(cls, values_ns: NDArray[np.int64] | Blocks) -> "Statistics":

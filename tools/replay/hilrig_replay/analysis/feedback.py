@@ -6,17 +6,20 @@ from the recording, and unrelated to everything that a program without these pos
 were computed from them. The statistic is that of a generalized least-squares fit in blocks of commands, each with its
 own trend in time and its own gains; for comparison it is computed with the rounding errors of other times.
 
+The same errors show which poll the torques were computed from: the first poll whose rounding errors they contain.
+
 With a small gain, rounding hides in the resolution of the torque registers. There, a law that restores a set point and
 explains each torque register to its resolution is evidence, too.
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.io.columns import Rows
+from hilrig_replay.io.columns import Rows, last_of_each_read
 from hilrig_sim.arm.joints import JOINT_SCALE
 
 Floats = NDArray[np.float64]
@@ -35,6 +38,16 @@ MIN_STATISTIC: Final = 20.0
 MIN_RATIO: Final = 2.0
 """Required ratio to the largest statistic of the other times."""
 ROUNDING_VARIANCE: Final = 1 / 12
+GAIN_BLOCK_COMMANDS: Final = 24
+MIN_GAIN_BLOCKS: Final = 5
+MIN_ERROR_VARIANCE: Final = 0.002
+"""Smallest variance of the rounding errors of a block; that of a moving joint is 1/12."""
+MAX_POLLS: Final = 3
+"""Number of earlier polls that are compared with the newest one."""
+MIN_GAIN_STATISTIC: Final = 25.0
+"""Squared ratio of the largest gain to its standard error from which the gains are significant."""
+MIN_GAIN_RATIO: Final = 0.4
+"""Gain of the first poll that the torques contain, as a share of the largest gain."""
 LAW_COMMANDS: Final = 24
 """Commands of a segment in which one law is fitted."""
 MIN_SEGMENTS: Final = 2
@@ -69,6 +82,124 @@ def _series(states: Rows, commands: Rows) -> Iterator[Series]:
             yield chosen["write_arrived_ns"] / 1e9, position, chosen["effort"] * 1e3
 
 
+@dataclass(frozen=True, slots=True)
+class RoundingGains:
+    """Gains with which torques contain the rounding errors of the positions in the registers."""
+
+    gains: Floats
+    """By joint and poll, the newest first: N·m per 0.01°, joint 3 N per 0.01 mm, (4, MAX_POLLS + 1)."""
+    statistics: Floats
+    """Squared ratios of the gains to their standard errors, same shape; 0: the joint shows nothing."""
+    older_steps: Floats
+    """Mean number of steps by which the state of each poll is older than the newest one, (MAX_POLLS + 1,)."""
+
+    @property
+    def noise(self) -> Floats:
+        """Standard deviation of the torques that is caused by the rounding, N·m or N, (4,); 0: not significant."""
+        shown = self.statistics.max(axis=1) >= MIN_GAIN_STATISTIC
+        return np.asarray(np.where(shown, np.sqrt((self.gains**2).sum(axis=1) * ROUNDING_VARIANCE), 0.0))
+
+    @property
+    def polls_behind(self) -> int | None:
+        """Polls between the newest one and that which the torques were computed from; None: they do not show it."""
+        joint = int(np.argmax(self.statistics.max(axis=1)))
+        statistics, gains = self.statistics[joint], np.abs(self.gains[joint])
+        if not statistics.max() >= MIN_GAIN_STATISTIC:
+            return None
+        used = (gains >= MIN_GAIN_RATIO * gains.max()) & (statistics >= MIN_GAIN_STATISTIC / 2)
+        return int(np.argmax(used))
+
+
+def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
+    """Estimate the gains of the rounding errors, by generalized least squares in blocks of commands.
+
+    Args:
+        windows: states and commands of parts of a run, fields as `STATE_DTYPE` and `COMMAND_DTYPE`.
+    """
+    blocks: list[list[tuple[Floats, Floats]]] = [[], [], [], []]
+    """By joint: normal matrices and right-hand sides of its blocks."""
+    older: list[NDArray[np.int64]] = [np.zeros((MAX_POLLS + 1, 0), np.int64)]
+    for states, commands in windows:
+        for basis_step, (time_s, position, torque) in _polls(states, commands):
+            steps = np.diff(basis_step, prepend=basis_step[0])
+            lagged = np.stack([basis_step - _lagged(basis_step, lag) for lag in range(MAX_POLLS + 1)])
+            older.append(lagged[:, MAX_POLLS:])
+            # A poll that returned the state of the one before can't be distinguished from it.
+            fresh = np.flatnonzero(steps > 0)
+            fresh = fresh[fresh >= MAX_POLLS]
+            rows = fresh[: len(fresh) // GAIN_BLOCK_COMMANDS * GAIN_BLOCK_COMMANDS].reshape(-1, GAIN_BLOCK_COMMANDS)
+            if not len(rows):
+                continue
+            error = np.rint(position) - position
+            for joint in range(4):
+                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(MAX_POLLS + 1)])
+                unexplained = _without(known, torque[rows, joint])
+                errors = _without(known, np.stack([error[rows - lag, joint] for lag in range(MAX_POLLS + 1)], axis=-1))
+                # The variance without the part that the errors explain, which may be most of it.
+                variance = _residual_variance(unexplained, errors, GAIN_BLOCK_COMMANDS - known.shape[2])
+                weight = np.where((unexplained**2).sum(axis=1) > 1e-6, 1 / (variance + ROUNDING_VARIANCE), 0.0)
+                # A limited torque contains no errors.
+                limited = np.abs(torque[rows, joint]) >= np.abs(torque[:, joint]).max() - 0.5
+                weight *= ~limited.any(axis=1)
+                # A joint at rest has no errors that change.
+                weight *= (errors**2).mean(axis=(1, 2)) > MIN_ERROR_VARIANCE
+                normal = np.einsum("b,bli,blj->bij", weight, errors, errors)
+                blocks[joint].append((normal, np.einsum("b,bli,bl->bi", weight, errors, unexplained)))
+    fits = [_fit(of_joint) for of_joint in blocks]
+    gains, statistics = np.stack([fit[0] for fit in fits]), np.stack([fit[1] for fit in fits])
+    steps_of_polls = np.concatenate(older, axis=1)
+    mean_steps = steps_of_polls.mean(axis=1) if steps_of_polls.shape[1] else np.zeros(MAX_POLLS + 1)
+    return RoundingGains(gains / 1e3, statistics, mean_steps)
+
+
+def _fit(blocks: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Gains and their statistics of a joint, (MAX_POLLS + 1,) each, from normal matrices and right-hand sides.
+
+    The standard error is the larger one of the model and of the scatter between blocks, so that a few blocks with a
+    limited torque or a step of the set point show nothing.
+    """
+    size = MAX_POLLS + 1
+    normals = np.concatenate([np.zeros((0, size, size)), *(normal for normal, _ in blocks)])
+    rights = np.concatenate([np.zeros((0, size)), *(right for _, right in blocks)])
+    used = np.diagonal(normals, axis1=1, axis2=2).any(axis=1)
+    if used.sum() < MIN_GAIN_BLOCKS:
+        return np.zeros(size), np.zeros(size)
+    inverse = np.linalg.pinv(normals.sum(axis=0), rcond=1e-9, hermitian=True)
+    gains = inverse @ rights.sum(axis=0)
+    scores = rights[used] - normals[used] @ gains
+    count = len(scores)
+    scatter = inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
+    variances = np.maximum(np.maximum(np.diagonal(inverse), np.diagonal(scatter)), 1e-300)
+    return gains, gains**2 / variances
+
+
+def _lagged(values: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
+    return np.concatenate((values[:lag], values))[: len(values)]
+
+
+def _polls(states: Rows, commands: Rows) -> Iterator[tuple[NDArray[np.int64], Series]]:
+    """Steps of the bases of consecutive polls, and their series, by incarnation of the simulation."""
+    commands = last_of_each_read(commands)
+    for incarnation in np.unique(states["incarnation"]):
+        known = states[states["incarnation"] == incarnation]
+        chosen = commands[commands["basis_incarnation"] == incarnation]
+        at = np.minimum(np.searchsorted(known["step"], chosen["basis_step"]), len(known) - 1)
+        found = known["step"][at] == chosen["basis_step"]
+        chosen, at = chosen[found], at[found]
+        if len(chosen) > MAX_POLLS:
+            position = known["position"][at] * JOINT_SCALE * 100
+            series = chosen["write_arrived_ns"] / 1e9, position, chosen["effort"] * 1e3
+            yield chosen["basis_step"].astype(np.int64), series
+
+
+def _residual_variance(unexplained: Floats, errors: Floats, freedom: int) -> Floats:
+    """Variance of the torques of each block, (blocks,), without their best fit by the errors of that block."""
+    left, sizes, _ = np.linalg.svd(errors, full_matrices=False)
+    left = left * (sizes > 1e-9)[:, np.newaxis, :]
+    rest = unexplained - np.einsum("bli,bi->bl", left, np.einsum("bli,bl->bi", left, unexplained))
+    return np.asarray((rest**2).sum(axis=1) / max(freedom - errors.shape[2], 1))
+
+
 def contains_rounding_errors(series: Iterable[Series]) -> bool:
     """Whether the torques contain the rounding errors of the positions in the registers."""
     statistics = np.zeros((4, COMPARISONS + 1))
@@ -95,7 +226,7 @@ def contains_rounding_errors(series: Iterable[Series]) -> bool:
 
 
 def _basis_of_known(time_s: Floats, positions: list[Floats]) -> Floats:
-    """Orthonormal basis of a cubic trend in time and of the exact positions, by block, (blocks, commands, 6)."""
+    """Orthonormal basis of a cubic trend in time and of exact positions, by block, (blocks, commands, k)."""
     since = time_s - time_s.mean(axis=1, keepdims=True)
     since /= np.maximum(np.abs(since).max(axis=1, keepdims=True), 1e-9)
     moved = [position - position.mean(axis=1, keepdims=True) for position in positions]

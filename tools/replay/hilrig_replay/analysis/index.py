@@ -53,6 +53,8 @@ class RunEntry:
     part: int = 1
     """Number of the segment in its session, from 1."""
     controller: str = ""
+    certificate: str = ""
+    """Name in the controller's certificate; empty: it had none."""
     start_wall_ns: int = 0
     """Time of the first state by the clock of its sender, ns since 1970-01-01 UTC."""
     duration_s: float = 0.0
@@ -304,6 +306,7 @@ def _with_session(blank: RunEntry, session: dict[str, str]) -> RunEntry:
         session=session.get("session", ""),
         part=int(session.get("part", 1)),
         controller=session.get("controller", ""),
+        certificate=session.get("certificate", ""),
         start_wall_ns=int(session.get("start_wall_ns", 0)),
     )
 

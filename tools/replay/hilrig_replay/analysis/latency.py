@@ -9,21 +9,29 @@ A sample is only as good as its basis. A command of a connection that did not re
 another connection of the same controller was served. Its latency is measured only if the torques follow the positions.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from hilrig_replay.analysis.age import AgeTable
 from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
-from hilrig_replay.analysis.diagnosis import Evidence, Finding, diagnose, edge_stalls
+from hilrig_replay.analysis.diagnosis.diagnose import diagnose
+from hilrig_replay.analysis.diagnosis.edge_stalls import edge_stalls
+from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, windows_of
 from hilrig_replay.analysis.distribution import Statistics, percentiles
-from hilrig_replay.analysis.feedback import follows_positions
+from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
+from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
 from hilrig_replay.analysis.stages import STAGES
+from hilrig_replay.geometry.scene import parameters_of
+from hilrig_replay.io.disk_table import Blocks
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
 from hilrig_replay.io.sequence_order import Repairs
+from hilrig_runtime.config.task import TaskConfig
+from hilrig_sim.arm.model import ArmParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +57,9 @@ class LatencyReport:
     loop_ms: Statistics | None
     """None: no closed loop (see `reasons`)."""
     stages_ms: dict[str, Statistics]
+    intervals_ms: dict[str, dict[str, Interval]]
+    """95 % confidence intervals of the percentiles of `loop`, each stage and `age`, by percentile (`intervals.SHARES`);
+    an infinite bound is not supported by the samples."""
     age_ms: Statistics | None
     """Age of the loop at each step; None: no command that is based on a state took effect."""
     control_period_ms: float | None
@@ -75,7 +86,7 @@ class LatencyReport:
     reasons: tuple[Reason, ...]
     """Reasons why it is not valid; empty: it is valid."""
     findings: tuple[Finding, ...]
-    """Probable causes of the latency."""
+    """Timing causes, the most important first, then control observations; empty: no cause was found."""
     table: SampleTable = field(repr=False, compare=False)
     """The samples, fields as `samples.SAMPLE_DTYPE`; `table["loop"]` is a column, shape (samples,)."""
     ages: AgeTable | None = field(repr=False, compare=False)
@@ -111,21 +122,27 @@ class LatencyReport:
         return "; ".join(reason.text for reason in self.reasons)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, without the samples."""
+        """Plain values for JSON, without the samples; None for an infinite bound."""
         plain = asdict(self.without_table())
         del plain["table"], plain["ages"]
+        for of_quantity in plain["intervals_ms"].values():
+            for name, bounds in of_quantity.items():
+                of_quantity[name] = [bound if math.isfinite(bound) else None for bound in bounds]
         return plain
 
 
-def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> LatencyReport:
+def measure(
+    run: Run, on_block: Callable[[Records], None] | None = None, task: TaskConfig | None = None
+) -> LatencyReport:
     """Measure the loop latency of a run in one pass, block by block.
 
     Args:
         run: the recording.
         on_block: called with each block (states, commands, parts, events), so that one pass serves several evaluations.
+        task: task whose poses a steady-state error refers to; None: none.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged, or its parameters are invalid.
     """
     matcher, table, quality, ages = CommandMatcher(), SampleTable(), DataQuality(run), AgeTable(run)
     for block in run.blocks(frozenset({"state", "command", "event"}), repairs=quality.repairs):
@@ -138,31 +155,42 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
     table.finish()
     ages.finish()
     age, loop, stages, spread = ages.statistics(), None, {}, 0.0
-    evidence = Evidence(
-        run=run,
-        samples=table,
-        step_ns=run.step_ns,
-        stalls=quality.stalls,
-        reported_edge_stalls=quality.edge_stalls,
-        cycle_ns=quality.cycle_ns(),
-    )
+    intervals: dict[str, dict[str, Interval]] = {}
+    windows = windows_of(run)
     other_connection = _other_connection_share(table) >= 0.5
-    open_loop = other_connection and not follows_positions(
-        (window.states, window.commands) for window in evidence.windows()
-    )
+    open_loop = other_connection and not follows_positions((window.states, window.commands) for window in windows)
     if open_loop:
         # The basis of the commands is not their basis.
         table, age = SampleTable(), None
-        evidence = replace(evidence, samples=table)
     if len(table):
         loop = Statistics.of(table.column("loop"))
         stages = {stage: Statistics.of(table.column(stage)) for stage in STAGES}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
-        evidence = replace(evidence, loop_ms=loop, stages_ms=stages)
-    reasons = tuple(quality.reasons(matcher.unmatched, loop, age, edge_stalls(evidence)))
+        intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *STAGES)}
+    if age is not None:
+        intervals["age"] = _intervals_ms(ages.ages_ns)
+    stalled = edge_stalls(quality.edge_stalls, table, windows, run.time_ns)
+    reasons = tuple(quality.reasons(matcher.unmatched, loop, age, stalled))
     if open_loop:
         reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
+    network = network_share(windows, stages["controller"].p50 if stages else None)
+    evidence = Evidence(
+        step_ns=run.step_ns,
+        samples=table,
+        windows=windows,
+        duration_s=run.duration_s,
+        age=age,
+        stalls=quality.stalls,
+        edge_stalls=stalled,
+        watchdog_gaps=quality.watchdog_gaps,
+        gains=rounding_gains((window.states, window.commands) for window in windows),
+        bases=quality.bases,
+        open_loop=open_loop,
+        min_rtt_ns=0.0 if network is None or network.min_ms is None else network.min_ms * 1e6,
+        arm=ArmParameters() if task is None else parameters_of(run.parameters_json).arm,
+        poses=() if task is None else task.poses,
+    )
     return LatencyReport(
         session=run.session,
         rig=run.rig,
@@ -171,6 +199,7 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
         stages_ms=stages,
+        intervals_ms=intervals,
         age_ms=age.age_ms if age else None,
         control_period_ms=age.control_period_ms if age else None,
         longest_hold_ms=age.longest_hold_ms if age else None,
@@ -178,16 +207,21 @@ def measure(run: Run, on_block: Callable[[Records], None] | None = None) -> Late
         older_than_steps=age.older_than_steps if age else {},
         read_on_other_connection=other_connection,
         kernel_timestamps=_kernel_timestamps(table),
-        network=network_share(evidence),
+        network=network,
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),
         repaired=quality.repairs,
         fit=not reasons,
         reasons=reasons,
-        findings=tuple(diagnose(evidence)),
+        findings=diagnose(evidence),
         table=table,
         ages=ages if age else None,
     )
+
+
+def _intervals_ms(values_ns: Blocks) -> dict[str, Interval]:
+    found = percentile_intervals(values_ns)
+    return {name: (low / 1e6, high / 1e6) for name, (low, high) in found.items()}
 
 
 def _other_connection_share(samples: SampleTable) -> float:

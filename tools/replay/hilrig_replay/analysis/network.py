@@ -5,11 +5,12 @@ that TCP has measured on a connection is a proven lower bound of the network's p
 bound: a peer delays its acknowledgments until its next request, so it contains the time of the controller.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hilrig_replay.analysis.diagnosis import Evidence
+from hilrig_replay.io.records import Records
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +36,13 @@ class NetworkShare:
         return ", ".join(parts)
 
 
-def network_share(evidence: Evidence) -> NetworkShare | None:
-    """Share of the network in a run; None: no TCP figures of a connection that wrote are recorded."""
-    windows = evidence.windows()
+def network_share(windows: Sequence[Records], controller_p50_ms: float | None) -> NetworkShare | None:
+    """Share of the network in a run; None: no TCP figures of a connection that wrote are recorded.
+
+    Args:
+        windows: parts of the run.
+        controller_p50_ms: median of the stage *controller*; None: no samples.
+    """
     writers = np.unique(np.concatenate([window.commands["controller"] for window in windows]))
     figures = np.concatenate([window.connections for window in windows])
     figures = figures[np.isin(figures["controller"], writers)]
@@ -46,8 +51,7 @@ def network_share(evidence: Evidence) -> NetworkShare | None:
     measured_us = figures["min_rtt_us"][figures["min_rtt_us"] > 0]
     # A bound of each connection is one of all of them.
     min_ms = int(measured_us.min()) / 1e3 if len(measured_us) else None
-    controller = evidence.stages_ms.get("controller")
-    controller_max_ms = None if controller is None or min_ms is None else max(controller.p50 - min_ms, 0.0)
+    controller_max_ms = None if controller_p50_ms is None or min_ms is None else max(controller_p50_ms - min_ms, 0.0)
     by_connection = [figures[figures["controller"] == code] for code in np.unique(figures["controller"])]
     retransmissions = sum(int(rows["retransmissions"].max()) for rows in by_connection)
     return NetworkShare(min_ms, controller_max_ms, retransmissions)

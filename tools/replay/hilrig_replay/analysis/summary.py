@@ -71,6 +71,8 @@ class RunSummary:
     rig: str
     lab: str
     controller: str
+    certificate: str
+    """Name in the controller's certificate; empty: it had none."""
     start: str
     """Start time as recorded, UTC."""
     duration_s: float
@@ -99,6 +101,7 @@ class RunSummary:
             "rig": self.rig,
             "lab": self.lab,
             "controller": self.controller,
+            "certificate": self.certificate,
             "start": self.start,
             "duration_s": self.duration_s,
             "ended": self.ended,
@@ -122,14 +125,16 @@ def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
     Raises:
         InputError: the file is damaged, or its parameters or its task are invalid.
     """
-    collector = _Collector(run, parameters_of(run.parameters_json), task or recorded_task(run))
-    latency = measure(run, collector.add)
+    task = task or recorded_task(run)
+    collector = _Collector(run, parameters_of(run.parameters_json), task)
+    latency = measure(run, collector.add, task)
     return RunSummary(
         name=run.path.stem,
         session=run.session,
         rig=run.rig,
         lab=run.lab,
         controller=run.controller,
+        certificate=run.certificate,
         start=run.started,
         duration_s=run.duration_s,
         ended=run.ended,

@@ -326,6 +326,20 @@ def concatenate_rows(pieces: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     return np.concatenate(pieces) if pieces else np.empty(0, dtype)
 
 
+def written(commands: Rows) -> Rows:
+    """Commands that a controller wrote after it had been served a state, of commands with `COMMAND_DTYPE`."""
+    kept = (commands["basis_step"] > 0) & ~commands["safe"] & (commands["write_arrived_ns"] > 0)
+    return np.asarray(commands[kept])
+
+
+def last_of_each_read(commands: Rows) -> Rows:
+    """The last write after each read, of commands with `COMMAND_DTYPE`: a program may write register by register."""
+    commands = written(commands)
+    if not len(commands):
+        return commands
+    return np.asarray(commands[np.append(np.diff(commands["state_served_ns"]) != 0, True)])
+
+
 def joint_values(values: NDArray[np.float64]) -> JointValues:
     """Return an array of shape (4,) as numbers of Python."""
     theta1, theta2, d3, theta4 = values.tolist()

@@ -87,6 +87,11 @@ class Run:
         return self._metadata_text("session", "controller")
 
     @property
+    def certificate(self) -> str:
+        """Name in the controller's certificate; empty: it had none."""
+        return self._metadata_text("session", "certificate")
+
+    @property
     def started(self) -> str:
         """Start time of the session, UTC, as recorded; empty: not recorded."""
         return self._metadata_text("session", "start")

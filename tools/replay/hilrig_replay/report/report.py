@@ -1,12 +1,15 @@
-"""Report of one run or a group of runs as a self-contained HTML file: no network access, scripts or other files."""
+"""Report of one run or a group of runs as a self-contained HTML file: it needs no network and no other files."""
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
+from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
+from hilrig_replay.analysis.intervals import cells
 from hilrig_replay.analysis.similarity import find_similar
 from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
@@ -20,7 +23,9 @@ from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, event_title
+from hilrig_replay.report import assets
 from hilrig_replay.report.html_figures import html_figure
+from hilrig_replay.report.timeline import MAX_ROWS, timeline
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 from hilrig_runtime.escaping import as_html
@@ -29,46 +34,18 @@ from hilrig_runtime.process.process_pool import process_pool
 _MIN_RUNS_FOR_PROCESSES: Final = 4
 """Fewer runs take less time than the start of worker processes."""
 
-STYLE: Final = """
-:root { color-scheme: light; font: 15px/1.5 system-ui, sans-serif; color: #24292f; background: #f5f6f8; }
-body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 72rem; }
-h1 { font-size: 1.6rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 0 0 .6rem; }
-p { margin: .3rem 0; } .quiet { color: #5d6771; }
-section, details { background: #fff; border: 1px solid #dfe3e8; border-radius: 8px;
-  padding: 1rem 1.2rem; margin: 1rem 0; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.5rem, 1fr)); gap: .8rem; }
-.facts div { border-left: 3px solid #4c78a8; padding-left: .6rem; } .facts b { display: block; font-size: 1.25rem; }
-.facts span { color: #5d6771; font-size: .85rem; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .45rem; text-align: right; border-bottom: 1px solid #e8ebef; white-space: nowrap; }
-th:first-child, td:first-child, td.text { text-align: left; }
-td.text { white-space: normal; min-width: 16rem; } thead th { color: #5d6771; font-weight: 600;
-  white-space: normal; vertical-align: bottom; }
-img { max-width: 100%; height: auto; display: block; }
-.figure { display: flex; align-items: flex-start; } .figure img { min-width: 0; }
-@media (max-width: 44rem) { .figure { display: block; }
-  table { font-size: .75rem; } th, td { padding: .25rem .15rem; }
-  section, details { padding: .8rem .6rem; }
-  td:first-child { white-space: normal; }
-  td.text { min-width: 9rem; } }
-@media (max-width: 44rem) { .ranking thead { display: none; } .ranking table, .ranking tbody { display: block; }
-  .ranking tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(6.5rem, 1fr)); padding: .4rem 0;
-    border-bottom: 1px solid #dfe3e8; }
-  .ranking td { text-align: left; border: 0; white-space: normal; font-size: .85rem; }
-  .ranking td:first-child { grid-column: 1 / -1; font-weight: 600; overflow-wrap: anywhere; }
-  .ranking td + td::before { content: attr(data-label); display: block; color: #5d6771; font-size: .7rem; } }
-@media (max-width: 30rem) { table { font-size: .68rem; } th, td { padding: .25rem .1rem; } }
-li { margin: .25rem 0; overflow-wrap: anywhere; }
-.good { color: #1a7f37; } .bad { color: #b35900; }
-summary { cursor: pointer; font-weight: 600; } summary span { font-weight: 400; }
-@media print { body { max-width: none; } section, details { break-inside: avoid; } }
-"""
+_MAX_ROWS_OF_GROUP: Final = 120_000
+"""States of all runs of a page, about 15 MB."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Page:
     summary: RunSummary
-    figures: tuple[str, ...]
+    motion: str
+    """Still picture of the motion, for paper."""
+    latency: str
+    """Picture of the latency; empty: no samples."""
+    timeline: dict[str, Any]
     verified: Verification | None
 
 
@@ -92,6 +69,8 @@ def build_report(
     task: TaskConfig | None = None,
     on_progress: Callable[[float], None] | None = None,
     workers: int | None = 1,
+    title: str = "",
+    introduction: str = "",
 ) -> Report:
     """Build the report of one run, or of several with a ranking; unreadable recordings are listed in the report.
 
@@ -101,6 +80,8 @@ def build_report(
         task: grading task for all runs; None: the task in each recording's lab.toml.
         on_progress: called with the completed share of the runs, 0 to 1.
         workers: number of processes; None: one per core if there are enough runs.
+        title: title of the page; empty: session or number of runs.
+        introduction: HTML below the title.
 
     Raises:
         InputError: the only recording, or every recording, is damaged or has an unsupported content.
@@ -122,7 +103,7 @@ def build_report(
     verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
     values = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
     pairs = _same_torques(pages)
-    return Report(_html(pages, left_out, pairs), values, tuple(left_out), pairs)
+    return Report(_html(pages, left_out, pairs, title, introduction), values, tuple(left_out), pairs)
 
 
 def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
@@ -138,24 +119,31 @@ def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
     )
 
 
-def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str]) -> str:
+def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str], title: str, introduction: str) -> str:
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
-        title = f"Run {summary.session}"
-        body = f'<h1>{as_html(title)}</h1><p class="quiet">{as_html(_origin(summary))}</p>{_run(pages[0])}'
+        title = title or f"Run {summary.session}"
+        body = (
+            f'<h1>{as_html(title)}</h1><p class="quiet">{as_html(_origin(summary))}</p>{introduction}'
+            f"{_run(1, pages[0])}"
+        )
     else:
-        title = f"{len(pages)} run{'s' * (len(pages) > 1)}"
+        title = title or f"{len(pages)} run{'s' * (len(pages) > 1)}"
         details = "".join(
             f"<details><summary>{number}. {as_html(page.summary.name)} "
-            f'<span class="quiet">· {as_html(_session_and_origin(page.summary))}</span></summary>{_run(page)}</details>'
+            f'<span class="quiet">· {as_html(_session_and_origin(page.summary))}</span></summary>'
+            f"{_run(number, page)}</details>"
             for number, page in enumerate(pages, start=1)
         )
         notes = _list_section("Skipped recordings", left_out) + _list_section("Runs with the same torques", pairs)
-        body = f"<h1>{title}</h1>{_overview(pages)}{notes}{details}"
+        body = f"<h1>{as_html(title)}</h1>{introduction}{_overview(pages)}{notes}{details}"
+    scripts = "".join(f"<script>{script}</script>" for script in assets.scripts())
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{assets.content_policy()}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{as_html(title)}</title><style>{STYLE}</style></head><body>{body}</body></html>\n"
+        f"<title>{as_html(title)}</title><style>{assets.style()}</style></head><body>{body}"
+        f"<!-- {assets.license_text()} -->{scripts}</body></html>\n"
     )
 
 
@@ -164,7 +152,8 @@ def _pages(
 ) -> Iterator[_Page | HilrigError]:
     """Page of each run, or the reason why it is missing, in the order of `paths`."""
     names = display_names(paths)
-    tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task)
+    rows = min(MAX_ROWS, _MAX_ROWS_OF_GROUP // len(paths))
+    tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task), repeat(rows)
     if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
         yield from map(_page_or_error, *tasks)
     else:
@@ -172,50 +161,54 @@ def _pages(
             yield from executor.map(_page_or_error, *tasks)
 
 
-def _page_or_error(path: Path, name: str, verified: bool, task: TaskConfig | None) -> _Page | HilrigError:
+def _page_or_error(
+    path: Path, name: str, verified: bool, task: TaskConfig | None, max_rows: int
+) -> _Page | HilrigError:
     try:
         with isolated(path):
-            return _page(open_run(path), name, verified, task)
+            return _page(open_run(path), name, verified, task, max_rows)
     except HilrigError as error:
         # The exceptions of recordings can't be sent between processes.
         return OperationError(str(error)) if isinstance(error, OperationError) else InputError(str(error))
 
 
-def _page(run: Run, name: str, verified: bool, task: TaskConfig | None) -> _Page:
+def _page(run: Run, name: str, verified: bool, task: TaskConfig | None, max_rows: int) -> _Page:
     summary = summarize(run, task)
     parameters = parameters_of(run.parameters_json)
     targets = task or recorded_task(run)
-    figures = [
-        html_figure(
-            motion_figure(summary.trajectory, parameters, targets), "joint positions, joint efforts and tool path"
-        )
-    ]
+    motion = html_figure(
+        motion_figure(summary.trajectory, parameters, targets), "joint positions, joint efforts and tool path"
+    )
+    latency = ""
     if summary.latency.loop_ms is not None:
-        figures.append(
-            html_figure(
-                latency_figure(summary.latency, run),
-                "loop latency: histogram, stages, tail distribution, course over time",
-            )
+        latency = html_figure(
+            latency_figure(summary.latency, run), "loop latency: histogram, stages, tail distribution, course over time"
         )
+    columns = timeline(run, summary.latency, parameters, targets, summary.grade, max_rows=max_rows)
     # Frees the samples once they are drawn: a group may have many runs.
     summary = replace(summary, name=name, latency=summary.latency.without_table())
-    return _Page(summary, tuple(figures), verify(run.path) if verified else None)
+    return _Page(summary, motion, latency, columns, verify(run.path) if verified else None)
 
 
-def _run(page: _Page) -> str:
-    summary = page.summary
+def _run(number: int, page: _Page) -> str:
+    summary, name = page.summary, f"run-{number}"
+    # "</script>" in a text would end the element.
+    values = json.dumps(page.timeline, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return (
         f"<section>{_facts(page)}</section>"
+        f"<section><h2>Causes and observations</h2>{_findings(summary)}</section>"
         f"{_task(summary)}"
-        f"<section><h2>Motion</h2>{page.figures[0]}{_efforts(summary)}</section>"
-        f"<section><h2>Loop latency</h2>{_latency(summary)}{''.join(page.figures[1:])}</section>"
-        f"<section><h2>Events</h2>{_events(summary)}</section>"
+        f'<section><h2>Motion</h2><div class="player" id="{name}"></div><div class="still">{page.motion}</div>'
+        f'<script type="application/json" id="{name}-data">{values}</script>{_efforts(summary)}</section>'
+        f"<section><h2>Loop latency</h2>{_latency(summary)}{page.latency}</section>"
+        f"<section><h2>Events</h2>{_events(name, page)}</section>"
     )
 
 
 def _origin(summary: RunSummary) -> str:
     # A session that was started by a controller has the controller's address.
-    started_by = f"controlled by {summary.controller}" if summary.controller else "recorded manually"
+    name = f"{summary.certificate} at " if summary.certificate else ""
+    started_by = f"controlled by {name}{summary.controller}" if summary.controller else "recorded manually"
     return f"{summary.rig}{' of ' + summary.lab if summary.lab else ''} · {started_by} · {summary.start}"
 
 
@@ -280,31 +273,48 @@ def _latency(summary: RunSummary) -> str:
     latency = summary.latency
     rows = []
     if latency.loop_ms is not None:
-        rows.append(["loop", *latency.loop_ms.cells()])
-        rows += [[stage.title, *latency.stages_ms[stage.key].cells()] for stage in LOOP_STAGES]
+        known = latency.intervals_ms
+        rows.append(["loop", *cells(latency.loop_ms, known["loop"])])
+        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in LOOP_STAGES]
     if latency.age_ms is not None:
-        rows.append(["age", *latency.age_ms.cells()])
-    rows.append(["tick lateness", *latency.jitter_ms.tick_lateness.cells()])
+        rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
+    rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit
         else f'<p class="bad">Not valid for latency measurements: {as_html(latency.reason_text())}.</p>'
     )
     notes = "".join(f'<p class="quiet">{as_html(note)}</p>' for note in latency.notes())
-    findings = "".join(f"<li>{as_html(finding.text)}</li>" for finding in latency.findings)
-    table = _table(["ms", *STATISTICS_TITLES], rows)
-    return f"{table}{notes}{verdict}{f'<ul>{findings}</ul>' if findings else ''}"
+    return f"{_table(['ms', *STATISTICS_TITLES], rows)}{notes}{verdict}"
 
 
-def _events(summary: RunSummary) -> str:
-    if not summary.events:
+def _findings(summary: RunSummary) -> str:
+    return "".join(
+        f"<p>{title}:</p><ul>{''.join(f'<li>{as_html(sentence)}</li>' for sentence in sentences)}</ul>"
+        for title, sentences in sections(summary.latency.findings)
+    )
+
+
+def _events(name: str, page: _Page) -> str:
+    events, others = page.timeline["events"], page.timeline["other_events"]
+    if not events:
         return "<p>No events.</p>"
-    rows = [
-        [event_title(kind), severity.lower(), str(count)]
-        for kind, counts in summary.events.items()
-        for severity, count in counts.items()
-    ]
-    return _table(["event", "severity", "count"], rows)
+    counts = ", ".join(
+        f"{event_title(kind)} {sum(by_severity.values())}" for kind, by_severity in page.summary.events.items()
+    )
+    rows = "".join(
+        f'<tr data-run="{name}">'
+        f'<td><button type="button" data-time="{event["time"]}">{event["time"]:.2f} s</button></td>'
+        f"<td>{as_html(event['title'])}</td><td>{as_html(event['severity'])}</td>"
+        f'<td class="text">{as_html(event["text"])}</td></tr>'
+        for event in events
+    )
+    more = f'<p class="quiet">{others} later events are not listed.</p>' if others else ""
+    head = "<thead><tr><th>time</th><th>event</th><th>severity</th><th>text</th></tr></thead>"
+    return (
+        f'<p class="quiet">{as_html(counts)}</p>'
+        f'<div class="events"><table>{head}<tbody>{rows}</tbody></table></div>{more}'
+    )
 
 
 def _overview(pages: Sequence[_Page]) -> str:

@@ -1,4 +1,4 @@
-"""Top view of a rig as JSON values: static geometry (scene) and arm position (pose).
+"""Views of a rig as JSON values, for pages: static geometry (scene) and arm position (pose).
 
 World frame, x forward, y to the left, rounded to millimeters.
 """
@@ -26,12 +26,16 @@ Pose = list[int]
 def scene_of(rig: RigParameters) -> Scene:
     """Return the static geometry of a rig as JSON values; lengths in mm, yaw angles in degrees.
 
-    `reach` is the outline of the workspace as SVG path data; `top` and `bottom` are the limits of the tool height. The
-    parts are in the order of the parts in a state.
+    `reach` is the outline of the workspace as SVG path data; `links` are the lengths of the upper arm and the forearm,
+    `shoulder` is their height; `top` and `bottom` are the limits of the tool height. The parts are in the order of the
+    parts in a state. A position is that of the center, of a tray that of its bottom.
     """
     arm, scene = rig.arm, rig.scene
     return {
         "span": _mm(arm.l2 + arm.l3),
+        "links": [_mm(arm.l2), _mm(arm.l3)],
+        "shoulder": _mm(arm.l1),
+        "table": _mm(scene.table_height),
         "top": _mm(arm.l1 - arm.lower[2]),
         "bottom": _mm(arm.l1 - arm.upper[2]),
         "reach": " ".join(map(_line, workspace_outline(arm, 0.0))),
@@ -40,6 +44,7 @@ def scene_of(rig: RigParameters) -> Scene:
                 "name": tray.name,
                 "at": [_mm(tray.position[0]), _mm(tray.position[1]), _degrees(tray.yaw)],
                 "size": [_mm(tray.size[0]), _mm(tray.size[1])],
+                "z": [_mm(tray.position[2]), _mm(tray.size[2])],
                 "color": tray.colour,
                 "places": [[_mm(x), _mm(y)] for x, y, _ in tray.places],
             }
@@ -50,6 +55,7 @@ def scene_of(rig: RigParameters) -> Scene:
                 "name": part.name,
                 "round": part.shape == "cylinder",
                 "size": [_mm(part.size[0]), _mm(part.size[1])],
+                "z": [_mm(part.position[2]), _mm(part.size[2])],
                 "color": part.colour,
                 "at": [_mm(part.position[0]), _mm(part.position[1]), _degrees(part.yaw)],
             }

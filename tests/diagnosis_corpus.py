@@ -1,0 +1,357 @@
+"""Corpus of runs with a known cause, in simulated time, and the error rate of the diagnosis on its judged part.
+
+The rules were tuned on `tuning`: one law, with the parameter ranges of that part. `judged` has other laws, other set
+points and disjoint ranges. Causes that need real processes are in `tests/rig/test_diagnosis_live.py`.
+
+    python tests/diagnosis_corpus.py [tuning|judged] [RUNS]    prints the table of docs/timing.md
+"""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.stats import binomtest
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+
+from hilrig_replay.analysis.latency import measure
+from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_sim.arm.kinematics import forward
+from support.recordings import PARAMETERS, REGISTER_SCALE
+from support.virtual_loop import Law, Program, virtual_runs
+
+Random = np.random.Generator
+UNDISTURBED: Final = "undisturbed"
+WEIGHT: Final = np.array([0.0, 0.0, -4.905, 0.0])
+RUNS: Final = 30
+"""Runs of each cause in the complete corpus; of undisturbed runs there are three times as many."""
+
+
+@dataclass
+class Case:
+    """A run with a known cause."""
+
+    code: str
+    program: Program
+    allowed: frozenset[str] = frozenset()
+    """Observations that the cause also produces."""
+
+
+@dataclass
+class Part:
+    """Laws and parameter ranges of a part of the corpus."""
+
+    laws: Sequence[str]
+    goals: Sequence[str]
+    kp: tuple[float, float]
+    """Gain of joint 1, N·m per degree."""
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+PARTS: Final = {
+    "tuning": Part(
+        ("filtered",),
+        ("poses", "sine"),
+        (0.20, 0.25),
+        {
+            "wait": (18, 22),
+            "slow": (90, 110),
+            "slow_computing": (28, 32),
+            "injected": (25, 35),
+            "beating": (1.03, 1.06),
+            "stall": (80, 130),
+            "behind": (20, 21),
+            "phase": (3, 6),
+            "gap": (900, 1200),
+            "saturating": (20, 30),
+            "cycling": (2.5, 3.5),
+            "noise": (0.20, 0.25),
+            "overshooting": (0.30, 0.40),
+            "error": (8, 12),
+        },
+    ),
+    "judged": Part(
+        ("difference", "cascade", "integral", "smooth limit"),
+        ("minimum jerk", "ramps", "hold", "slow sine"),
+        (0.08, 0.18),
+        {
+            "wait": (24, 70),
+            "slow": (26, 85),
+            "slow_computing": (34, 90),
+            "injected": (40, 90),
+            "beating": (1.065, 1.13),
+            "stall": (140, 400),
+            "behind": (22, 60),
+            "phase": (7, 14),
+            "gap": (1250, 3000),
+            "saturating": (5, 18),
+            "cycling": (4.0, 9.0),
+            "noise": (0.26, 0.36),
+            "overshooting": (0.5, 1.2),
+            "error": (13, 60),
+        },
+    ),
+}
+
+
+def goal_of(kind: str, random: Random) -> Callable[[float], np.ndarray]:
+    """Set points, degrees and mm, of a time, s."""
+    low, high = np.array([-60, -70, 30, -60]), np.array([60, 70, 150, 60])
+    corners = random.uniform(low, high, (40, 4))
+    every_s = float(random.uniform(2.5, 5.0))
+    if kind == "hold":
+        return lambda _: corners[0]
+    if kind == "poses":
+        return lambda t: corners[int(t / 4) % 2]
+    if kind in ("sine", "slow sine"):
+        rate = 1.5 if kind == "sine" else float(random.uniform(0.4, 1.4))
+        return lambda t: corners[0] * np.array([0.4, 0.4, 1.0, 0.4]) + np.array([20, 15, 12, 10]) * np.sin(rate * t)
+    move_s = 0.8 if kind == "minimum jerk" else 1.6
+
+    def moves(t: float) -> np.ndarray:
+        number = int(t / every_s)
+        share = min((t - number * every_s) / move_s, 1.0)
+        if kind == "minimum jerk":
+            share = share**3 * (10 - 15 * share + 6 * share**2)
+        return np.asarray(corners[number] + share * (corners[number + 1] - corners[number]))
+
+    return moves
+
+
+SCALE: Final = np.array([1.0, 0.6, 0.12, 0.016])
+"""Gains of the joints relative to joint 1."""
+DAMPING: Final = np.array([0.3, 0.15, 0.06, 0.09])
+"""Derivative gain over proportional gain, s: the viscous friction damps, too."""
+
+
+def law_of(kind: str, goal: Callable[[float], np.ndarray], kp: float, period_s: float, damping: float = 1.0) -> Law:
+    """A control law with a proportional gain for joint 1."""
+    p, d = kp * SCALE, damping * kp * SCALE * DAMPING
+    seen: list[tuple[float, np.ndarray]] = []
+    integral, speed = np.zeros(4), np.zeros(4)
+
+    def law(t: float, q: np.ndarray) -> np.ndarray:
+        nonlocal integral, speed
+        seen.append((t, q))
+        error = goal(t) - q
+        if kind == "filtered":
+            if len(seen) > 1:
+                speed = 0.5 * speed + 0.5 * (q - seen[-2][1]) / period_s
+            return np.asarray(p * error - d * speed + WEIGHT)
+        first = seen[-4:][0]
+        speed = (q - first[1]) / (t - first[0]) if t > first[0] else np.zeros(4)
+        if kind == "cascade":
+            wanted = np.clip(p / np.maximum(d, 1e-9) * error, -90, 90)
+            return np.asarray(d * (wanted - speed) + WEIGHT)
+        if kind == "integral":
+            integral = np.clip(integral + 0.02 * p * error * period_s, -1, 1)
+            return np.asarray(p * error - d * speed + integral + WEIGHT)
+        if kind == "smooth limit":
+            return np.asarray(6 * np.tanh((p * error - d * speed) / 6) + WEIGHT)
+        return np.asarray(p * error - d * speed + WEIGHT)
+
+    return law
+
+
+def _task(position: np.ndarray) -> str:
+    """The `lab.toml` of a task with one pose, where the joints are at a position, degrees and mm."""
+    x, y, z = forward(PARAMETERS.arm, (position / REGISTER_SCALE)[:, np.newaxis])[:3, 0] * 1e3
+    return f'[[task.poses]]\nname = "goal"\nposition_mm = [{x:.2f}, {y:.2f}, {z:.2f}]\n'
+
+
+def case_of(code: str, part: str, number: int) -> Case:
+    """The case of a cause with a number; equal arguments give the same case."""
+    random = np.random.default_rng([sum(map(ord, code)), part == "judged", number])
+    of = PARTS[part]
+    law, goal = of.laws[number % len(of.laws)], goal_of(of.goals[number // 2 % len(of.goals)], random)
+    kp = float(random.uniform(*of.kp))
+    step_ms = 20.0
+    phase = float(random.uniform(*of.ranges["phase"]))
+    fast = float(random.uniform(0.3, 0.6)) * step_ms
+
+    def within(name: str) -> float:
+        return float(random.uniform(*of.ranges[name]))
+
+    def program(period_ms: float, gain: float = 1.0, damping: float = 1.0, kind: str = law, **changes: Any) -> Program:
+        polled_ms = max(period_ms, changes.get("wait_ms", 0.0) + changes.get("compute_ms", 0.0))
+        values = {"period_ms": period_ms, "phase_ms": phase, "seed": number + 1, "step_ms": step_ms, **changes}
+        start = tuple(goal(0.0) + np.array([8, -8, 4, 5]))
+        return Program(law_of(kind, goal, kp * gain, polled_ms / 1e3, damping), start=start, **values)  # type: ignore[arg-type]
+
+    times = random.permutation(np.arange(2.0, 18.0, 2.0))
+    match code:
+        case "undisturbed":
+            return Case(code, program((step_ms, fast)[number % 2]))
+        case "open_loop":
+            return Case(code, program(step_ms, reads_once=True), frozenset({"joint_on_stop"}))
+        case "previous_poll":
+            period_ms = (step_ms, within("behind"))[number % 2]
+            return Case(code, program(period_ms, 0.6, behind=1 + (number % 5 == 0)))
+        case "wait_before_write":
+            if number % 3 == 0:
+                return Case(code, program(within("wait"), 0.6, deadline=False, write_first=True))
+            return Case(code, program(0, 0.6, deadline=False, wait_ms=within("wait")))
+        case "slow_polling":
+            return Case(code, program(within("slow"), 0.6, deadline=number % 2 == 0))
+        case "computing_time":
+            spread, compute_ms = float(random.uniform(0.05, 0.3)), within("slow_computing")
+            period_ms = compute_ms * 1.3 if number % 2 else 0.0
+            return Case(code, program(period_ms, 0.5, compute_ms=compute_ms, compute_spread=spread))
+        case "delayed_acknowledgement":
+            return Case(code, program(step_ms, 0.4, ack_ms=float(random.uniform(40, 44))))
+        case "edge_stall":
+            return Case(code, program(step_ms, 0.6, edge_stalls={float(t): within("stall") for t in times[:4]}))
+        case "simulation_stall":
+            return Case(code, program(step_ms, 0.6, stalls={float(t): within("stall") for t in times[:4]}))
+        case "injected_delay":
+            share = float(random.uniform(0, 1))
+            delay_ms = within("injected")
+            delays = {"injected_state_ms": share * delay_ms, "injected_command_ms": (1 - share) * delay_ms}
+            return Case(code, program(fast, 0.5, **delays))
+        case "beating":
+            return Case(code, program(step_ms * within("beating")))
+        case "watchdog_gaps":
+            return Case(code, program(step_ms, 0.6, pauses={float(t): within("gap") for t in times[:3]}))
+        case "saturation":
+            limit = float(random.uniform(0.4, 1.2))
+            limited = program(step_ms, within("saturating") * 0.4, 4.0, kind=of.laws[0])
+            free, goal = limited.law, goal_of("poses", random)
+            limited.law = lambda t, q: np.clip(free(t, q) - WEIGHT, -limit, limit) + WEIGHT
+            return Case(code, limited, frozenset({"overshoot", "limit_cycle"}))
+        case "limit_cycle":
+            hot = program(step_ms, within("cycling") * 4, 0.0, kind=of.laws[0])
+            return Case(code, hot, frozenset({"saturation", "joint_on_stop"}))
+        case "joint_on_stop":
+            pressed = program(step_ms)
+            free = pressed.law
+            lift = within("error") * 0.5
+            if number % 2:
+                pressed.law = lambda t, q: free(t, q) - np.array([0, 0, lift, 0])
+            else:
+                pressed.law = lambda t, q: free(t, q - np.array([100 + 10 * lift, 0, 0, 0]))
+            return Case(code, pressed, frozenset({"saturation"}))
+        case "steady_state_error":
+            # The weight of joint 3 is carried only in part: it hangs lower by this distance.
+            goal = goal_of("hold", random)
+            sagging = program(step_ms, kind=of.laws[0])
+            free, error = sagging.law, within("error") * kp * SCALE[2]
+            sagging.law = lambda t, q: free(t, q) + np.array([0, 0, error, 0])
+            sagging.task = _task(goal(0.0))
+            return Case(code, sagging)
+        case "overshoot":
+            goal = goal_of("poses", random)
+            return Case(
+                code, program(step_ms, within("overshooting") / kp, 0.0, kind=of.laws[0]), frozenset({"saturation"})
+            )
+        case "noise_amplification":
+            step_ms = 5.0
+            noisy = program(step_ms, 1.0, kind=of.laws[0], seconds=10.0, phase_ms=1.5)
+            free, gain, seen = noisy.law, within("noise"), [np.zeros(4)]
+
+            def with_derivative(t: float, q: np.ndarray) -> np.ndarray:
+                speed = (q - seen[-1]) / (step_ms / 1e3) if len(seen) > 1 else np.zeros(4)
+                seen.append(q)
+                return np.asarray(free(t, q) - gain * np.array([1, 0, 0, 0]) * speed)
+
+            noisy.law = with_derivative
+            return Case(code, noisy, frozenset({"saturation"}))
+    raise ValueError(code)
+
+
+TIMING: Final = (
+    "open_loop",
+    "previous_poll",
+    "wait_before_write",
+    "slow_polling",
+    "computing_time",
+    "delayed_acknowledgement",
+    "edge_stall",
+    "simulation_stall",
+    "injected_delay",
+    "beating",
+    "watchdog_gaps",
+)
+CONTROL: Final = (
+    "saturation",
+    "limit_cycle",
+    "joint_on_stop",
+    "steady_state_error",
+    "overshoot",
+    "noise_amplification",
+)
+CODES: Final = (UNDISTURBED, *TIMING, *CONTROL)
+
+
+@dataclass
+class Result:
+    """Diagnosis of a case."""
+
+    case: Case
+    timing: list[str]
+    control: list[str]
+
+    @property
+    def found(self) -> bool:
+        """Whether the cause is in its list; of an undisturbed run, whether both lists are empty."""
+        code = self.case.code
+        return not self.timing + self.control if code == UNDISTURBED else code in self.timing + self.control
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the first cause is not the right one; of a control run, a timing cause or another observation."""
+        code = self.case.code
+        if code in TIMING:
+            return bool(self.timing) and self.timing[0] != code
+        return bool(self.timing) or bool(self.control and self.control[0] not in {code, *self.case.allowed})
+
+
+def diagnosed(cases: Sequence[Case]) -> Iterator[Result]:
+    """Run and diagnose cases."""
+
+    def key(case: Case) -> tuple[float, float]:
+        return case.program.step_ms, case.program.seconds
+
+    for _, group in groupby(sorted(cases, key=key), key):
+        together = list(group)
+        for case, run in zip(together, virtual_runs([one.program for one in together]), strict=True):
+            findings = measure(run, task=recorded_task(run)).findings
+            yield Result(case, *([one.code for one in findings if one.list == name] for name in ("timing", "control")))
+
+
+def corpus(part: str, runs: int) -> list[Case]:
+    """Cases of a part: `runs` of each cause, and three times as many undisturbed runs."""
+    return [case_of(code, part, number) for code in CODES for number in range(runs * (3 if code == UNDISTURBED else 1))]
+
+
+def interval(count: int, total: int) -> str:
+    """Share with its 95 % interval (Wilson), as text."""
+    bounds = binomtest(count, total).proportion_ci(method="wilson")
+    return f"{count / total:.1%} ({bounds.low:.1%} to {bounds.high:.1%})"
+
+
+def table(results: Sequence[Result]) -> str:
+    """Table of docs/timing.md: found and wrong by cause."""
+    lines = ["| cause | runs | found | wrong first entry |", "|---|---|---|---|"]
+    for code in CODES:
+        ours = [one for one in results if one.case.code == code]
+        if ours:
+            counts = (sum(one.found for one in ours), sum(one.wrong for one in ours))
+            cells = [interval(count, len(ours)) for count in counts]
+            lines.append(f"| {code} | {len(ours)} | {cells[0]} | {cells[1]} |")
+    found, wrong = (sum(getattr(one, name) for one in results) for name in ("found", "wrong"))
+    lines.append(f"| all | {len(results)} | {interval(found, len(results))} | {interval(wrong, len(results))} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [RUNS])[0])
+    judged = list(diagnosed(corpus(selected[0], count)))
+    print(table(judged))
+    for one in judged:
+        if one.wrong or not one.found:
+            print(one.case.code, one.case.program.seed - 1, one.timing, one.control)

@@ -1,0 +1,43 @@
+"""Error rate of the diagnosis on runs with a known cause; with HILRIG_LONG set, of the complete corpus."""
+
+import os
+
+import pytest
+
+from diagnosis_corpus import PARTS, RUNS, UNDISTURBED, corpus, diagnosed, table
+
+LONG = bool(os.environ.get("HILRIG_LONG"))
+
+
+def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
+    tuning, judged = PARTS["tuning"], PARTS["judged"]
+    assert not set(tuning.laws) & set(judged.laws)
+    assert not set(tuning.goals) & set(judged.goals)
+    assert tuning.ranges.keys() == judged.ranges.keys()
+    for name in ("kp", *tuning.ranges):
+        (low, high), (other_low, other_high) = (
+            part.kp if name == "kp" else part.ranges[name] for part in (tuning, judged)
+        )
+        assert high < other_low or other_high < low, name
+
+
+def test_a_sample_of_forty_runs_is_diagnosed() -> None:
+    # Two runs of each cause, and six undisturbed ones.
+    results = list(diagnosed(corpus("judged", 2)))
+    assert len(results) == 40
+    missed = [(one.case.code, one.timing, one.control) for one in results if not one.found or one.wrong]
+    assert len(missed) <= 1, missed
+
+
+@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
+@pytest.mark.timeout(900)
+def test_error_rate_of_the_complete_corpus() -> None:
+    results = list(diagnosed(corpus("judged", RUNS)))
+    print(table(results))
+    disturbed = [one for one in results if one.case.code != UNDISTURBED]
+    undisturbed = [one for one in results if one.case.code == UNDISTURBED]
+    assert sum(one.wrong for one in disturbed) <= 0.02 * len(disturbed)
+    assert sum(one.found for one in undisturbed) >= 0.98 * len(undisturbed)
+    for code in {one.case.code for one in disturbed}:
+        ours = [one for one in disturbed if one.case.code == code]
+        assert sum(one.found for one in ours) >= 0.9 * len(ours), code

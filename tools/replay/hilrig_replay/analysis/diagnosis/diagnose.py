@@ -1,0 +1,22 @@
+"""Selects the findings of a run: relevant, not explained by another one, and at most three of each list."""
+
+from typing import Final
+
+from hilrig_replay.analysis.diagnosis.control_observations import OBSERVATIONS
+from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding
+from hilrig_replay.analysis.diagnosis.timing_causes import RULES, SUPPRESSED, is_relevant
+
+MAX_FINDINGS: Final = 3
+"""Largest number of findings in each list."""
+
+
+def diagnose(evidence: Evidence) -> tuple[Finding, ...]:
+    """Timing causes, those that explain most of the age first, then control observations; empty: no cause was found."""
+    causes = [finding for rule in RULES if (finding := rule(evidence)) is not None and is_relevant(finding)]
+    explained = frozenset[str]().union(*(SUPPRESSED.get(cause.code, frozenset()) for cause in causes))
+    causes = [cause for cause in causes if cause.code not in explained]
+    causes.sort(key=lambda cause: -cause.evidence["share"])
+    observations: list[Finding] = []
+    for observe in OBSERVATIONS:
+        observations += observe(evidence, observations)
+    return (*causes[:MAX_FINDINGS], *observations[:MAX_FINDINGS])
