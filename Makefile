@@ -55,7 +55,6 @@ test-long: .venv/dev ## tests that take minutes: 2,000 other forged recordings, 
 	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
 	HILRIG_BUS_FUZZ_MESSAGES=100000 $(BIN)/pytest tests/rig/test_bus_fuzz.py
 	HILRIG_RANDOM_ARMS=100 $(BIN)/pytest tests/unit/test_automatic_substeps.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_basis_of_commands.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py
 
 check: .venv/dev ## check format, lint rules, types and layers

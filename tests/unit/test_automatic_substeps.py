@@ -167,11 +167,11 @@ def test_tool_falls_from_an_edge_when_it_leaves_it(step_ns: int) -> None:
 
 
 def test_hours_of_random_torque_do_not_diverge() -> None:
-    # 500 rigs for 3 s; the benchmark makes ten hours.
+    # 250 rigs for 1.6 s; the benchmark makes ten hours.
     random = np.random.default_rng(3)
-    plant = Plant([rig()] * 500)
-    for _ in range(150):
-        plant.step(random_efforts(random, 500), np.zeros(500, dtype=np.bool_))
+    plant = Plant([rig()] * 250)
+    for _ in range(80):
+        plant.step(random_efforts(random, 250), np.zeros(250, dtype=np.bool_))
         assert np.abs(plant.velocity[:2]).max() < 40
         assert plant.substeps.max() < MAX_SUBSTEPS
         assert not plant.is_inaccurate()
@@ -274,7 +274,7 @@ def test_fast_arms_are_resolved(masses: tuple[float, float, float], friction: tu
     assert any((error > limits).any() for *_, error in step_errors(old, np.random.default_rng(8)))
 
 
-@pytest.mark.parametrize("number", range(int(os.environ.get("HILRIG_RANDOM_ARMS", "4"))))
+@pytest.mark.parametrize("number", range(int(os.environ.get("HILRIG_RANDOM_ARMS", "3"))))
 def test_inaccurate_steps_of_an_arm_are_reported(number: int) -> None:
     random = np.random.default_rng(number)
     arm = arm_of(tuple(10 ** random.uniform(-2, 0.3, 3)), tuple(10 ** random.uniform(-1, 0.6, 2)))
