@@ -5,8 +5,8 @@ rig: the results of a rig do not depend on the number of rigs. An interval start
 the recorded efforts and the magnet. Its last step must lead to the first state of the next interval, and the last
 interval of a block continues in the next block, so the complete run is re-simulated. An hour takes seconds.
 
-Every published field that the simulation computes is compared, effort and magnet of each state with its command, and the
-times of its ticks with each other.
+Every published field that the simulation computes is compared, effort and magnet of each state with its command, and
+the times of its ticks with each other.
 """
 
 from collections import Counter
@@ -46,14 +46,6 @@ TIME_WINDOW_ROWS: Final = 8192
 """States of previous blocks that can be the basis of a loop latency, as many as the simulation remembers."""
 _DRIVE: Final = np.dtype([("key", "<u8"), ("effort", "<f8", (4,)), ("magnet", "?")])
 _TICK_FIELDS: Final = [
-    "incarnation",
-    "step",
-    "sampled_ns",
-    "lateness_ns",
-    "missed_steps",
-    "basis_step",
-    "loop_latency_ns",
-]
     "incarnation",
     "step",
     "sampled_ns",
