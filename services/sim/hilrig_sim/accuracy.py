@@ -53,9 +53,9 @@ def _failure(rig: RigParameters) -> str | None:
     if not inaccurate.any():
         return None
     joint = int(np.argmax(shares.max(axis=1)))
-    unit = "mm" if joint == 2 else "°"
+    unit = " mm" if joint == 2 else "°"
     worst = error[joint].max() * JOINT_SCALE[joint]
-    return f"{100 * inaccurate.mean():.2g} % of the steps are inaccurate, by up to {worst:.2g} {unit}"
+    return f"{100 * inaccurate.mean():.2g} % of the steps are inaccurate, by up to {worst:.2g}{unit}"
 
 
 def step_errors(rig: RigParameters, random: np.random.Generator) -> Iterator[tuple[Plant, Floats, Floats]]:
