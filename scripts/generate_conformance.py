@@ -66,6 +66,9 @@ RULES: tuple[Rule, ...] = (
     Rule("AP 6.3", "03 with quantity 125 is legal; the address is illegal", "03 00 00 00 7D", "83 02"),
     Rule("AP 6.3", "03 beyond the map is an illegal address", "03 00 08 00 01", "83 02"),
     Rule("AP 6.3", "03 across the map's end is an illegal address", "03 00 07 00 02", "83 02"),
+    Rule("AP 6.3", "03 reads the mirror of the input registers", "03 00 C8 00 01", "03 02 00 01"),
+    Rule("AP 6.3", "03 across the mirror's end is an illegal address", "03 00 EB 00 02", "83 02"),
+    Rule("AP 6.3", "03 reads back the magnet", "03 01 2C 00 01", "03 02 00 01", ("05 00 00 FF 00",)),
     Rule("AP 6.3", "03 across a gap is an illegal address", "03 00 00 00 66", "83 02"),
     Rule("AP 6.3", "03 at address 65535 does not wrap", "03 FF FF 00 02", "83 02"),
     Rule("AP 6.3", "03 that is too short is an illegal value", "03 00 00 00", "83 03"),
@@ -141,6 +144,8 @@ RULES: tuple[Rule, ...] = (
         "AP 6.12", "16 with more data than its byte count is an illegal value", "10 00 00 00 01 02 00 0A 01 02", "90 03"
     ),
     Rule("AP 6.12", "16 at address 65535 does not wrap", "10 FF FF 00 02 04 00 0A 01 02", "90 02"),
+    Rule("AP 6.12", "16 writes magnet and reset", "10 01 2C 00 02 04 00 01 00 00", "10 01 2C 00 02"),
+    Rule("AP 6.12", "16 of the mirror is an illegal address", "10 00 C8 00 01 02 00 00", "90 02"),
     Rule("AP 6.12", "16 across a gap is an illegal address", "10 00 63 00 02 04 00 0A 01 02", "90 02"),
     Rule("AP 6.12", "quantity and byte count are checked before address", "10 FF FF 00 02 03 00 0A 01", "90 03"),
     Rule(

@@ -27,8 +27,3 @@ def list_names(names: Sequence[str], limit: int = 3) -> str:
     """Join names for a message; those beyond `limit` are only counted."""
     more = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")
-
-
-def listen_failure(error: OSError) -> str:
-    """Return the reason why a socket can't listen, without the address that Python appends to it."""
-    return (error.strerror or str(error)).partition(" (while")[0]

@@ -9,7 +9,9 @@ from hilrig_schemas.v1.control_pb2 import RevokeClient as RevokeClient
 from hilrig_schemas.v1.control_pb2 import StartSession as StartSession
 from hilrig_schemas.v1.control_pb2 import StopSession as StopSession
 from hilrig_schemas.v1.event_pb2 import Event as Event
+from hilrig_schemas.v1.health_pb2 import ExceptionCount as ExceptionCount
 from hilrig_schemas.v1.health_pb2 import Health as Health
+from hilrig_schemas.v1.health_pb2 import PeerReport as PeerReport
 from hilrig_schemas.v1.health_pb2 import RigReport as RigReport
 from hilrig_schemas.v1.impairment_pb2 import ImpairmentRequest as ImpairmentRequest
 from hilrig_schemas.v1.impairment_pb2 import ImpairmentStatus as ImpairmentStatus

@@ -51,7 +51,7 @@ DOCUMENTED = [
         [("edge.watchdog_min_ms", 1), ("edge.watchdog_max_ms", 1000)],
     ),
     ("docs/controllers.md", r"sent no request for (\S+) s", [("edge.lease_timeout_ms", 1000)]),
-    ("docs/controllers.md", r"runs every (\d+) ms, like the simulation", [("sim.step_ms", 1)]),
+    ("docs/controllers/openplc.md", r"runs every (\d+) ms, like the simulation", [("sim.step_ms", 1)]),
     (
         "docs/controllers.md",
         r"at most (\d+) mm beside and (\d+) mm below",
@@ -103,6 +103,7 @@ DOCUMENTED = [
         for page in (
             "README.md",
             "docs/controllers.md",
+            *(f"docs/controllers/{name}.md" for name in ("python", "c", "nodejs", "go", "forte")),
             *(f"examples/hold_position.{kind}" for kind in ("py", "c", "js")),
         )
         for pattern in (r"(?:127\.0\.0\.1[: ]|-p |--port |[pP]ort.{1,22}[=:] \"?)(\d{4})\b",)

@@ -2,9 +2,13 @@
 
 import ast
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
+
+from hilrig_recorder.ingest.recording import LossCounters
+from hilrig_recorder.mcap_format.ending import Ending
 
 ROOT = Path(__file__).parents[2]
 FORMAT = ROOT / "services/recorder/hilrig_recorder/mcap_format"
@@ -82,3 +86,14 @@ def test_size_of_chunks_is_documented() -> None:
     from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 
     assert f"in chunks of at most {CHUNK_BYTES // 1024} KiB" in (ROOT / "docs/recordings.md").read_text()
+
+
+def test_recordings_page_has_the_causes_and_the_counters() -> None:
+    page = (ROOT / "docs/recordings.md").read_text(encoding="utf-8")
+    section = page.partition("## Completeness")[2].partition("## ")[0]
+    counters, causes = (
+        [name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall("`(.+?)`", row)]
+        for table in section.split("| `ended` | cause")
+    )
+    assert counters == [*(field.name for field in fields(LossCounters)), "messages"]
+    assert causes == list(Ending)

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -213,7 +214,7 @@ def test_unwritable_folder_is_one_error_line_and_exit_3(tmp_path: Path) -> None:
 
 @pytest.mark.rig
 @pytest.mark.skipif(os.name != "posix", reason="on other systems an open file can't be moved or deleted")
-@pytest.mark.parametrize("change", ["file moved", "file deleted", "folder deleted"])
+@pytest.mark.parametrize("change", ["file moved", "file deleted", "file truncated", "folder deleted"])
 def test_moved_or_deleted_recording_continues_in_new_segment(tmp_path: Path, change: str) -> None:
     config, lab = make_lab(tmp_path)
     elsewhere = tmp_path / "elsewhere.mcap"
@@ -229,11 +230,16 @@ def test_moved_or_deleted_recording_continues_in_new_segment(tmp_path: Path, cha
                     part.rename(elsewhere)
                 elif change == "file deleted":
                     part.unlink()
+                elif change == "file truncated":
+                    os.truncate(part, 100)
                 else:
                     shutil.rmtree(lab.recorder.folder)
                 eventually(lambda: files_of(lab, "rig1", "*.2.mcap.part"))
                 eventually(
-                    lambda: any("moved or deleted while it was being written" in text for text in alerts.received)
+                    lambda: any(
+                        re.search("(moved or deleted|truncated) while it was being written", text)
+                        for text in alerts.received
+                    )
                 )
                 sent = senders.count("rig1")
                 eventually(lambda: senders.count("rig1") > sent + 100)

@@ -53,18 +53,43 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MultiHostLab]:
         yield made
 
 
+LOST = {"edge": "no states since ", "sim": "no command received for ", "recorder": "no messages of "}
+"""Begin of the text of an outage, in the recording and in the log of each service."""
+
+
 def test_loop_recovers_after_router_restart(lab: MultiHostLab) -> None:
+    def count(host: str, text: str) -> int:
+        return lab.log(host).read_text().count(text)
+
+    outages = {"edge": 1, "sim": 1, "recorder": 2}
+    """Log messages of each service: one, of the recorder one for each stream."""
+    ended = {host: count(host, "received again") for host in LOST}
+    logged = {host: count(host, text) for host, text in LOST.items()}
     with ControllerSession(lab) as session:
         killed_ns = lab.kill("router")
         time.sleep(2.0)
         lab.start("router")
         lab.wait_for_closed_loop(15)
         back_ns = time.monotonic_ns()
+        eventually(
+            lambda: all(count(host, "received again") >= ended[host] + outages[host] for host in LOST), every_s=0.1
+        )
     states = session.states()
     assert time_to_zero_ns(states, killed_ns) <= TIMEOUT_NS + TOLERANCE_NS
     assert np.abs(states["effort"][states["sampled_ns"] > back_ns]).max() > 0, "no torque after the recovery"
     steps = np.diff(states["step"].astype(np.int64))
     assert steps.max() == 1, "states of the outage are missing: the simulation must send them again"
+    [lost], [_] = session.event_texts("STATE_LOST"), session.event_texts("STATE_BACK")
+    assert lost.startswith(LOST["edge"])
+    [lost], [_] = session.event_texts("COMMAND_LOST"), session.event_texts("COMMAND_BACK")
+    assert lost.startswith(LOST["sim"])
+    recorded = [text.partition(" since ")[0] for text in session.event_texts("RECORDING")]
+    missing = [f"messages of {service}" for service in ("edge/1", "sim/1")]
+    assert sorted(recorded) == [
+        *(f"{messages} received again" for messages in missing),
+        *(f"no {messages}" for messages in missing),
+    ]
+    assert {host: count(host, text) - logged[host] for host, text in LOST.items()} == outages
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,23 @@
 """The edge as the client of a controller that is a Modbus server: sockets, a cyclic program, and its failures."""
 
 import socket
+import ssl
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hilrig_cli.doctor.controllers import check_controllers
 from hilrig_runtime.bus.memory_bus import MemoryBus
+from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.security.x509 import issue_client, issue_server, make_authority
 from hilrig_schemas import Event, LeaseRequest, LeaseStatus, TorqueCommand, topics
 from support.edge_rig import EdgeRig, counts, running_edge
 from support.plc import HEADER, Plc
@@ -29,6 +35,7 @@ def client_of(
 ) -> Iterator[EdgeRig]:
     """Run an edge that is the client of `plc`, with a state every 20 ms."""
     settings = {"controller": edge.pop("controller", plc.address), "registers": registers, "client": client}
+    settings |= {key: edge.pop(key) for key in ("impairment",) if key in edge}
     edge = {"watchdog_ms": 300.0, "session_grace_ms": 600.0} | edge
     with running_edge(first_rig=settings, **edge) as rig:
         ended = threading.Event()
@@ -98,6 +105,25 @@ def test_torques_answer_the_positions_of_their_basis() -> None:
     start = rig.event(Event.SESSION_START)
     assert start.text.endswith(f"started as client of {plc.address}")
     assert len({command.session for command in commands}) == 1
+
+
+@pytest.mark.parametrize(("scan_s", "delay_s"), [(0.005, 0.0), (0.05, 0.004)])
+def test_basis_is_the_one_that_the_device_knows(scan_s: float, delay_s: float) -> None:
+    with Plc(scan_s=scan_s, delay_s=delay_s) as plc, client_of(plc) as rig:
+        eventually(lambda: len(torques(rig)) > 12)
+        commands, scans, requests = torques(rig)[2:], list(plc.scans), list(plc.requests)
+    for command in commands:
+        step = struct.pack(">H", command.basis_step & 0xFFFF)
+        [written_ns] = [at_ns for at_ns, pdu in requests if pdu[0] == 16 and pdu[-2:] == step]
+        assert command.state_served_ns < written_ns < command.positions_acknowledged_ns
+        read = [at for at, pdu in requests if pdu[0] == 3 and command.read_sent_ns < at < command.write_arrived_ns]
+        [read_ns] = read
+        used = [(begin, end) for begin, end, seen in scans if seen == command.basis_step and end < read_ns]
+        assert used[0][0] > written_ns
+        # No scan with newer positions ended before the read.
+        assert not [seen for _, end, seen in scans if seen > command.basis_step and end < read_ns - 2e6]
+        if command.stale_read_sent_ns:
+            assert command.state_served_ns < command.stale_read_sent_ns < command.read_sent_ns
 
 
 def test_first_write_follows_a_read_of_the_torques() -> None:
@@ -184,6 +210,20 @@ def test_no_other_connection_may_write() -> None:
         assert (status.client_of, status.holder, status.controller_fault) == (plc.address, plc.address, "")
 
 
+def test_emulated_network_delays_states_and_torques() -> None:
+    impairment = {"state": {"delay": "constant:30"}, "command": {"delay": "constant:7"}}
+    with Plc() as plc, client_of(plc, impairment=impairment) as rig:
+        # The first ones are later, because the connection was established meanwhile.
+        eventually(lambda: len(torques(rig)) > 8)
+        commands = torques(rig)[-3:]
+    for command in commands:
+        assert (command.state_injected_ns, command.command_injected_ns) == (30_000_000, 7_000_000)
+        assert command.state_served_ns - command.state_arrived_ns >= 30_000_000
+        # The state is written as soon as its delay has passed, not with the next one.
+        assert command.state_served_ns - command.state_arrived_ns < 45_000_000
+        assert command.sent_ns - command.write_arrived_ns >= 7_000_000
+
+
 def test_operator_can_revoke_the_lease() -> None:
     with Plc() as plc, client_of(plc, lease_timeout_ms=500.0) as rig:
         works(rig)
@@ -206,6 +246,17 @@ def test_stopped_program_trips_the_watchdog() -> None:
         plc.running = True
         rig.event(Event.WATCHDOG_REARM)
         rig.event(Event.CONTROLLER_BACK)
+
+
+def test_missing_states_are_no_fault_of_the_program() -> None:
+    with Plc() as plc, client_of(plc) as rig:
+        works(rig)
+        publish, rig.state = rig.state, lambda **_: None  # type: ignore[assignment, method-assign]
+        trip = rig.event(Event.WATCHDOG_TRIP)
+        assert f"no new state was written to {plc.address}" in trip.text
+        assert "CONTROLLER_FAULT" not in rig.kinds()
+        rig.state = publish  # type: ignore[method-assign]
+        works(rig)
 
 
 def test_program_that_does_not_copy_the_step_is_reported() -> None:
@@ -255,6 +306,56 @@ def test_reconnection_continues_the_session() -> None:
         assert rig.kinds().count("SESSION_START") == 1
         assert "SESSION_END" not in rig.kinds()
         assert plc.connections == 2
+
+
+def test_tls_with_mutual_authentication(tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    authority, stranger = make_authority("lab", now, 30), make_authority("stranger", now, 30)
+    names = {"ca": authority, "rig": issue_client(authority, "rig", "operator", now, 30)}
+    names |= {
+        "plc": issue_server(authority, ["127.0.0.1"], now, 30),
+        "fake": issue_server(stranger, ["127.0.0.1"], now, 30),
+    }
+    for name, identity in names.items():
+        (tmp_path / f"{name}.pem").write_bytes(identity.certificate_pem)
+        (tmp_path / f"{name}.key").write_bytes(identity.key_pem)
+
+    def server_context(name: str) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
+        context.load_verify_locations(tmp_path / "ca.pem")
+        context.verify_mode = ssl.CERT_REQUIRED
+        return context
+
+    files = {"authority": "ca.pem", "certificate": "rig.pem", "key": "rig.key"}
+    client = {"tls": {key: str(tmp_path / name) for key, name in files.items()}}
+    with Plc() as plc:
+        plc.tls = server_context("fake")
+        with client_of(plc, client=client) as rig:
+            fault(rig, "TLS handshake failed")
+            assert not plc.requests
+            plc.tls = server_context("plc")
+            works(rig)
+
+
+def test_doctor_names_missing_registers() -> None:
+    def findings(plc: Plc, running: tuple[str, ...] = ()) -> list[tuple[str, str]]:
+        rig = {"name": "rig1", "controller": plc.address, "registers": ECHO, "client": FAST}
+        lab = LabConfig.model_validate({"rigs": [rig]})
+        return [(result.level.value, result.text) for result in check_controllers(lab, running)]
+
+    with Plc() as plc:
+        assert findings(plc) == [("ok", f"rig 'rig1': {plc.address} has all registers")]
+        assert not plc.written()
+        assert findings(plc, ("edge",))[0][1].endswith("is not tested while the edge runs; see hilrig lease")
+        plc.fault = lambda t, _, pdu: frame(t, bytes((0x83, 2)) if pdu[1:3] == b"\0\4" else plc.execute(pdu))
+        [(level, text)] = findings(plc)
+        assert level == "error"
+        assert "reading positions from holding registers 4–8 (40005–40009): they do not all exist" in text
+        plc.shut()
+        [(level, text)] = findings(plc)
+        assert level == "error"
+        assert "connection refused" in text
 
 
 # -- failures, each as an event in the terms of PLC users

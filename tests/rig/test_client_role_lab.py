@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.analysis.stages import CLIENT_STAGES
 from hilrig_replay.io.run import open_run
 from support.clients import compile_with_libmodbus
 from support.labs import RunningLab, free_ports, hilrig, write_lab
@@ -66,9 +67,16 @@ def test_recordings_of_the_client_role_are_evaluated(result: Result, tmp_path: P
     first, second = result.recordings
     for path in (first, second):
         assert hilrig("verify", path).returncode == 0
-    report = measure(open_run(first))
-    assert report.loop_ms is not None
-    assert report.samples > 250
+    reports = [measure(open_run(path)) for path in (first, second)]
+    for report in reports:
+        assert report.samples > 250
+        assert list(report.stages_ms) == [stage.key for stage in CLIENT_STAGES]
+        samples = report.table
+        assert (sum(samples[stage.key] for stage in CLIENT_STAGES) == samples["loop"]).all()
+        assert all((samples[stage.key] >= 0).all() for stage in CLIENT_STAGES)
+    codes = [{reason.code for reason in report.reasons} for report in reports]
+    assert ["no_echo" in found for found in codes] == [False, True]
+    assert [report.device_scan is None for report in reports] == [False, True]
     assert hilrig("compare", first, second).returncode == 0
     assert hilrig("report", first, "--out", tmp_path / "report.html").returncode == 0
     rrd = hilrig("replay", first, "--save", tmp_path / "run.rrd")

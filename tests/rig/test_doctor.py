@@ -14,7 +14,7 @@ import pytest
 
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.process.discovery import ClockOffset, query_services
+from hilrig_runtime.process.discovery import list_services, query_services
 from support.labs import HILRIG, RunningLab, free_ports, hilrig, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
@@ -62,16 +62,13 @@ def stopped(lab: RunningLab, service: str) -> Iterator[None]:
 
 
 def test_stopped_service_shifts_no_clock_of_others(lab: RunningLab) -> None:
-    with stopped(lab, "recorder"), ZenohBus(lab.lab.bus, "tool") as bus:
-        found: dict[str, ClockOffset] = {}
-
-        def ask() -> bool:
+    # The bus is closed last: it waits for the stopped service.
+    with ZenohBus(lab.lab.bus, "tool") as bus:
+        eventually(lambda: len(list_services(bus, lab.lab.name)) == 3)
+        with stopped(lab, "recorder"):
             replies = query_services(bus, lab.lab.name, "*", Counters(), 1.5)
-            found.update((info.service, offset) for info, offset in replies)
-            return {"sim", "edge"} <= set(found)
-
-        eventually(ask)
-    assert "recorder" not in found
+            found = {info.service: offset for info, offset in replies}
+    assert set(found) == {"sim", "edge"}
     for offset in found.values():
         assert abs(offset.offset_ns) <= offset.uncertainty_ns < 300_000_000
 
@@ -82,7 +79,9 @@ def test_top_shows_true_clocks_while_a_service_is_stopped(lab: RunningLab) -> No
     with stopped(lab, "recorder"):
         deadline_s = time.monotonic() + 15
         while time.monotonic() < deadline_s:
-            shown = json.loads(hilrig("top", "--config", lab.config, "--json").stdout)["services"]
+            done = hilrig("top", "--config", lab.config, "--json")
+            assert done.returncode == 0, done.stderr
+            shown = json.loads(done.stdout)["services"]
             clocks = [row for row in shown if row["service"] != "recorder" and row["clock_peer"]]
             assert len(clocks) == 2
             for row in clocks:

@@ -4,6 +4,7 @@ The examples in Python, C and Node.js run as a student runs them; each must move
 """
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -17,6 +18,8 @@ import pytest
 
 from support.clients import compile_with_libmodbus, mbpoll_read, mbpoll_write, require_mbpoll
 from support.edge_rig import EdgeRig, RawClient, running_edge
+from support.guides import commands as commands_of
+from support.guides import write_programs
 from support.labs import RunningLab, hilrig, write_lab
 from support.waiting import eventually
 
@@ -31,45 +34,95 @@ SECONDS = "7.8"
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLab]:
-    with RunningLab(write_lab(tmp_path_factory.mktemp("lab"), rigs=3, extra=LONG_LEASE)) as lab:
+    with RunningLab(write_lab(tmp_path_factory.mktemp("lab"), rigs=9, extra=LONG_LEASE)) as lab:
         yield lab
 
 
 @pytest.fixture(scope="module")
-def in_c(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compile_with_libmodbus(EXAMPLES / "hold_position.c", tmp_path_factory.mktemp("c"))
+def in_c(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> Path:
+    folder = tmp_path_factory.mktemp("c")
+    write_programs("c", folder, lab.lab.ports["rig9"])
+    compile_with_libmodbus(folder / "first.c", folder)
+    return compile_with_libmodbus(folder / "hold_position.c", folder)
 
 
 @pytest.fixture(scope="module")
-def in_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def in_node(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> Path:
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("needs node and npm (Debian's packages nodejs and npm)")
     folder = tmp_path_factory.mktemp("node")
-    for name in ("package.json", "hold_position.js"):
-        shutil.copy(EXAMPLES / name, folder)
-    command = ["npm", "install", "--omit=optional", "--no-audit", "--no-fund", "--loglevel=error"]
+    write_programs("nodejs", folder, lab.lab.ports["rig4"])
+    command = ["npm", "install", "--omit=optional", "--no-audit", "--no-fund", "--loglevel=error", "jsmodbus"]
     done = subprocess.run(command, cwd=folder, check=False, capture_output=True, text=True, timeout=60)
     if done.returncode:
-        pytest.skip(f"npm can't install modbus-serial here: {done.stderr.strip().splitlines()[-1:]}")
+        pytest.skip(f"npm can't install modbus-serial and jsmodbus here: {done.stderr.strip().splitlines()[-1:]}")
     return folder / "hold_position.js"
 
 
-def test_examples_hold_and_move_the_arm(lab: RunningLab, in_c: Path, in_node: Path) -> None:
-    """All three run at once, each on its own rig."""
+@pytest.fixture(scope="module")
+def in_python(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> dict[str, tuple[Path, Path]]:
+    """By library of another version or project: its program of the guide, and the folder where it is installed."""
+    programs = {
+        "pymodbus==3.0.*": ("hold.py", "rig5"),
+        "pyModbusTCP": ("hold_pymodbustcp.py", "rig6"),
+    }
+    found = {}
+    installing = []
+    for library, (name, rig) in programs.items():
+        folder = tmp_path_factory.mktemp("python")
+        write_programs("python", folder, lab.lab.ports[rig])
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--target", folder / "installed", library]
+        installing.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+        found[library] = (folder / name, folder / "installed")
+    for process in installing:
+        output, _ = process.communicate(timeout=120)
+        if process.returncode:
+            pytest.skip(f"pip can't install {', '.join(programs)} here: {output.strip().splitlines()[-1:]}")
+    return found
+
+
+def test_examples_hold_and_move_the_arm(
+    lab: RunningLab, in_c: Path, in_node: Path, in_python: dict[str, tuple[Path, Path]]
+) -> None:
+    """The examples and the programs of the guides run at once, each on its own rig."""
     port = {rig.name: str(lab.lab.ports[rig.name]) for rig in lab.lab.rigs}
-    commands = {
+    commands: dict[str, list[str | Path]] = {
         "Python": [sys.executable, EXAMPLES / "hold_position.py", "--port", port["rig1"], "--duration", SECONDS],
         "C": [in_c, "127.0.0.1", port["rig2"], SECONDS],
         "Node.js": ["node", in_node, "127.0.0.1", port["rig3"], SECONDS],
+        "jsmodbus": ["node", in_node.with_name("hold_jsmodbus.js"), SECONDS],
+        "one part": [sys.executable, EXAMPLES / "pick_one_part.py", "--port", port["rig7"]],
     }
+    last_line = dict.fromkeys(commands, "error at the end") | {"jsmodbus": "at the end: ", "one part": "done"}
+    folder_of = {}
+    for library, (program, installed) in in_python.items():
+        commands[library] = [sys.executable, program, SECONDS]
+        last_line[library] = "at the end: "
+        folder_of[library] = str(installed)
     running = {
-        name: subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        name: subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | ({"PYTHONPATH": folder_of[name]} if name in folder_of else {}),
+        )
         for name, command in commands.items()
     }
     outputs = {name: process.communicate(timeout=60)[0] for name, process in running.items()}
     for name, process in running.items():
         assert process.returncode == 0, f"{name}: {outputs[name]}"
-        assert "error at the end" in outputs[name]
+        assert last_line[name] in outputs[name].splitlines()[-1]
+
+
+def test_first_program_of_each_guide_moves_the_arm(lab: RunningLab, in_c: Path, tmp_path: Path) -> None:
+    write_programs("python", tmp_path, lab.lab.ports["rig8"])
+    python = subprocess.run([sys.executable, tmp_path / "first.py"], check=True, capture_output=True, text=True)
+    begin, end = (int(line.split("[")[1].split(",")[0]) for line in python.stdout.splitlines())
+    assert begin == 0
+    assert 1000 < end < 10_000
+    c = subprocess.run([in_c.with_name("first")], check=True, capture_output=True, text=True)
+    assert 10 < float(c.stdout.split()[-2]) < 100
 
 
 @pytest.mark.parametrize("name", ["Python", "C", "Node.js"])
@@ -85,17 +138,20 @@ def test_example_reports_a_missing_rig(name: str, request: pytest.FixtureRequest
     assert "Traceback" not in done.stderr
 
 
-def test_operator_lists_and_revokes_leases(lab: RunningLab) -> None:
+def test_operator_lists_and_revokes_leases(lab: RunningLab, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No cell of a table is wrapped.
+    monkeypatch.setenv("COLUMNS", "200")
+
     def ask(*arguments: str) -> subprocess.CompletedProcess[str]:
         return hilrig("lease", *arguments, "--config", lab.config)
 
     with RawClient("127.0.0.1", lab.lab.ports["rig2"]) as holder:
         holder.write(0, 0)
         everyone = json.loads(ask("--json").stdout)
-        assert [status["rig"] for status in everyone] == ["rig1", "rig2", "rig3"]
+        assert [status["rig"] for status in everyone] == [rig.name for rig in lab.lab.rigs]
         assert everyone[1]["holder"] == holder.address
         assert everyone[1]["connections"] == 1
-        assert holder.address in ask("rig2").stdout.replace("\n", "")
+        assert holder.address in ask("rig2").stdout
         taken = ask("rig2", "--release", "--json")
         assert (taken.returncode, json.loads(taken.stdout)["released"]) == (0, holder.address)
         assert ask("rig2", "--release").returncode == 1
@@ -103,7 +159,7 @@ def test_operator_lists_and_revokes_leases(lab: RunningLab) -> None:
 
 
 def test_lease_command_reports_errors(lab: RunningLab, tmp_path: Path) -> None:
-    unknown = hilrig("lease", "rig9", "--config", lab.config)
+    unknown = hilrig("lease", "rig10", "--config", lab.config)
     assert unknown.returncode == 2
     assert "rig1, rig2, rig3" in unknown.stderr
     assert hilrig("lease", "--release", "--config", lab.config).returncode == 2
@@ -132,6 +188,18 @@ def test_libmodbus_holds_the_lease_and_mbpoll_is_denied(in_c: Path) -> None:
         mbpoll_write(rig.port, 1, 1000)
         assert rig.commands[-1].effort[0] == 1.0
         mbpoll_write(rig.port, 1, 1, kind="coil")
+        assert rig.commands[-1].magnet
+
+
+def test_documented_mbpoll_commands_reach_the_rig() -> None:
+    require_mbpoll()
+    with running_edge() as rig:
+        read, torques, magnet = (line.split() for line in commands_of("other-devices", rig.port))
+        done = subprocess.run(read, check=True, capture_output=True, text=True, timeout=10)
+        assert "[5]:" in done.stdout
+        subprocess.run(torques, check=True, capture_output=True, timeout=10)
+        assert list(rig.commands[-1].effort) == [-0.5, 0.0, 0.0, 0.0]
+        subprocess.run(magnet, check=True, capture_output=True, timeout=10)
         assert rig.commands[-1].magnet
 
 

@@ -12,6 +12,7 @@ import pytest
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS
 from hilrig_modbus_edge.registers.map import SEPARATE_WRITES
 from hilrig_modbus_edge.service import run
+from hilrig_runtime.addresses import format_address
 from hilrig_runtime.bus.memory_bus import MemoryBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
@@ -324,17 +325,6 @@ def test_only_allowed_networks_may_connect() -> None:
         assert client.read(0, 1) == [0]
 
 
-def test_only_idle_connections_are_closed() -> None:
-    with running_edge(idle_timeout_s=0.3) as rig, rig.client() as idle, rig.client() as used:
-        closed = threading.Event()
-        threading.Thread(target=lambda: idle.closed() and closed.set(), daemon=True).start()
-        begin = time.monotonic()
-        while not closed.wait(0.01):
-            used.read(0, 1)
-        assert 0.25 < time.monotonic() - begin < 3
-        used.read(0, 1)
-
-
 def test_incomplete_request_does_not_keep_connection_open() -> None:
     with running_edge(idle_timeout_s=0.3) as rig, rig.client() as client:
         client.send(client.frame(b"\x03\x00\x00\x00\x01")[:9])
@@ -417,6 +407,33 @@ def _connect(port: int) -> RawClient | None:
         return RawClient("127.0.0.1", port)
     except ConnectionRefusedError:
         return None
+
+
+def test_listens_on_ipv4_and_ipv6_at_once() -> None:
+    if not socket.has_dualstack_ipv6():
+        pytest.skip("this machine has no IPv6")
+    with running_edge(host="::", allow=["127.0.0.0/8", "::1/128"], lease="connection") as rig:
+        for host in ("127.0.0.1", "::1"):
+            with RawClient(host, rig.port) as client:
+                eventually(lambda client=client: client.write(0, 5).hex() == "1000000001")
+                assert rig.commands[-1].controller == format_address(host, client.socket.getsockname()[1])
+        address = rig.service.addresses("rig1")
+        assert f"{socket.gethostname()}:{rig.port}" in address
+        assert ":::" not in address
+    with running_edge(host="::", allow=["10.0.0.0/8"]) as rig, RawClient("127.0.0.1", rig.port) as client:
+        assert client.closed()
+
+
+def test_rigs_have_the_same_port_at_several_addresses() -> None:
+    port = free_ports(1)
+    rigs = [{"name": f"rig{number}", "host": f"127.0.0.{number}", "port": port} for number in (1, 2)]
+    with running_edge(("rig1", "rig2"), rig_settings=rigs):
+        for number in (1, 2):
+            with RawClient(f"127.0.0.{number}", port) as client:
+                client.write(0, number)
+        for number in (1, 2):
+            with RawClient(f"127.0.0.{number}", port) as client:
+                assert client.read(0, 1) == [number]
 
 
 def test_listens_on_ipv6() -> None:

@@ -352,8 +352,9 @@ def test_completed_handshakes_are_limited(lab: Lab) -> None:
         assert ask(owner, READ)
         # Both are admitted before one of them is a client.
         begun = [closing.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5)) for _ in range(2)]
-        second, third = (closing.enter_context(context.wrap_socket(one, server_hostname="localhost")) for one in begun)
+        second = closing.enter_context(context.wrap_socket(begun[0], server_hostname="localhost"))
         assert ask(second, READ)
+        third = closing.enter_context(context.wrap_socket(begun[1], server_hostname="localhost"))
         with pytest.raises(OSError):  # noqa: PT011  # which one depends on the timing
             ask(third, READ)
         assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text

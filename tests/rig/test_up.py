@@ -1,6 +1,7 @@
 """`hilrig up`: third-party controllers move the arm; services are restarted; a signal stops the lab in order."""
 
 import os
+import platform
 import signal
 import subprocess
 import time
@@ -10,6 +11,9 @@ from pathlib import Path
 import pytest
 from pymodbus.client import ModbusTcpClient
 
+from hilrig_recorder.mcap_format.reader import decompress
+from hilrig_recorder.mcap_format.records import Chunk
+from hilrig_recorder.mcap_format.scan import scan
 from hilrig_replay.io.run import open_run
 from support.clients import build_c_client, mbpoll_read, mbpoll_write, require_mbpoll
 from support.labs import RunningLab, free_ports, hilrig, write_lab
@@ -27,6 +31,12 @@ def lab(tmp_path: Path) -> Iterator[RunningLab]:
 def registers(*values: int) -> list[int]:
     """Signed values as Modbus registers."""
     return [value & 0xFFFF for value in values]
+
+
+def content_of(path: Path) -> bytes:
+    """All bytes of a recording, and those of its chunks."""
+    data = path.read_bytes()
+    return data + b"".join(decompress(item) for _, item in scan(data) if isinstance(item, Chunk))
 
 
 def alive(pid: int) -> bool:
@@ -61,6 +71,9 @@ def test_mbpoll_switches_the_magnet(lab: RunningLab) -> None:
     assert mbpoll_read(lab.port, 1, 1, kind="coil") == [0]
     eventually(lambda: lab.recordings)
     lab.stop()
+    content = content_of(lab.recordings[0])
+    for secret in (lab.config.parent, lab.config.parent.name, Path.home(), platform.node()):
+        assert str(secret).encode() not in content, f"the recording reveals {secret}"
     magnet = open_run(lab.recordings[0]).states["magnet"]
     assert magnet.any()
     assert not magnet[-1]
@@ -78,6 +91,7 @@ def test_c_controller_on_libmodbus_closes_the_loop(lab: RunningLab) -> None:
     assert '"samples"' in report.stdout
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_stops_the_lab_within_three_seconds(lab: RunningLab, number: signal.Signals) -> None:
     with ModbusTcpClient("127.0.0.1", port=lab.port) as client:

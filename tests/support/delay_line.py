@@ -1,4 +1,6 @@
-"""A network link that delays packets: two TUN devices with a queue between them, the far one in a network namespace.
+"""A network link that delays and loses packets: two TUN devices with a queue between them.
+
+The far one is in a network namespace.
 
 Needs root, iproute2 and /dev/net/tun. The queue keeps the order of the packets, as a cable does.
 """
@@ -24,6 +26,8 @@ import pytest
 
 NEAR, FAR = "10.79.0.1", "10.79.0.2"
 """Addresses of the two ends; the far one is in the namespace."""
+LONGEST_EMPTY_PACKET: Final = 60
+"""IP and TCP headers with options, bytes: connections are opened and closed without losses."""
 TUNSETIFF = 0x400454CA
 IFF_TUN_NO_PI = 0x0001 | 0x1000
 CLONE_NEWNET: Final = 0x40000000
@@ -44,13 +48,17 @@ def require_delay_line() -> None:
 
 
 class DelayLine:
-    """Context manager; each packet takes `low_s` to `high_s` from one end to the other, uniformly distributed."""
+    """Context manager; each packet takes `low_s` to `high_s` from one end to the other, uniformly distributed.
 
-    def __init__(self, low_s: float, high_s: float) -> None:
+    A packet of a size that has data is lost with the probability `loss`.
+    """
+
+    def __init__(self, low_s: float, high_s: float, loss: float = 0.0) -> None:
         number = next(_NUMBERS)
         self.interface = f"hrn{os.getpid() % 100_000}x{number}"
         self._namespace = f"hr{os.getpid()}delay{number}"
         self._bounds_s = low_s, high_s
+        self._loss = loss
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="delay line")
         self._ends: list[int] = []
@@ -100,6 +108,8 @@ class DelayLine:
             readable, _, _ = select.select(self._ends, [], [], wait_s)
             for end in readable:
                 packet = os.read(end, 65536)
+                if self._loss and len(packet) > LONGEST_EMPTY_PACKET and generator.random() < self._loss:
+                    continue
                 last_s[end] = max(last_s[end], time.monotonic() + generator.uniform(*self._bounds_s))
                 heapq.heappush(due, (last_s[end], next(order), other[end], packet))
             while due and due[0][0] <= time.monotonic():

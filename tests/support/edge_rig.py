@@ -102,6 +102,7 @@ def running_edge(rigs: tuple[str, ...] = ("rig1",), **edge: Any) -> Iterator[Edg
     """
     first_port = free_ports(len(rigs))
     settings: list[dict[str, Any]] = [{"name": name, "port": first_port + number} for number, name in enumerate(rigs)]
+    settings = edge.pop("rig_settings", settings)
     settings[0] |= edge.pop("first_rig", {})
     allow = edge.pop("allow", None)
     if allow is not None:

@@ -54,12 +54,16 @@ class MultiHostLab:
     commands: dict[str, list[str]]
     """Arguments of `hilrig`, by host."""
     processes: dict[str, subprocess.Popen[Any]] = field(default_factory=dict)
+    environ: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Environment of the process of a host, if it is not that of the test."""
 
     def start(self, host: str) -> None:
         """Start the process of a host."""
         command = [HILRIG, *self.commands[host], "-c", str(self.config)]
         with self.log(host).open("a") as log:
-            self.processes[host] = self.network.popen(host, command, stdin=subprocess.PIPE, stdout=log, stderr=log)
+            self.processes[host] = self.network.popen(
+                host, command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=self.environ.get(host)
+            )
 
     def log(self, host: str) -> Path:
         """Log file of the process of a host."""
@@ -152,6 +156,11 @@ class ControllerSession:
                 continue
         states = np.concatenate(found)
         return states[np.argsort(states["sampled_ns"], kind="stable")]
+
+    def event_texts(self, kind: str) -> list[str]:
+        """Texts of the events of a kind in the recordings of this session."""
+        events = [event for path in self._finished() for event in open_run(path).events]
+        return [event["message"].text for event in events if event["kind"] == kind]
 
     def reported_lost(self) -> int:
         """Number of lost messages reported by the recordings of this session."""

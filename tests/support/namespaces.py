@@ -60,7 +60,7 @@ class Network:
 
     def popen(self, host: str, command: list[str], **options: Any) -> subprocess.Popen[Any]:
         """Start a process on a host; it is ended on exit of the context if it is still running."""
-        process = subprocess.Popen(["ip", "netns", "exec", self._namespace(host), *command], **options)
+        process = subprocess.Popen([*self._enter(host), *command], **options)
         self._closing.callback(_end, process)
         return process
 
@@ -68,12 +68,11 @@ class Network:
         self, host: str, command: list[str], *, check: bool = True, **options: Any
     ) -> subprocess.CompletedProcess[Any]:
         """Run a command on a host and wait until it exits."""
-        return subprocess.run(["ip", "netns", "exec", self._namespace(host), *command], check=check, **options)
+        return subprocess.run([*self._enter(host), *command], check=check, **options)
 
     def call(self, host: str, command: list[str]) -> int:
         """Run a command on a host without output; returns its exit code."""
-        arguments = ["ip", "netns", "exec", self._namespace(host), *command]
-        return subprocess.run(arguments, check=False, capture_output=True).returncode
+        return subprocess.run([*self._enter(host), *command], check=False, capture_output=True).returncode
 
     def set_link(self, host: str, up: bool) -> None:
         """Set a host's link up or down; packets to a host whose link is down are dropped silently."""
@@ -117,6 +116,11 @@ class Network:
     @property
     def _gateway(self) -> str:
         return self._prefix
+
+    def _enter(self, host: str) -> list[str]:
+        """Begin of a command line that is executed on a host, with its name as the host name."""
+        named = ["unshare", "--uts", "sh", "-c", 'echo "$0" > /proc/sys/kernel/hostname; exec "$@"', host]
+        return ["ip", "netns", "exec", self._namespace(host), *named]
 
     def _namespace(self, host: str) -> str:
         return f"{self._prefix}-{host}"

@@ -1,6 +1,7 @@
 """A controller that is a Modbus server, on a bare socket: a cyclic program, network delay, and faults on request."""
 
 import socket
+import ssl
 import struct
 import threading
 import time
@@ -48,6 +49,8 @@ class Plc:
         """Time and PDU of each request."""
         self.fault: Callable[[int, int, bytes], bytes | None] | None = None
         """Returns the bytes that answer a request (transaction, unit, PDU); None: the connection is closed."""
+        self.tls: ssl.SSLContext | None = None
+        """Context of a server with TLS; None: without TLS."""
         self.connections = 0
         self._scan_s, self._delay_s, self._law, self._copies_step = scan_s, delay_s, law, copies_step
         self._lock = threading.Lock()
@@ -140,6 +143,11 @@ class Plc:
                 return
             connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.connections += 1
+            if self.tls is not None:
+                try:
+                    connected = self.tls.wrap_socket(connected, server_side=True)
+                except OSError:
+                    continue
             self._open.add(connected)
             self._start(self._serve, connected)
 

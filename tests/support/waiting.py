@@ -3,6 +3,8 @@
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -22,6 +24,16 @@ def eventually(condition: Callable[[], T], *, timeout_s: float = LONG_TIMEOUT_S,
         if time.monotonic() > deadline:
             raise AssertionError(f"condition not met within {timeout_s} s (last value: {value!r})")
         time.sleep(every_s)
+
+
+def cpu_wait_s(pid: int) -> float:
+    """Time that the threads of a process waited for a processor, s; 0: unknown on this system."""
+    waited_ns = 0
+    for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        # A thread may end meanwhile.
+        with suppress(OSError):
+            waited_ns += int(path.read_text().split()[1])
+    return waited_ns / 1e9
 
 
 class StallMonitor:

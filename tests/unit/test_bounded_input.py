@@ -3,7 +3,9 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
@@ -13,8 +15,13 @@ from hilrig_recorder.mcap_format.recover import recover
 from hilrig_recorder.mcap_format.scan import scan
 from hilrig_replay.analysis.index import INDEX_NAME, RunIndex
 from hilrig_replay.analysis.latency import measure
+from hilrig_replay.export.export import export_foxglove, export_tables
 from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import open_run
+from hilrig_replay.io.timebase import Timebase
+from hilrig_replay.plots.latency_plot import save_plot
+from hilrig_replay.rerun_view.view import save_rrd
 from hilrig_runtime.config.impairment import read_trace
 from hilrig_runtime.config.lab import load_lab, parse_lab
 from hilrig_runtime.config.validation import MAX_TEXT_BYTES, read_text
@@ -104,6 +111,15 @@ def test_impossible_numbers_are_damage(tmp_path: Path, record: str, key: str, nu
     assert len(entry.error) < 250
 
 
+def test_session_of_a_million_characters_is_damage(tmp_path: Path) -> None:
+    path = with_metadata(tmp_path / "run.mcap", "session", session="s" * 1_000_000)
+    with pytest.raises(InputError, match=r"session has 1000000 characters, expected at most 1000") as raised:
+        open_run(path)
+    assert len(str(raised.value)) < 500
+    [entry] = RunIndex(tmp_path).load()
+    assert "characters, expected at most" in entry.error
+
+
 @pytest.mark.parametrize(
     ("text", "defect"),
     [
@@ -152,6 +168,57 @@ def test_extreme_stamps_are_evaluated(tmp_path: Path, wall_ns: int) -> None:
             one.message.wall_ns = wall_ns  # type: ignore[attr-defined]
     path = recordings.write(tmp_path / "run.mcap", made, script=SCRIPT)
     assert measure(open_run(path)).samples > 0
+
+
+@pytest.mark.timeout(10)
+def test_steps_and_restarts_at_each_state_take_little_time() -> None:
+    states, commands = np.zeros(10_000, STATE_DTYPE), np.zeros(10_000, COMMAND_DTYPE)
+    states["step"] = states["incarnation"] = np.arange(10_000)
+    states["sampled_ns"] = commands["wall_ns"] = 20_000_000 * np.arange(10_000)
+    # The wall clock is set by a quarter of an hour at each state.
+    states["wall_ns"] = states["sampled_ns"] + 10**12 * (np.arange(10_000) % 2) + 1
+    timebase = Timebase()
+    timebase.update(states)
+    assert (len(timebase.time_ns(states)), len(timebase.time_ns(commands))) == (10_000, 10_000)
+
+
+@pytest.mark.parametrize(("topic", "field"), [("state", "position"), ("command", "effort"), ("part", "x")])
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_infinite_number_is_refused_with_its_name(tmp_path: Path, topic: str, field: str, number: float) -> None:
+    made = recordings.make(SCRIPT)
+    message: Any = next(one.message for one in made if one.topic == topic.replace("part", "state"))
+    if topic == "part":
+        message.parts[0].x = number
+    else:
+        getattr(message, field)[2] = number
+    path = recordings.write(tmp_path / "run.mcap", made, script=SCRIPT)
+    with pytest.raises(InputError, match=rf"run\.mcap: unusable content: {field} is {number}; expected finite"):
+        measure(open_run(path))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_differences_of_impossible_times_are_bounded(tmp_path: Path, sign: int) -> None:
+    made = recordings.make(SCRIPT)
+    for number, one in enumerate(one for one in made if one.topic == "state"):
+        state: Any = one.message
+        state.sampled_ns = (-sign if number % 2 else sign) * ((1 << 63) - 1)
+        state.wall_ns = -(1 << 63)
+        state.step = (1 << 64) - 1 - number
+    run = open_run(recordings.write(tmp_path / "run.mcap", made, script=SCRIPT))
+    measure(run)
+    export_tables(run, tmp_path / "tables", "csv")
+    export_foxglove(run, tmp_path / "drawn.mcap")
+    save_rrd(run, tmp_path / "run.rrd")
+
+
+def test_impossible_loop_latency_is_plotted(tmp_path: Path) -> None:
+    made = recordings.make(SCRIPT)
+    for one in made:
+        if one.topic == "state":
+            one.message.loop_latency_ns = (1 << 63) - 1  # type: ignore[attr-defined]
+    run = open_run(recordings.write(tmp_path / "run.mcap", made, script=SCRIPT))
+    save_plot(measure(run), run, tmp_path / "run.png")
+    assert (tmp_path / "run.png").stat().st_size > 10_000
 
 
 def test_number_too_large_for_its_column_is_damage(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Unit tests of `Device` with a manual clock and states of the test."""
 
+import re
 import struct
 
 import pytest
@@ -15,9 +16,11 @@ from hilrig_modbus_edge.registers.map import (
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
+    SWITCH_ADDRESS,
     Status,
     address_of,
 )
+from hilrig_runtime.config.impairment import ImpairmentConfig
 from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
 from hilrig_schemas import Event, JointState
 from support.device_bench import MS, Bench
@@ -325,6 +328,95 @@ def test_coil_switches_the_magnet(bench: Bench) -> None:
 # -- lease
 
 
+def test_register_switches_the_magnet(bench: Bench) -> None:
+    client = bench.connect()
+    for value, on in ((1, True), (0, False), (0xFF00, True)):
+        bench.write(client, SWITCH_ADDRESS, value)
+        assert bench.commands[-1].magnet is on
+        assert bench.read(client, SWITCH_ADDRESS, 1) == [on]
+        assert bench.device.read_bits(client, RegisterTable.COIL, 0, 1) == on
+
+
+def test_reset_register_resets_once_per_change(bench: Bench) -> None:
+    """A scanner writes the same registers in each cycle."""
+    client = bench.connect()
+    bench.write(client, 0, 500)
+    for _ in range(3):
+        bench.write(client, SWITCH_ADDRESS, 1, 1)
+    assert bench.commands[-1].resets == 1
+    assert list(bench.commands[-1].effort) == [0, 0, 0, 0]
+    assert bench.read(client, SWITCH_ADDRESS, 2) == [1, 1]
+    bench.write(client, SWITCH_ADDRESS + 1, 0)
+    bench.write(client, SWITCH_ADDRESS + 1, 7)
+    assert bench.commands[-1].resets == 2
+    assert bench.commands[-1].magnet
+
+
+def test_reset_register_works_for_one_shot_clients(bench: Bench) -> None:
+    for number in range(3):
+        client = bench.connect(port=number)
+        bench.write(client, SWITCH_ADDRESS + 1, 1)
+        bench.device.disconnect(client, "connection closed by the client")
+    assert bench.commands[-1].resets == 3
+
+
+def test_switch_registers_and_coils_have_one_writer(bench: Bench) -> None:
+    one, other = bench.connect(), bench.connect(port=2)
+    bench.device.write_coil(one, 0, True, bench.clock.monotonic_ns())
+    with pytest.raises(ModbusError, match="06"):
+        bench.write(other, SWITCH_ADDRESS, 0)
+    bench.write(other, SWITCH_ADDRESS + 1, 1)
+    with pytest.raises(ModbusError, match="06"):
+        bench.device.write_coil(one, 100, True, bench.clock.monotonic_ns())
+
+
+def test_block_reads_over_gaps_are_zero_if_permitted() -> None:
+    bench = Bench(unmapped_reads="zeros")
+    bench.state(1)
+    client = bench.connect()
+    bench.write(client, 0, 11, 12, 13, 14)
+    bench.write(client, ECHO_ADDRESS, 99)
+    exact = [*bench.read(client, 0, 8), *[0] * 92, *bench.read(client, ECHO_ADDRESS, 2)]
+    # Modbus Poll reads 10 registers by default, ModScan 100 from number 100 on; a scanner one block for all.
+    assert bench.read(client, 0, 10) == exact[:10]
+    assert bench.read(client, 0, 102) == exact
+    assert bench.read(client, 99, 100) == [0, 99, 1000, *[0] * 97]
+    assert bench.read(client, 3, 5) == exact[3:8]
+    inputs = bench.read(client, 0, INPUT_END, RegisterTable.INPUT_REGISTER)
+    assert bench.read(client, 0, 125, RegisterTable.INPUT_REGISTER) == inputs + [0] * (125 - INPUT_END)
+    assert bench.read(client, 195, 110) == [0] * 5 + inputs + [0] * 64 + [0, 0] + [0] * 3
+    bench.device.write_coil(client, 0, True, bench.clock.monotonic_ns())
+    assert bench.device.read_bits(client, RegisterTable.COIL, 0, 16) == 1
+    assert bench.device.read_bits(client, RegisterTable.COIL, 90, 16) == 0
+    status = bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 0, 16)
+    assert bench.device.read_bits(client, RegisterTable.DISCRETE_INPUT, 4, 32) == status >> 4
+    # An address in the traditional numbering is a mistake, and no write may hit a gap.
+    for table, address, count in (
+        (RegisterTable.HOLDING_REGISTER, 40004, 4),
+        (RegisterTable.HOLDING_REGISTER, 8, 90),
+        (RegisterTable.INPUT_REGISTER, INPUT_END, 2),
+        (RegisterTable.HOLDING_REGISTER, 0xFFFF, 2),
+    ):
+        with pytest.raises(ModbusError, match="02"):
+            bench.read(client, address, count, table)
+    with pytest.raises(ModbusError, match="02"):
+        bench.write(client, 0, *[0] * 10)
+
+
+def test_gaps_are_refused_by_default(bench: Bench) -> None:
+    client = bench.connect()
+    for table, address, count in (
+        (RegisterTable.HOLDING_REGISTER, 0, 9),
+        (RegisterTable.HOLDING_REGISTER, 99, 3),
+        (RegisterTable.HOLDING_REGISTER, 235, 2),
+        (RegisterTable.INPUT_REGISTER, 0, INPUT_END + 1),
+    ):
+        with pytest.raises(ModbusError, match="02"):
+            bench.read(client, address, count, table)
+    with pytest.raises(ModbusError, match="02"):
+        bench.device.read_bits(client, RegisterTable.COIL, 0, 2)
+
+
 def test_first_writer_acquires_lease_and_others_get_06(bench: Bench) -> None:
     holder, other = bench.connect(), bench.connect(host="10.0.0.2")
     bench.write(holder, 0, 5)
@@ -361,7 +453,47 @@ def test_denials_are_reported_once_per_second_with_count(bench: Bench) -> None:
             bench.write(other, 0, 6)
     refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
     assert len(refusals) == 2
-    assert "(67 times)" in refusals[1]
+    assert "(66 times)" in refusals[1]
+    bench.wait(1000)
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert "(33 times)" in refusals[2]
+
+
+def test_denials_of_a_session_are_not_counted_in_the_next(bench: Bench) -> None:
+    """The first client is refused 30 times; minutes later, in another session, a second one is refused once."""
+    for refused in (30, 1):
+        holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+        bench.write(holder, 0, 5)
+        session = bench.device.session
+        for _ in range(refused):
+            with pytest.raises(ModbusError):
+                bench.write(other, 0, 6)
+        bench.device.disconnect(other, "done")
+        bench.device.disconnect(holder, "done")
+        # The session ends within the period of the report.
+        bench.device.stop("the edge stops")
+        refusals = [event for event in bench.events if event.kind == Event.LEASE_REFUSED]
+        counts = [int(found[1]) if (found := re.search(r"\((\d+) times\)", one.text)) else 1 for one in refusals]
+        assert counts == [1, 29][:refused]
+        assert session is not None
+        assert {one.session for one in refusals} == {session.id}
+        bench.events.clear()
+
+
+def test_denials_are_counted_per_cause(bench: Bench) -> None:
+    holder, other = bench.connect(), bench.connect(host="10.0.0.2")
+    observer = bench.connect(host="10.0.0.2", may_write=False)
+    bench.write(holder, 0, 5)
+    for client in (other, observer, other, observer, observer):
+        with pytest.raises(ModbusError):
+            bench.write(client, 0, 6)
+    for _ in range(10):
+        bench.write(holder, 0, 5)
+        bench.wait(100)
+    refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
+    assert ["read-only" in text for text in refusals] == [False, True, False, True]
+    assert "times" not in "".join(refusals[:3])
+    assert refusals[3].endswith("(2 times)")
 
 
 def test_denials_of_new_connections_are_limited_per_host(bench: Bench) -> None:
@@ -374,8 +506,8 @@ def test_denials_of_new_connections_are_limited_per_host(bench: Bench) -> None:
         bench.device.disconnect(other, "done")
     refusals = [event.text for event in bench.events if event.kind == Event.LEASE_REFUSED]
     assert len(refusals) == 2
-    assert "10.0.0.2:67: write to rig1 denied" in refusals[1]
-    assert "(67 times)" in refusals[1]
+    assert "10.0.0.2:66: write to rig1 denied" in refusals[1]
+    assert "(66 times)" in refusals[1]
 
 
 def one_shot(bench: Bench, port: int, host: str = "10.0.0.1") -> int:
@@ -618,6 +750,49 @@ def test_trip_event_has_the_cause(bench: Bench) -> None:
     bench.device.disconnect(client, "connection closed by the client")
     bench.wait(1000)
     assert "10.0.0.1:1000 no longer holds the lease" in trip_text()
+
+
+def test_another_controller_takes_lease_after_trip(bench: Bench) -> None:
+    """A program that wrote once and only polls does not keep the rig."""
+    polls, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(polls, 0, 5)
+    for _ in range(9):
+        bench.wait(100)
+        bench.read(polls, 4, 4)
+        with pytest.raises(ModbusError):
+            bench.write(other, 0, 6)
+    bench.wait(100)
+    assert bench.device.watchdog.tripped
+    bench.read(polls, 4, 4)
+    bench.write(other, 0, 6)
+    assert bench.device.lease.holder is other.controller
+    assert not bench.device.watchdog.tripped
+    lost = next(event for event in bench.events if event.kind == Event.LEASE_LOST)
+    assert lost.controller_data.controller == polls.address
+    assert "the watchdog has tripped, and 10.0.0.2:1000 writes" in lost.text
+    assert bench.kinds().count("SESSION_START") == 2
+    with pytest.raises(ModbusError):
+        bench.write(polls, 0, 7)
+
+
+def test_holder_that_writes_keeps_lease_on_lossy_link() -> None:
+    """The watchdog trips because the emulated network drops each write."""
+    bench = Bench(impairment=ImpairmentConfig.model_validate({"command": {"loss": {"kind": "bernoulli", "rate": 1.0}}}))
+    bench.state(1)
+    bench.device.start()
+    writes, other = bench.connect(), bench.connect(host="10.0.0.2")
+    bench.write(writes, 0, 5)
+    bench.device.watchdog.feed(bench.clock.monotonic_ns())
+    for _ in range(30):
+        bench.wait(50)
+        bench.write(writes, 0, 5)
+    assert bench.device.watchdog.tripped
+    with pytest.raises(ModbusError):
+        bench.write(other, 0, 6)
+    assert "10.0.0.1:1000 holds the lease" in bench.events[-1].text
+    bench.wait(1000)
+    bench.write(other, 0, 6)
+    assert bench.device.lease.holder is other.controller
 
 
 def test_next_write_rearms_the_watchdog(bench: Bench) -> None:

@@ -73,18 +73,21 @@ class Model:
         """Return whether a valid write of these registers and coils by this client is accepted."""
         if self.read_only:
             return False
-        if self.holder not in (None, client.host):
+        is_other = self.holder not in (None, client.host)
+        if is_other and not self.tripped:
             return False
         period_ms = self.timeout_ms or LEASE_MS
         for item in items:
             writer, written_ms = self.writers.get(item, (client, 0))
             if writer is not client and self.now_ms - written_ms < period_ms:
                 return False
-        if self.holder is None:
+        if self.holder is None or is_other:
             if self.session_host not in (None, client.host):
                 if self.now_ms < self.host_change_ms:
                     return False
                 self.host_change_ms = self.now_ms + HOST_CHANGE_MS
+            if is_other:
+                self.release()
             self.holder = client.host
             if self.session_host != client.host:
                 self.timeout_ms, self.echo = WATCHDOG_MS, 0

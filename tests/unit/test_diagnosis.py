@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilrig_replay.analysis.data_quality import Stalls
 from hilrig_replay.analysis.diagnosis import control_observations, timing_causes
 from hilrig_replay.analysis.diagnosis.diagnose import MAX_FINDINGS, diagnose
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, sections
@@ -24,6 +23,7 @@ from hilrig_runtime.config.task import PoseConfig
 from support.recordings import Script, make, record, write
 
 MS = 1_000_000
+DATA = Path(__file__).parents[1] / "data"
 
 
 def findings(folder: Path, script: Script) -> dict[str, Finding]:
@@ -138,6 +138,23 @@ def test_accepts_commands_without_a_known_basis(tmp_path: Path, basis_step: int)
     assert codes == (["open_loop"] if basis_step else [])
 
 
+def test_recorded_limit_cycle_is_saturated_and_oscillates() -> None:
+    report = measure(open_run(DATA / "limit-cycle.mcap"))
+    observed = {one.code: one for one in report.findings if one.list == "control"}
+    saturated, cycle = observed["saturation"], observed["limit_cycle"]
+    assert saturated.text.startswith("joint 1 is saturated at ±32 N·m for 6")
+    assert saturated.evidence["saturated_share"] > 0.5
+    assert cycle.evidence["frequency_hz"] == pytest.approx(1.1, abs=0.2)
+    assert cycle.evidence["amplitude"] == pytest.approx(65, abs=15)
+
+
+def test_recorded_open_loop_has_one_timing_cause() -> None:
+    report = measure(open_run(DATA / "read-once-then-write.mcap"))
+    [cause] = [one for one in report.findings if one.list == "timing"]
+    assert cause.code == "open_loop"
+    assert "1183 commands are based on 1 state" in cause.text
+
+
 def lossy(count: int, rtt_us: int) -> Evidence:
     """Cycles of 20 ms with two pauses of 300 ms; `count` retransmissions are recorded at the first pause."""
     commands = np.zeros(200, COMMAND_DTYPE)
@@ -163,16 +180,6 @@ def test_pauses_far_from_a_retransmission_are_not_of_the_network() -> None:
     apart = lossy(3, 200)
     apart.windows[0].connections["wall_ns"] += 4_000 * MS
     assert timing_causes.retransmissions(apart) is None
-
-
-def test_processor_time_that_was_taken_explains_the_stalls() -> None:
-    stalls = Stalls(2, 80 * MS, area_ns2=2 * (80.0 * MS) ** 2 / 2)
-    stalled = replace(evidence([]), stalls=stalls, edge_stalls=stalls)
-    assert timing_causes.cpu_steal(stalled) is None
-    assert timing_causes.cpu_steal(replace(stalled, stolen_ns=30 * MS)) is None
-    found = timing_causes.cpu_steal(replace(stalled, stolen_ns=90 * MS))
-    assert found is not None
-    assert found.evidence["stolen_ms"] == 90
 
 
 EMPTY = Records(

@@ -5,12 +5,15 @@ from collections.abc import Iterable
 from contextlib import closing
 from datetime import datetime, timedelta
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from hilrig_cli.doctor import CheckResult, Level, host, services
 from hilrig_cli.doctor.certificates import check_certificates
+from hilrig_cli.doctor.processes import LocalProcess, RouterState
 from hilrig_runtime.config.lab import LabConfig, parse_lab
+from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.security.x509 import Credential, issue_client, issue_peer, issue_server, load, make_authority
 from hilrig_runtime.timing.realtime import realtime_priority
@@ -208,7 +211,8 @@ ALL_SERVICES = ("sim/1", "edge/1", "recorder/1")
 def test_missing_silent_or_alerting_service_is_an_error() -> None:
     lab = parse_lab("")
     assert by_level(services.check_services(lab, snapshot(*ALL_SERVICES)))[Level.ERROR] == []
-    assert "not running: edge, recorder" in only_error(services.check_services(lab, snapshot("sim/1")))
+    errors = by_level(services.check_services(lab, snapshot("sim/1")))[Level.ERROR]
+    assert errors == [f"not running: {name}: no process on this host" for name in ("edge", "recorder")]
     silent = snapshot(*ALL_SERVICES)
     del silent.healths["edge/1"]
     assert "edge/1: alive, but sends no health reports" in only_error(services.check_services(lab, silent))
@@ -216,6 +220,70 @@ def test_missing_silent_or_alerting_service_is_an_error() -> None:
     alerting.healths["recorder/1"].alert = "the disk is full"
     assert "recorder/1: the disk is full" in only_error(services.check_services(lab, alerting))
     assert by_level(services.check_services(lab, snapshot()))[Level.WARNING] == ["no service of lab 'lab' is running"]
+
+
+ROUTED = '[bus]\ntopology = "router"\nrouter = "tcp/hub:7447"\n'
+
+
+def seen_without(name: str, silent_s: float) -> services.BusSnapshot:
+    """A snapshot of a lab whose recorder received the last message of a service some time ago."""
+    found = snapshot(*(other for other in ALL_SERVICES if other != name))
+    found.healths["recorder/1"].peers.add(service=name, host="left", silent_ns=round(silent_s * 1e9))
+    return found
+
+
+def test_service_on_another_host_is_not_to_be_restarted() -> None:
+    for is_alive in (False, True):
+        found = seen_without("sim/1", 12.3)
+        found.alive |= {"sim/1"} if is_alive else set()
+        [error] = [one for one in services.check_services(parse_lab(ROUTED), found) if one.level is Level.ERROR]
+        assert "sim/1 on left: recorder/1 received its last message 12.3 s ago" in error.text
+        assert error.fix.startswith("run hilrig doctor on left first")
+        assert "not running" not in error.text, "a cut link looks the same"
+
+
+@pytest.mark.parametrize("is_alive", [False, True])
+def test_stopped_process_of_this_host_is_to_be_continued(is_alive: bool) -> None:
+    found = seen_without("sim/1", 12.3)
+    found.alive |= {"sim/1"} if is_alive else set()
+    local = [LocalProcess("sim", 4711, is_stopped=True)]
+    [error] = [one for one in services.check_services(parse_lab(ROUTED), found, local) if one.level is Level.ERROR]
+    assert (error.text.partition(":")[0], error.fix) == (
+        "sim on this host is stopped (process 4711)",
+        "continue it: kill -CONT 4711",
+    )
+
+
+@pytest.mark.parametrize("is_alive", [False, True])
+def test_running_process_of_this_host_is_not_to_be_restarted(is_alive: bool) -> None:
+    found = seen_without("sim/1", 12.3)
+    found.alive |= {"sim/1"} if is_alive else set()
+    local = [LocalProcess("sim", 4711, is_stopped=False)]
+    [error] = [one for one in services.check_services(parse_lab(ROUTED), found, local) if one.level is Level.ERROR]
+    assert "4711" in error.text + error.fix
+    assert "do not restart it" in error.fix
+
+
+@pytest.mark.parametrize(
+    ("state", "advice"),
+    [
+        (RouterState.REFUSES, "check on hub whether the router runs"),
+        (RouterState.UNREACHABLE, "check the network link of this host first"),
+        (RouterState.ACCEPTS, "check on hub whether the router is stopped"),
+    ],
+)
+def test_router_link_and_services_are_told_apart(
+    state: RouterState, advice: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(services, "probe_router", lambda _: state)
+    monkeypatch.setattr(services, "collect", Mock(side_effect=OperationError("no zenoh router answers")))
+    local = [LocalProcess("sim", 4711, is_stopped=False), LocalProcess("edge", 4712, is_stopped=True)]
+    results, joined = services.check_bus(parse_lab(ROUTED), local)
+    assert joined is None
+    assert state.value in results[0].text
+    assert results[0].fix.startswith(advice)
+    assert results[1].fix == "do not restart it: it continues when the router answers"
+    assert results[2].fix == "continue it: kill -CONT 4712"
 
 
 def test_denied_realtime_policy_is_a_warning_with_a_fix() -> None:

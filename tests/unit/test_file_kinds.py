@@ -11,7 +11,7 @@ from hilrig_recorder.storage.maintenance import find_unfinished
 from hilrig_recorder.storage.retention import finished_recordings
 from hilrig_replay.analysis.index import RunIndex, write_verdict
 from hilrig_replay.io.output_file import check_output
-from hilrig_replay.io.paths import find_recordings
+from hilrig_replay.io.paths import find_runs
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError
 from support import recordings
@@ -41,7 +41,7 @@ def test_special_files_are_refused_and_not_waited_for(tmp_path: Path, kind: str)
     good = record(folder / "good.mcap", SCRIPT)
     special = [make_special(folder / f"x{suffix}", kind) for suffix in (".mcap", ".mcap.part")]
     assert [entry.path for entry in RunIndex(tmp_path).load()] == ["lab/rig1/good.mcap"]
-    assert find_recordings([tmp_path]) == [good]
+    assert find_runs([tmp_path]) == [(good,)]
     assert find_unfinished(tmp_path / "lab") == []
     assert [stored.path for stored in finished_recordings(tmp_path / "lab")] == [good]
     for path in special:
@@ -64,7 +64,7 @@ def test_linked_folders_are_followed_once(tmp_path: Path) -> None:
     (lab / "rig1" / "self").symlink_to(lab / "rig1" / "self")
     expected = ["lab/rig1/rig1.mcap", "lab/rig2/rig2.mcap"]
     assert sorted(entry.path for entry in RunIndex(tmp_path / "recordings").load()) == expected
-    assert find_recordings([tmp_path / "recordings"]) == [tmp_path / "recordings" / path for path in expected]
+    assert find_runs([tmp_path / "recordings"]) == [(tmp_path / "recordings" / path,) for path in expected]
 
 
 def test_late_arrival_changes_neither_beginning_nor_duration(tmp_path: Path) -> None:

@@ -31,17 +31,26 @@ def test_group_of_rigs_and_single_rigs() -> None:
     assert [rig.arm.l2_m for rig in lab.rigs] == [0.2, 0.3, 0.2, 0.3]
 
 
+def test_rigs_have_one_port_at_several_addresses() -> None:
+    text = '[[rigs]]\nname="a"\nport=502\nhost="10.0.0.1"\n[[rigs]]\nname="b"\nport=502\nhost="{}"\n'
+    lab = parse_lab(text.format("10.0.0.2"))
+    assert [lab.addresses()[rig]["Modbus TCP"] for rig in "ab"] == [("10.0.0.1", 502), ("10.0.0.2", 502)]
+    for host in ("10.0.0.1", "0.0.0.0", "::"):
+        with pytest.raises(InputError, match="port 502 is already used by another rig at the same address"):
+            parse_lab(text.format(host))
+
+
 def test_large_lab_is_parsed_quickly() -> None:
     lab = parse_lab("[rigs]\ncount = 2000\nprefix = 'seat-'\n")
-    assert lab.addresses()["seat-2000"] == {"Modbus TCP": "127.0.0.1:7019"}
+    assert lab.addresses()["seat-2000"] == {"Modbus TCP": ("127.0.0.1", 7019)}
 
 
 def test_addresses_match_listening_ports() -> None:
     tls = "[edge.tls]\ncertificate = 'c'\nkey = 'k'\nauthority = 'a'\nfirst_port = 8020\n"
     plain, secured = "Modbus TCP", "Modbus TCP with TLS"
-    assert parse_lab("").addresses()["rig1"] == {plain: "127.0.0.1:5020"}
-    assert parse_lab(tls).addresses()["rig1"] == {plain: "127.0.0.1:5020", secured: "127.0.0.1:8020"}
-    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: "127.0.0.1:8020"}
+    assert parse_lab("").addresses()["rig1"] == {plain: ("127.0.0.1", 5020)}
+    assert parse_lab(tls).addresses()["rig1"] == {plain: ("127.0.0.1", 5020), secured: ("127.0.0.1", 8020)}
+    assert parse_lab("[edge]\nplain = false\n" + tls).addresses()["rig1"] == {secured: ("127.0.0.1", 8020)}
 
 
 def test_lab_keeps_its_source_text(tmp_path: Path) -> None:

@@ -48,8 +48,8 @@ def test_other_errors_are_not_caught() -> None:
 @pytest.mark.parametrize(
     ("host", "words"),
     [
-        ("192.0.2.1", "Cannot assign requested address; edge.host in lab.toml must be an address of this host"),
-        ("no-such-host.invalid", "edge.host in lab.toml must be an address of this host"),
+        ("192.0.2.1", "Cannot assign requested address; edge.host, or `host` of the rig, in lab.toml must be an"),
+        ("no-such-host.invalid", "edge.host, or `host` of the rig, in lab.toml must be an address of this host"),
     ],
 )
 def test_address_of_another_host_is_reported(host: str, words: str) -> None:
@@ -64,7 +64,7 @@ def test_port_in_use_is_reported() -> None:
     port = free_ports(1)
     with (
         bind("rig1", "127.0.0.1", port),
-        pytest.raises(OperationError, match=r"in use; stop the program that listens there, or choose another port"),
+        pytest.raises(OperationError, match=r"in use; is another hilrig running here\? Stop the program"),
     ):
         bind("rig2", "127.0.0.1", port)
 

@@ -126,7 +126,7 @@ def test_chunk_never_expands_beyond_its_stated_size(compression: str) -> None:
 
 
 def test_chunk_that_states_too_large_a_size_is_damaged() -> None:
-    content = struct.pack("<QQQII4sQ", 0, 0, MAX_CHUNK_BYTES + 1, 0, 4, b"zstd", 3) + b"abc"
+    content = struct.pack("<QQQII4sQ", 0, 0, MAX_CHUNK_BYTES + 1, 0, 4, b"zstd", 200_000) + bytes(200_000)
     with pytest.raises(DamagedError, match=f"at most {MAX_CHUNK_BYTES}, at offset 8"):
         decode_chunk(content, 8)
 
@@ -189,3 +189,31 @@ def test_indexes_are_those_of_the_mcap_library(tmp_path: Path) -> None:
             opcode, _, channel = struct.unpack_from("<BQH", data, offset)
             assert (opcode, channel) == (Opcode.MESSAGE_INDEX, channel_id)
     assert zlib.crc32(data[summary.start : -12]) == summary.checksum
+
+
+def test_two_indexes_of_one_chunk_are_damage(good: bytes, tmp_path: Path) -> None:
+    data = bytearray(good)
+    reader = buffer_reader(good)
+    found = [one.offset for one in reader.summary_records(reader.summary()) if one.opcode == Opcode.CHUNK_INDEX]
+    first, second = found[:2]
+    # Offset and length of the chunk, after its two times.
+    data[second + 25 : second + 41] = data[first + 25 : first + 41]
+    data[-12:-8] = bytes(4)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="chunk indexes overlap"):
+        open_run(path)
+    assert recover(path, tmp_path / "new.mcap").messages == sum(open_run(tmp_path / "new.mcap").file.counts.values())
+
+
+def test_chunk_with_an_impossible_ratio_is_not_expanded() -> None:
+    raw = bytes(16 << 20)
+    packed = zstandard.compress(raw)
+    content = struct.pack("<QQQII4sQ", 0, 1, len(raw), zlib.crc32(raw), 4, b"zstd", len(packed)) + packed
+    with pytest.raises(DamagedError, match="bytes uncompressed; expected"):
+        decode_chunk(content, 0)
+
+
+def test_zeros_in_a_chunk_are_damage() -> None:
+    with pytest.raises(DamagedError, match="opcode 0"):
+        list(chunk_records(bytes(100), {1}))

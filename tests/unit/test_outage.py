@@ -51,6 +51,8 @@ def test_source_that_flaps_has_one_long_outage() -> None:
     assert len(found) <= 4
     assert found[-1].has_ended
     assert found[-1].until_ns == pytest.approx(60_000 * MS, abs=SECOND)
+    assert found[-1].interruptions >= 25
+    assert describe_outage("states", found[-1], 0).endswith(f" s with {found[-1].interruptions} interruptions")
 
 
 def test_returned_source_is_reported_after_steady_messages_only() -> None:

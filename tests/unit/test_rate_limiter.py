@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+from hilrig_runtime.timing.rate_limiter import RateLimiter, RepeatReporter, repeat_suffix
 
 PERIOD = 100
 
@@ -59,6 +59,58 @@ def test_every_occurrence_is_reported_once(steps: list[tuple[int, int, bool]]) -
     for found, count in limiter.pop_remainders(now):
         report(found, count)
     assert reported == [sum(step[0] == key for step in steps) for key in range(4)]
+
+
+def test_repeats_are_reported_when_their_period_ends() -> None:
+    reports: list[tuple[int, int]] = []
+    reporter: RepeatReporter[str, int] = RepeatReporter(PERIOD, lambda item, count: reports.append((item, count)))
+    for now in (0, 10, 20):
+        reporter.record("a", now, now)
+    reporter.check(99)
+    assert reports == [(0, 1)]
+    reporter.check(100)
+    assert reports == [(0, 1), (20, 2)]
+    reporter.check(500)
+    assert len(reports) == 2
+
+
+def test_report_counts_nothing_of_a_later_time() -> None:
+    reports: list[tuple[int, int]] = []
+    reporter: RepeatReporter[str, int] = RepeatReporter(PERIOD, lambda item, count: reports.append((item, count)))
+    for now in (0, 10, 20, 10_000):
+        reporter.record("a", now, now)
+    assert reports == [(0, 1), (20, 2)]
+    reporter.flush()
+    assert reports[2:] == [(10_000, 1)]
+    reporter.record("a", 10_001, 10_001)
+    assert reports[3:] == [(10_001, 1)], "the cause has ended: this is a first occurrence"
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from("abcde"), st.integers(0, 150), st.sampled_from(["record", "check", "flush"])))
+)
+def test_each_occurrence_is_in_one_report(steps: list[tuple[str, int, str]]) -> None:
+    reported: dict[str, int] = dict.fromkeys("abcde", 0)
+    recorded = dict(reported)
+    last_ns: dict[str, int] = {}
+    now = 0
+
+    def report(item: str, count: int) -> None:
+        reported[item] += count
+        last_ns[item] = now
+
+    reporter: RepeatReporter[str, str] = RepeatReporter(PERIOD, report, keys=3)
+    for key, after, step in steps:
+        now += after
+        if step == "record":
+            recorded[key] += 1
+            reporter.record(key, key, now)
+        elif step == "check":
+            reporter.check(now)
+            assert all(reported[one] == recorded[one] for one, at in last_ns.items() if now - at >= PERIOD)
+        else:
+            reporter.flush()
+            assert reported == recorded
 
 
 def test_repeat_suffix_is_empty_for_one_occurrence() -> None:

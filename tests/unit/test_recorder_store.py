@@ -65,7 +65,7 @@ def test_resumed_recorder_does_not_report_a_slow_disk(tmp_path: Path) -> None:
 def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
     sync_worker: Any = SimpleNamespace(sync_delay_s=0.0, follow=lambda _: None, finish=lambda *_: None)
     store = make_store(tmp_path, sync_worker, [])
-    recording = Recording("rig1", "s", "", "edge/1", 1, 0, store)
+    recording = Recording("rig1", "s", "", "edge/1", 1, 0)
     assert store.open(recording)
     folder, moved = tmp_path / "lab" / "rig1", tmp_path / "moved"
     assert [path.name for path in folder.iterdir()] == ["s.mcap.part"]
@@ -75,5 +75,11 @@ def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
     store.tick(0)
     assert store.open(recording)
     assert [path.name for path in folder.iterdir()] == ["s.2.mcap.part"]
-    store.close(recording, "ended", "")
+    # The session ends because its owner is silent, and continues later, in a folder that was replaced again.
+    store.close(recording, "keeper lost", "")
+    folder.rename(tmp_path / "moved again")
+    again = Recording("rig1", "s", "", "edge/1", 1, 0)
+    assert store.open(again)
+    assert [path.name for path in folder.iterdir()] == ["s.3.mcap.part"]
+    store.close(again, "ended", "")
     store.release()

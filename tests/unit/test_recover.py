@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import struct
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,8 @@ from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC
 from hilrig_recorder.mcap_format.file_names import recovered_path
 from hilrig_recorder.mcap_format.fsutil import lock_file
 from hilrig_recorder.mcap_format.records import Chunk, Message, encode_message
-from hilrig_recorder.mcap_format.recover import read_session_metadata, recover
-from hilrig_recorder.mcap_format.scan import is_complete, read_chunk, scan
+from hilrig_recorder.mcap_format.recover import read_session_metadata, read_tail, recover
+from hilrig_recorder.mcap_format.scan import SEARCH_BYTES, is_complete, read_chunk, scan
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.errors import InputError, OperationError
@@ -276,6 +277,28 @@ def test_interrupted_recovery_leaves_no_new_file(tmp_path: Path) -> None:
     with pytest.raises(OperationError, match="interrupted"):
         recover(source, tmp_path / "new.mcap", should_continue=lambda: next(answers))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "truncated.mcap"]
+
+
+def test_recovery_pauses_while_it_searches_a_damaged_range(tmp_path: Path) -> None:
+    good_file(tmp_path / "run.mcap")
+    data = (tmp_path / "run.mcap").read_bytes()
+    source = tmp_path / "damaged.mcap"
+    source.write_bytes(data[: len(data) // 2] + bytes(20 * SEARCH_BYTES))
+    pauses = count()
+    recover(source, tmp_path / "new.mcap", should_continue=lambda: next(pauses) >= 0)
+    assert next(pauses) > 20
+
+
+@pytest.mark.timeout(20)
+def test_tail_is_read_without_searching_a_large_range(tmp_path: Path) -> None:
+    good_file(tmp_path / "run.mcap")
+    data = (tmp_path / "run.mcap").read_bytes()
+    source = tmp_path / "damaged.mcap"
+    with source.open("wb") as file:
+        file.write(data[: len(data) // 2])
+        file.truncate(1 << 40)
+    # A range of 1 TiB: reading all of it takes minutes.
+    assert read_tail(source, 1 << 60).keys
 
 
 def test_default_path_of_a_recovered_file(tmp_path: Path) -> None:

@@ -15,17 +15,21 @@ from hilrig_modbus_edge.registers import image
 from hilrig_modbus_edge.registers.map import (
     DISCRETE_END,
     ECHO_ADDRESS,
+    EXTENDED_END,
     INPUT_END,
     MAP,
+    MIRROR_ADDRESS,
+    MIRROR_END,
     PAPER_END,
     POSITION_ADDRESS,
     SEPARATE_WRITES,
+    SWITCH_ADDRESS,
+    SWITCH_END,
     TORQUE_ADDRESS,
     Register,
     Status,
     ValueType,
     address_of,
-    end_of,
     rows_of,
     struct_of,
 )
@@ -60,7 +64,9 @@ def test_values_share_no_register_and_names_are_distinct() -> None:
 def test_ranges_that_are_read_as_one_block_have_no_gap() -> None:
     for table, start, end in (
         (HOLDING, TORQUE_ADDRESS, PAPER_END),
-        (HOLDING, ECHO_ADDRESS, end_of(HOLDING)),
+        (HOLDING, ECHO_ADDRESS, EXTENDED_END),
+        (HOLDING, MIRROR_ADDRESS, MIRROR_END),
+        (HOLDING, SWITCH_ADDRESS, SWITCH_END),
         (INPUT, 0, INPUT_END),
         (RegisterTable.DISCRETE_INPUT, 0, DISCRETE_END),
     ):
@@ -141,13 +147,13 @@ def test_each_input_register_has_its_value() -> None:
 
 
 def _value(row: Register) -> list[int]:
-    # A watchdog timeout has bounds.
-    return [150] if row.name == "watchdog_timeout_set" else [row.number]
+    # A watchdog timeout has bounds, and a mirror of a coil is 0 or 1.
+    return [150] if row.name == "watchdog_timeout_set" else [1] if row.mirrors else [row.number]
 
 
 def test_device_has_exactly_the_holding_registers() -> None:
     bench = _bench()
-    client, other = next(iter(bench.device.clients)), set(range(200))
+    client, other = next(iter(bench.device.clients)), set(range(310))
     for row in rows_of(HOLDING):
         other -= set(range(row.address, row.end))
         bench.device.check_readable(row.address, row.type.words)
@@ -169,6 +175,20 @@ def test_device_has_exactly_the_holding_registers() -> None:
         ):
             with pytest.raises(ModbusError, match="02"):
                 access(address, 1)
+
+
+def test_mirrors_are_the_input_registers() -> None:
+    bench = _bench()
+    client = next(iter(bench.device.clients))
+    inputs = {row.name: row for row in rows_of(INPUT)}
+    mirrors = [row for row in rows_of(HOLDING) if row.mirrors in inputs]
+    assert [row.mirrors for row in mirrors] == list(inputs)
+    for row in mirrors:
+        source = inputs[row.mirrors]
+        assert (row.number - 200, row.type, row.unit) == (source.number, source.type, source.unit)
+        words = bench.read(client, source.address, source.type.words, INPUT)
+        assert bench.read(client, row.address, row.type.words) == words
+    assert bench.read(client, MIRROR_ADDRESS, INPUT_END) == bench.read(client, 0, INPUT_END, INPUT)
 
 
 def test_device_has_exactly_the_bits_and_input_registers() -> None:

@@ -1,5 +1,7 @@
 """Publishers and caches of a service: published bytes are recorded unchanged, and only the newest value is cached."""
 
+import platform
+
 import pytest
 
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
@@ -103,3 +105,30 @@ def test_health_report_is_published_once_a_second() -> None:
         # Rates are of the last second, counts since the start.
         assert [health.published_hz for health in seen] == pytest.approx([500, 0, 0], rel=0.01)
         assert (seen[0].service, seen[0].instance, seen[0].incarnation) == ("sim", "1", service.incarnation)
+
+
+def test_health_report_has_the_last_messages_of_others() -> None:
+    hub, clock = MemoryHub(), ManualClock()
+    seen: list[Health] = []
+    MemoryBus(hub).subscribe(HEALTH.key("lab", "edge", "*"), lambda _, payload: seen.append(HEALTH.decode(payload)))
+    with make_service(hub, clock) as sim, make_service(hub, clock, "edge") as edge:
+        edge.latest_value_cache(STATES)
+        sim.ready()
+        edge.ready()
+        sender = sim.batch_publisher(STATES)
+        sim.add_to_batch(sender, STATE, "rig1")
+        sender.publish([JointState(step=1).SerializeToString()])
+        clock.advance(3_000_000_000)
+        edge.health.report(clock.monotonic_ns())
+    [peer] = seen[0].peers
+    assert (peer.service, peer.host, peer.silent_ns) == ("sim/1", platform.node(), 3_000_000_000)
+
+
+def test_stall_of_a_service_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    clock = ManualClock()
+    with make_service(MemoryHub(), clock) as service:
+        service.ready()
+        for gap_ms in (20, 400, 14_000, 20):
+            clock.advance(gap_ms * 1_000_000)
+            service.beat(clock.monotonic_ns())
+    assert [text.partition(" until")[0] for text in caplog.messages] == ["stalled for 14.0 s"]

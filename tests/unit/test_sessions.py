@@ -41,6 +41,9 @@ class FakeFile:
     end: str = ""
     reason: str = ""
 
+    def write(self, records: Sequence[bytes]) -> None:
+        self.records += records
+
     @property
     def payloads(self) -> list[bytes]:
         """Payloads of the written and the pending messages."""
@@ -72,11 +75,9 @@ class FakeStore:
         if not self.accepts:
             return False
         recording.seen, recording.last, recording.horizon_ns = self.seen, dict(self.last), self.horizon_ns
-        self.files.append(FakeFile(recording, self.flush))
+        recording.file = FakeFile(recording, self.flush)
+        self.files.append(recording.file)
         return True
-
-    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
-        self._file(recording).records += records
 
     def close(self, recording: Recording, end: str, reason: str) -> None:
         file = self._file(recording)
@@ -400,6 +401,7 @@ def test_stream_that_stops_and_returns_is_reported() -> None:
     assert bench.store.outages == [], "no recording is concerned"
     bench.states(100)
     bench.start()
+    bench.accept(FakeSource("recorder/1").batch([]))
     for _ in range(20):
         bench.wait(500 * MS)
         bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))

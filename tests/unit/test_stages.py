@@ -7,7 +7,7 @@ import pytest
 
 from hilrig_cli.commands.latency import print_report
 from hilrig_replay.analysis.latency import measure
-from hilrig_replay.analysis.stages import LOOP_STAGES, STAGES
+from hilrig_replay.analysis.stages import ALL_STAGES, CLIENT_STAGES, LOOP_STAGES, STAGES, TRANSPORT
 from hilrig_replay.export.delay_trace import TRACE_STAGES
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
 from hilrig_replay.io.run import Run, open_run
@@ -26,29 +26,37 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_stage_names_and_colors_are_unique() -> None:
-    for values in (STAGES, TITLES, [stage.color for stage in LOOP_STAGES]):
-        assert len(set(values)) == len(LOOP_STAGES)
+    for stages in (LOOP_STAGES, CLIENT_STAGES):
+        assert len({stage.color for stage in stages}) == len(stages)
+    for values in ([stage.key for stage in ALL_STAGES], [stage.title for stage in ALL_STAGES]):
+        assert len(set(values)) == len(ALL_STAGES)
 
 
 def test_only_the_last_stage_is_the_remainder() -> None:
-    assert [bool(stage.added) for stage in LOOP_STAGES] == [True] * (len(STAGES) - 1) + [False]
+    for stages in (LOOP_STAGES, CLIENT_STAGES):
+        assert [bool(stage.added) for stage in stages] == [True] * (len(stages) - 1) + [False]
 
 
 def test_stages_sum_fields_of_one_message_type() -> None:
-    for stage in LOOP_STAGES:
+    for stage in ALL_STAGES:
         fields = {*stage.added, *stage.subtracted}
         assert fields <= set(STATE_DTYPE.names or ()) or fields <= set(COMMAND_DTYPE.names or ()), stage.key
 
 
 def test_timing_page_has_the_table_of_stages() -> None:
-    section = (DOCS / "timing.md").read_text(encoding="utf-8").partition("| stage | from, to | clock |\n")[2]
-    rows = section.partition("\n\n")[0].splitlines()[1:]
-    assert rows == [f"| {stage.title} | {stage.span} | {stage.clock} |" for stage in LOOP_STAGES]
+    page = (DOCS / "timing.md").read_text(encoding="utf-8")
+    _, *sections = page.split("| stage | from, to | clock |\n")
+    rows = [section.partition("\n\n")[0].splitlines()[1:] for section in sections]
+    of_the_client = [stage for stage in CLIENT_STAGES if stage not in LOOP_STAGES]
+    assert rows == [
+        [f"| {stage.title} | {stage.span} | {stage.clock} |" for stage in stages]
+        for stages in (LOOP_STAGES, of_the_client)
+    ]
 
 
 def test_recordings_page_has_the_formulas_of_the_stages() -> None:
     text = " ".join((DOCS / "recordings.md").read_text(encoding="utf-8").split())
-    for stage in LOOP_STAGES[:-1]:
+    for stage in {*LOOP_STAGES, *CLIENT_STAGES} - {TRANSPORT}:
         assert f"{stage.title} `{stage.formula}`" in text
     assert f"{TITLES[-1]} the remainder of the loop latency" in text
 

@@ -1,9 +1,11 @@
 """Study: file validation, sweep, user-written controllers, results and plots."""
 
+import hashlib
 import json
 import os
 import re
 import signal
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from hilrig_cli.main import app
 from hilrig_runtime.errors import InputError
 from hilrig_study.controllers import user_controller
 from hilrig_study.plots import Marker, plane_figure, traces
-from hilrig_study.results import settled_interval
+from hilrig_study.results import PROVENANCE, provenance, settled_interval
 from hilrig_study.study_config import StudyConfig, load_study
 from hilrig_study.sweep import all_cells, cell_at, run_cells, sweep
 from support.rrd_files import RrdFile
@@ -289,9 +291,22 @@ def test_command_writes_all_result_files(tmp_path: Path) -> None:
     page = (ROOT / "docs/studies.md").read_text(encoding="utf-8").split("| column of `runs.parquet` |")[1]
     cells = [line.split("|")[1] for line in page.split("\n\n")[0].splitlines()[2:]]
     assert set(re.findall(r"`(\w+)`", "".join(cells))) == set(table.column_names)
+    origin = json.loads(table.schema.metadata[b"hilrig"])
+    assert origin == {name: summary[name] for name in PROVENANCE}
+    assert origin["units"] == {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    assert (origin["seed"], origin["controller_sha256"]) == (1, {})
+    assert origin["versions"]["numpy"] == np.__version__
+    assert abs((datetime.now(UTC) - datetime.fromisoformat(origin["date"])).total_seconds()) < 600
     assert (out / "plane-1.png").stat().st_size > 10_000
     assert (out / "plane-1.svg").read_text().startswith("<?xml")
     assert RrdFile(out / "study.rrd").rows("/trace/A/error/θ1") == 150
+
+
+def test_results_have_the_hash_of_each_controller_file(tmp_path: Path) -> None:
+    program = (ROOT / "examples/controllers/pd.py").read_bytes()
+    (tmp_path / "mine.py").write_bytes(program)
+    study = load(tmp_path, SMALL + '[[controllers]]\nname = "mine"\nkind = "file"\nfile = "mine.py"\n')
+    assert provenance(study, tmp_path)["controller_sha256"] == {"mine": hashlib.sha256(program).hexdigest()}
 
 
 def test_growing_error_is_not_settled(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from hilrig_recorder.mcap_format.chunk import CHUNK_BYTES
 from hilrig_recorder.mcap_format.file_names import part_path
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.scan import scan
-from hilrig_recorder.mcap_format.writer import RecordingWriter
+from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
 from hilrig_schemas import JointState
 
 START = 1_767_225_600_000_000_000
@@ -174,6 +174,33 @@ def test_open_recording_is_not_overwritten(tmp_path: Path) -> None:
     first.discard()
 
 
+def test_moved_file_gets_its_final_name_in_its_new_folder(tmp_path: Path) -> None:
+    folder, moved = tmp_path / "rig1", tmp_path / "moved"
+    folder.mkdir()
+    writer = RecordingWriter(folder / "run.mcap")
+    added = fill(writer, 500)
+    folder.rename(moved)
+    with pytest.raises(FileReplacedError, match="moved or deleted while it was being written"):
+        writer.sync()
+    writer.finish()
+    with pytest.raises(FileReplacedError):
+        writer.publish()
+    assert [path.name for path in moved.iterdir()] == ["run.mcap"]
+    assert read(moved / "run.mcap") == added
+
+
+def test_truncation_by_another_process_is_noticed(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    fill(writer, 2_000)
+    writer.sync()
+    os.truncate(writer.temporary_path, 20_000)
+    fill(writer, 2_000)
+    for method in (writer.sync, writer.finish):
+        with pytest.raises(FileReplacedError, match="truncated while it was being written"):
+            method()
+    writer.close()
+
+
 class SmallDisk:
     """Wraps a file and limits its size to `space` bytes."""
 
@@ -291,7 +318,7 @@ def test_file_truncated_by_others_is_not_finished(tmp_path: Path) -> None:
     fill(writer, 10)
     writer.close_chunk()
     os.truncate(writer.temporary_path, writer.size // 2)
-    with pytest.raises(OSError, match="can't be read back"):
+    with pytest.raises(OSError, match="truncated while it was being written"):
         writer.finish()
     writer.discard()
 

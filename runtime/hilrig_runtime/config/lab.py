@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
+from hilrig_runtime.addresses import WILDCARDS
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_runtime.config.controller import ClientConfig, ControllerAddress, RegistersConfig, parse_controller
 from hilrig_runtime.config.edge_tls import TlsConfig
@@ -93,7 +94,7 @@ class EdgeConfig(Section):
     """The Modbus servers of the rigs."""
 
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 opens the rigs to the network."""
+    """Address to listen on; 0.0.0.0 opens the rigs to the network, :: also with IPv6."""
     first_port: Port = 5020
     """Port of the first rig; the others follow, unless a rig sets its own port."""
     watchdog_ms: Annotated[float, Field(strict=True, ge=0, le=65535)] = 1000.0
@@ -106,6 +107,9 @@ class EdgeConfig(Section):
     """Time without a request after which another controller that writes acquires the lease."""
     lease: Literal["controller", "connection"] = "controller"
     """Identity of a client without a certificate: its host ("controller"), or each connection ("connection")."""
+    unmapped_reads: Literal["refuse", "zeros"] = "refuse"
+    """Response to a block read with addresses that do not exist: exception 02 ("refuse"), or they read 0 ("zeros"). A
+    block without any that exists is always refused."""
     session_grace_ms: NotNegative = 5000.0
     """Time within which a controller that reconnects continues its session."""
     repeat_ms: Positive = 200.0
@@ -115,7 +119,8 @@ class EdgeConfig(Section):
     max_connections_per_host: Annotated[int, Field(strict=True, ge=1)] = 16
     """Largest number of connections of a rig from one host."""
     idle_timeout_s: NotNegative = 60.0
-    """Time without a request after which a connection is closed; 0: never."""
+    """Time without a valid request after which a new connection is closed; one that made requests is closed after it if
+    its place is needed, the longest idle first; 0: never."""
     plain: Flag = True
     """Listen without TLS; false: only clients with a certificate can connect."""
     tls: TlsConfig | None = None
@@ -160,6 +165,8 @@ class RigSettings(Section):
     name: Name = "rig1"
     port: Port | None = None
     """Modbus TCP port; default: the next free one from `edge.first_port`."""
+    host: str | None = None
+    """Address to listen on; default: `edge.host`. Several rigs can have port 502, each on its own address."""
     allow: tuple[Network, ...] = ()
     """Networks whose hosts may connect, as "192.168.7.0/24"; empty: all."""
     controller: ControllerAddress | None = None
@@ -272,11 +279,14 @@ class LabConfig(Section):
     @model_validator(mode="after")
     def _rigs_are_distinct(self) -> "LabConfig":
         check_distinct("rig name", (rig.name for rig in self.rigs))
+        hosts = {rig.name: self.host_of(rig) for rig in self.rigs}
         all_ports = [*self.ports.items(), *self.tls_ports.items()]
+        addresses = Counter((hosts[rig], port) for rig, port in all_ports)
         ports = Counter(port for _, port in all_ports)
+        everywhere = {port for rig, port in all_ports if hosts[rig] in WILDCARDS}
         for rig, port in all_ports:
-            if ports[port] > 1:
-                raise ValueError(f"rig {rig!r}: port {port} is already used by another rig")
+            if addresses[hosts[rig], port] > 1 or (port in everywhere and ports[port] > 1):
+                raise ValueError(f"rig {rig!r}: port {port} is already used by another rig at the same address")
             if port > 65535:
                 raise ValueError(f"rig {rig!r}: no port available from {self.edge.first_port} to 65535")
         return self
@@ -295,7 +305,7 @@ class LabConfig(Section):
                     f"rigs {other!r} and {rig.name!r}: both are clients of the controller {rig.controller}; a "
                     "controller has one rig"
                 )
-            if port in served and host in ("localhost", "127.0.0.1", "::1", self.edge.host):
+            if port in served and host in {"localhost", "127.0.0.1", "::1", *map(self.host_of, self.rigs)}:
                 raise ValueError(
                     f"rig {rig.name!r}: its controller {rig.controller} is the address of a rig of this lab"
                 )
@@ -345,11 +355,15 @@ class LabConfig(Section):
         tls = self.edge.tls
         return {} if tls is None else {rig.name: tls.first_port + index for index, rig in enumerate(self.rigs)}
 
-    def addresses(self) -> dict[str, dict[str, str]]:
-        """Return the addresses of each rig on which `edge` listens: kind of connection → "host:port"."""
+    def host_of(self, rig: RigSettings) -> str:
+        """Return the address on which a rig listens: its own, or the edge's."""
+        return self.edge.host if rig.host is None else rig.host
+
+    def addresses(self) -> dict[str, dict[str, tuple[str, int]]]:
+        """Return the addresses of each rig on which `edge` listens: kind of connection → host, port."""
         kinds = {"Modbus TCP": self.ports if self.edge.plain else {}, "Modbus TCP with TLS": self.tls_ports}
         return {
-            rig.name: {kind: f"{self.edge.host}:{ports[rig.name]}" for kind, ports in kinds.items() if ports}
+            rig.name: {kind: (self.host_of(rig), ports[rig.name]) for kind, ports in kinds.items() if ports}
             for rig in self.rigs
         }
 

@@ -38,6 +38,8 @@ class LatestValueCache:
     def __init__(self, clock: Clock, counters: Counters, permitted: Mapping[str, Collection[str]]) -> None:
         self._permitted = permitted
         self._by_rig: dict[str, TimestampedPayload] = {}
+        self.last_ns: dict[str, int] = {}
+        """Arrival of the last batch on each key, monotonic clock, ns."""
         self._monotonic_ns = clock.monotonic_ns
         self._counters = counters
         self.notify: Callable[[], object] | None = None
@@ -67,9 +69,12 @@ class LatestValueCache:
         else:
             self._by_rig.update(values)
         self._counters.received += len(messages)
+        self.last_ns[key] = arrived_ns
         if len(self._by_rig) > MAX_RIGS:
             newest = sorted(self._by_rig.items(), key=lambda item: -item[1].arrived_ns)[: MAX_RIGS // 2]
             self._by_rig = dict(newest)
+        if len(self.last_ns) > MAX_RIGS:
+            self.last_ns = {key: arrived_ns}
         if self.notify is not None:
             self.notify()
 

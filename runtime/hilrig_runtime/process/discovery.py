@@ -29,6 +29,8 @@ from hilrig_schemas import ServiceInfo
 from hilrig_schemas.topics import SERVICE_INFO, alive_key, source_of_key
 
 RECHECK_PERIOD_NS: Final = 10_000_000_000
+MAX_HOSTS: Final = 256
+"""Maximum number of services with a remembered host."""
 RETRY_INTERVAL_S: Final = 0.1
 QUERY_TIMEOUT_S: Final = 0.5
 CLAIM_TIMEOUT_S: Final = 3.0
@@ -133,6 +135,8 @@ class PeerRegistry:
         may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
     ) -> None:
         self.clock_offset = ClockOffset()
+        self.hosts: dict[str, str] = {}
+        """Host of each service that replied once, "<service>/<instance>"."""
         self._bus = bus
         self._lab = lab
         self._own = own
@@ -211,6 +215,10 @@ class PeerRegistry:
             offset for other, offset in replies if other.incarnation != self._own.incarnation
         )
         others = [other for other, _ in replies]
+        # Replaced, not changed: the thread of the health reports reads it.
+        self.hosts = dict(
+            [*self.hosts.items(), *((f"{other.service}/{other.instance}", other.host) for other in others)][-MAX_HOSTS:]
+        )
         for other in others:
             allowed = [rig for rig in other.rigs if self._may_serve(f"{other.service}/{other.instance}", rig)]
             if len(allowed) < len(other.rigs):

@@ -15,7 +15,7 @@ from hilrig_runtime.counters import Counters
 from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.timing.clock import Clock
 from hilrig_runtime.timing.realtime import realtime_priority
-from hilrig_schemas import Health, RigReport
+from hilrig_schemas import Health, PeerReport, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
 REJECTED_LOG_PERIOD_NS: Final = 10_000_000_000
@@ -32,6 +32,8 @@ class HealthReporter:
         self.rig_reports: Callable[[], Iterable[RigReport]] = tuple
         """Called at each report for the reports of the service's rigs."""
         self.clock_offset: Callable[[], ClockOffset] = ClockOffset
+        self.peers: Callable[[int], Iterable[PeerReport]] = lambda _: ()
+        """Called at each report, with its time, for the other services."""
         self._publisher = publisher
         self._identity = {
             "service": service,
@@ -74,6 +76,7 @@ class HealthReporter:
             clock_offset_ns=clock.offset_ns,
             clock_uncertainty_ns=clock.uncertainty_ns,
             rig_reports=self.rig_reports(),
+            peers=self.peers(now_ns),
         )
         for name in _COPIED:
             value = getattr(counters, name)

@@ -10,7 +10,7 @@ from hilrig_schemas import Event
 
 RETURN_NS: Final = 1_000_000_000
 """Time that messages must arrive again before an outage has ended, ns."""
-STEADY_NS: Final = 10_000_000_000
+STEADY_NS: Final = 5_000_000_000
 """The same for an outage that begins within this time after the last one: a source that flaps has one long outage."""
 OUTAGE_LOG_DELAY_NS: Final = 250_000_000
 """Time in which the outages of all rigs are collected for one log message, ns."""
@@ -31,6 +31,8 @@ class Outage:
     until_ns: int
     """End of the outage, or the time of its detection."""
     has_ended: bool
+    interruptions: int = 1
+    """Number of interruptions within it, if messages arrived meanwhile."""
 
     @property
     def silent_ns(self) -> int:
@@ -50,6 +52,7 @@ class OutageDetector:
         """Arrival of the last message before the outage; None: no outage."""
         self._back_ns: int | None = None
         """Arrival of the first message after it, if no other interruption followed."""
+        self._interruptions = 0
         self._ended_ns = -STEADY_NS
         self._return_ns = RETURN_NS
 
@@ -73,14 +76,16 @@ class OutageDetector:
                 return None
             self._since_ns = last_ns or self._valid_ns
             self._back_ns = None
+            self._interruptions = 1
             self._return_ns = STEADY_NS if now_ns - self._ended_ns < STEADY_NS else RETURN_NS
             return Outage(self._since_ns, now_ns, has_ended=False)
-        if is_silent or last_ns <= self._since_ns:
+        if is_silent:
+            self._interruptions += self._back_ns is not None
             self._back_ns = None
         elif self._back_ns is None:
-            self._back_ns = last_ns
+            self._back_ns = last_ns if last_ns > self._since_ns else None
         elif now_ns - self._back_ns >= self._return_ns:
-            ended = Outage(self._since_ns, self._back_ns, has_ended=True)
+            ended = Outage(self._since_ns, self._back_ns, has_ended=True, interruptions=self._interruptions)
             self._since_ns, self._ended_ns = None, now_ns
             return ended
         return None
@@ -123,7 +128,8 @@ def describe_outage(what: str, outage: Outage, wall_offset_ns: int) -> str:
     """
     if outage.has_ended:
         until = _utc_time(outage.until_ns + wall_offset_ns)
-        return f"{what} received again since {until}, after {outage.silent_ns / 1e9:.1f} s"
+        times = f" with {outage.interruptions} interruptions" if outage.interruptions > 1 else ""
+        return f"{what} received again since {until}, after {outage.silent_ns / 1e9:.1f} s{times}"
     return f"no {what} since {_utc_time(outage.since_ns + wall_offset_ns)}"
 
 

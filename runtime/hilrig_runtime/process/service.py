@@ -25,8 +25,8 @@ from hilrig_runtime.process.discovery import PeerRegistry
 from hilrig_runtime.process.health import HealthReporter
 from hilrig_runtime.process.outage import STALL_NS, OutageLog
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
-from hilrig_schemas import Event, RigBatch, ServiceInfo
-from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key
+from hilrig_schemas import Event, PeerReport, RigBatch, ServiceInfo
+from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, source_of_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 EXTRA_QUEUED_BATCHES: Final = 64
@@ -88,6 +88,9 @@ class Service(Handle):
         )
         self._closing.callback(self._registry.close)
         self.health.clock_offset = lambda: self._registry.clock_offset
+        self.health.peers = self._peer_reports
+        self.last_received: Callable[[], Mapping[str, int]] = dict
+        """Returns the arrival of the last message of each other service, monotonic clock, ns; set by the recorder."""
 
     def claim(self) -> None:
         """Check, before anything is published, that no other service of its kind has one of its rigs or its name.
@@ -137,6 +140,7 @@ class Service(Handle):
         # A batch may contain one message only: room for one batch per rig, and for rigs that are added later.
         depth = len(self.rigs) + EXTRA_QUEUED_BATCHES
         self._closing.enter_context(self.bus.subscribe_newest(key, cache.on_message, depth))
+        self.last_received = lambda: {source_of_key(key): ns for key, ns in cache.last_ns.copy().items()}
         return cache
 
     def publisher(self, topic: ServiceTopic[MessageT]) -> Publisher:
@@ -192,6 +196,17 @@ class Service(Handle):
         """
         if self._failure:
             raise OperationError(self._failure)
+
+    def _peer_reports(self, now_ns: int) -> list[PeerReport]:
+        hosts, received = self._registry.hosts, self.last_received()
+        return [
+            PeerReport(
+                service=name,
+                host=hosts.get(name, ""),
+                silent_ns=max(1, now_ns - received[name]) if name in received else 0,
+            )
+            for name in sorted((hosts.keys() | received.keys()) - {self.source})
+        ]
 
     def _rigs_reached(self) -> list[tuple[str, str]]:
         return [(rig.name, self.addresses(rig.name)) for rig in self.rigs]

@@ -1,9 +1,10 @@
 """Rate limit of repeated events and log messages: counts the suppressed ones."""
 
-from collections.abc import Hashable, Iterator
-from typing import Generic, TypeVar
+from collections.abc import Callable, Hashable, Iterator
+from typing import Generic, NamedTuple, TypeVar
 
 KeyT = TypeVar("KeyT", bound=Hashable)
+ItemT = TypeVar("ItemT")
 
 
 class RateLimiter(Generic[KeyT]):
@@ -54,6 +55,72 @@ class RateLimiter(Generic[KeyT]):
         self._reported[key] = (now_ns, 0)
         if len(self._reported) > self._keys:
             del self._reported[next(iter(self._reported))]
+
+
+class _Reported(NamedTuple, Generic[ItemT]):
+    """Entry of a `RepeatReporter` for one key."""
+
+    reported_ns: int
+    suppressed: int
+    """Number of occurrences since the last report."""
+    newest: ItemT
+
+
+class RepeatReporter(Generic[KeyT, ItemT]):
+    """Reports at most once per key and period: the newest occurrence and the number of them since the last report.
+
+    Every occurrence is in exactly one report: those that were suppressed are reported when their period ends (`check`)
+    or their cause does (`flush`), never with a later occurrence. Time is passed in.
+    """
+
+    def __init__(self, period_ns: int, report: Callable[[ItemT, int], None], keys: int = 256) -> None:
+        self._period_ns = period_ns
+        self._report = report
+        self._keys = keys
+        self._reported: dict[KeyT, _Reported[ItemT]] = {}
+        """In the order of the reports."""
+        self._suppressed = 0
+
+    def record(self, key: KeyT, item: ItemT, now_ns: int) -> None:
+        """Record one occurrence at `now_ns`, monotonic clock, and report it if no report was made within the period."""
+        self.check(now_ns)
+        before = self._reported.get(key)
+        if before is not None and now_ns - before.reported_ns < self._period_ns:
+            self._reported[key] = _Reported(before.reported_ns, before.suppressed + 1, item)
+            self._suppressed += 1
+            return
+        self._remember(key, item, now_ns)
+        self._report(item, 1)
+
+    def check(self, now_ns: int) -> None:
+        """Report the suppressed occurrences of each key whose period has ended."""
+        while self._suppressed:
+            key = next(iter(self._reported))
+            reported_ns, count, newest = self._reported[key]
+            if now_ns - reported_ns < self._period_ns:
+                return
+            del self._reported[key]
+            if count:
+                self._suppressed -= count
+                self._remember(key, newest, now_ns)
+                self._report(newest, count)
+
+    def flush(self) -> None:
+        """Report all suppressed occurrences; the next one is the first of its key."""
+        reported, self._reported, self._suppressed = self._reported, {}, 0
+        for _, count, newest in reported.values():
+            if count:
+                self._report(newest, count)
+
+    def _remember(self, key: KeyT, item: ItemT, now_ns: int) -> None:
+        # Inserted again: the oldest report is first.
+        self._reported.pop(key, None)
+        self._reported[key] = _Reported(now_ns, 0, item)
+        if len(self._reported) > self._keys:
+            _, count, newest = self._reported.pop(next(iter(self._reported)))
+            if count:
+                self._suppressed -= count
+                self._report(newest, count)
 
 
 def repeat_suffix(count: int) -> str:

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class TorqueCommand(_message.Message):
-    __slots__ = ("rig", "session", "seq", "effort", "magnet", "controller", "safe", "echo", "resets", "basis_incarnation", "basis_step", "state_arrived_ns", "state_served_ns", "write_arrived_ns", "sent_ns", "state_injected_ns", "command_injected_ns", "wall_ns", "write_received_ns", "basis_on_other_connection", "positions_acknowledged_ns", "read_sent_ns", "basis_is_bound")
+    __slots__ = ("rig", "session", "seq", "effort", "magnet", "controller", "safe", "echo", "resets", "basis_incarnation", "basis_step", "state_arrived_ns", "state_served_ns", "write_arrived_ns", "sent_ns", "state_injected_ns", "command_injected_ns", "wall_ns", "write_received_ns", "basis_on_other_connection", "positions_acknowledged_ns", "read_sent_ns", "stale_read_sent_ns", "basis_is_bound")
     RIG_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -30,6 +30,7 @@ class TorqueCommand(_message.Message):
     BASIS_ON_OTHER_CONNECTION_FIELD_NUMBER: _ClassVar[int]
     POSITIONS_ACKNOWLEDGED_NS_FIELD_NUMBER: _ClassVar[int]
     READ_SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    STALE_READ_SENT_NS_FIELD_NUMBER: _ClassVar[int]
     BASIS_IS_BOUND_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
@@ -53,5 +54,6 @@ class TorqueCommand(_message.Message):
     basis_on_other_connection: bool
     positions_acknowledged_ns: int
     read_sent_ns: int
+    stale_read_sent_ns: int
     basis_is_bound: bool
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., seq: _Optional[int] = ..., effort: _Optional[_Iterable[float]] = ..., magnet: _Optional[bool] = ..., controller: _Optional[str] = ..., safe: _Optional[bool] = ..., echo: _Optional[int] = ..., resets: _Optional[int] = ..., basis_incarnation: _Optional[int] = ..., basis_step: _Optional[int] = ..., state_arrived_ns: _Optional[int] = ..., state_served_ns: _Optional[int] = ..., write_arrived_ns: _Optional[int] = ..., sent_ns: _Optional[int] = ..., state_injected_ns: _Optional[int] = ..., command_injected_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., write_received_ns: _Optional[int] = ..., basis_on_other_connection: _Optional[bool] = ..., positions_acknowledged_ns: _Optional[int] = ..., read_sent_ns: _Optional[int] = ..., basis_is_bound: _Optional[bool] = ...) -> None: ...
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., seq: _Optional[int] = ..., effort: _Optional[_Iterable[float]] = ..., magnet: _Optional[bool] = ..., controller: _Optional[str] = ..., safe: _Optional[bool] = ..., echo: _Optional[int] = ..., resets: _Optional[int] = ..., basis_incarnation: _Optional[int] = ..., basis_step: _Optional[int] = ..., state_arrived_ns: _Optional[int] = ..., state_served_ns: _Optional[int] = ..., write_arrived_ns: _Optional[int] = ..., sent_ns: _Optional[int] = ..., state_injected_ns: _Optional[int] = ..., command_injected_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., write_received_ns: _Optional[int] = ..., basis_on_other_connection: _Optional[bool] = ..., positions_acknowledged_ns: _Optional[int] = ..., read_sent_ns: _Optional[int] = ..., stale_read_sent_ns: _Optional[int] = ..., basis_is_bound: _Optional[bool] = ...) -> None: ...

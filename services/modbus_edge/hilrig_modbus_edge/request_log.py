@@ -47,7 +47,7 @@ class RequestLog:
         head = pdu[:5], exception, controller
         index = self._index_of_head.get(head)
         if index is None:
-            index = self._index_of_head[head] = self._index(_kind_of(pdu[:5]), exception, controller)
+            index = self._index_of_head[head] = self._index(kind_of(pdu[:5]), exception, controller)
         self._add_index(index)
         self._add_arrived_ns(arrived_ns)
         self._add_answered_after_ns(answered_ns - arrived_ns)
@@ -76,7 +76,8 @@ class RequestLog:
         return index
 
 
-def _kind_of(head: bytes) -> _RequestKind:
+def kind_of(head: bytes) -> _RequestKind:
+    """Return function, address and quantity from the first five bytes of a request's PDU."""
     function = head[0]
     layout = _LAYOUTS.get(function, RequestLayout.UNADDRESSED)
     if layout is RequestLayout.UNADDRESSED or len(head) < 5:

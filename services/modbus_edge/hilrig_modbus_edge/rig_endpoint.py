@@ -15,14 +15,17 @@ from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
 from hilrig_modbus_edge.server.admission import Limits
 from hilrig_modbus_edge.server.listener import RigServer, bind
 from hilrig_modbus_edge.server.tls import TlsPolicy
+from hilrig_runtime.addresses import format_address, reachable_hosts
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload
 from hilrig_runtime.process.service import Service
-from hilrig_schemas import Event, RigReport, topics
+from hilrig_schemas import Event, ExceptionCount, RigReport, topics
 
 REQUEST_LOG_PERIOD_NS: Final = 200_000_000
 """Period at which the request log of a rig is published, ns."""
+CHECK_PERIOD_NS: Final = 500_000_000
+"""Period at which the connections are checked, ns."""
 TCP_FIGURES_PERIOD_NS: Final = 1_000_000_000
 """Period at which the TCP figures of the connections are recorded, ns."""
 
@@ -71,6 +74,7 @@ class RigEndpoint:
         lab = service.lab
         self._clock = service.clock
         self._edge = lab.edge
+        self._host = lab.host_of(rig)
         self._output = BusOutput(rig.name, service, sessions_changed)
         settings = DeviceSettings.of(lab.edge, lab.impairment_of(rig))
         if rig.controller is not None:
@@ -93,11 +97,12 @@ class RigEndpoint:
         self.closing = ExitStack()
         """Resources that are closed with the endpoint."""
         self.address = ""
-        """Human-readable listening addresses. Stored, because a thread of the bus reads them while the edge closes."""
+        """Addresses that reach the rig, human-readable. Stored: a thread of the bus reads it while the edge closes."""
         self._request_log = service.rig_publisher(topics.TRAFFIC, rig.name)
         self.request_log_due_ns = 0
         """Time at which the request log is published next, ns, monotonic clock."""
         self._tcp_figures_due_ns = 0
+        self._check_due_ns = 0
         self._sockets: list[tuple[socket.socket, TlsPolicy | None]] = []
 
     def bind(self, port: int, tls_port: int | None) -> None:
@@ -108,11 +113,12 @@ class RigEndpoint:
         """
         edge, rig = self._edge, self.device.rig
         if edge.plain:
-            self._sockets.append((self.closing.enter_context(bind(rig, edge.host, port)), None))
+            self._sockets.append((self.closing.enter_context(bind(rig, self._host, port)), None))
         if edge.tls is not None and tls_port is not None:
-            listening = self.closing.enter_context(bind(rig, edge.host, tls_port, "edge.tls.first_port"))
+            listening = self.closing.enter_context(bind(rig, self._host, tls_port, "edge.tls.first_port"))
             self._sockets.append((listening, TlsPolicy(edge.tls)))
-        addresses = [f"{edge.host}:{listening.getsockname()[1]}" for listening, _ in self._sockets]
+        ports = [listening.getsockname()[1] for listening, _ in self._sockets]
+        addresses = [format_address(host, port) for port in ports for host in reachable_hosts(self._host)]
         if self.exchange is not None:
             addresses.append(f"client of {self.exchange.address}")
         self.address = ", ".join(addresses)
@@ -129,12 +135,14 @@ class RigEndpoint:
             self.exchange.start()
 
     def on_tick(self, now_ns: int) -> None:
-        """Do the periodic work: device, idle connections, request log; ns, monotonic clock."""
+        """Do the periodic work: device, connections, request log; ns, monotonic clock."""
         server = self._server
         self.device.check(now_ns)
         if server.connections:
             self.device.refresh_state()
-            server.close_idle(now_ns)
+        if now_ns >= self._check_due_ns:
+            self._check_due_ns = now_ns + CHECK_PERIOD_NS
+            server.check(now_ns)
             server.close_expired(self._clock.wall_ns())
         count = server.request_log.count
         if count and (now_ns >= self.request_log_due_ns or count >= MAX_REQUESTS_PER_MESSAGE):
@@ -151,13 +159,18 @@ class RigEndpoint:
 
     def report(self) -> RigReport:
         """Return the part of the health report that describes the rig."""
-        status = self.device.lease_status()
+        status, server = self.device.lease_status(), self._server
         return RigReport(
             rig=status.rig,
             controller=status.holder,
             session=status.session,
             watchdog_tripped=status.watchdog_tripped,
             connections=status.connections,
+            exceptions=[
+                ExceptionCount(host=host, function=function, code=code, count=count)
+                for host, function, code, count in server.exceptions.counts()
+            ],
+            alert=server.alert(),
         )
 
     def stop(self, reason: str) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import os
 import random
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -129,6 +130,7 @@ class Recorder:
             partial(handle_control_request, handlers),
         )
         service.health.rig_reports = self._rig_reports
+        service.last_received = self._sessions.last_received
         self._maintenance = MaintenanceWorker(
             self._store.folder,
             unfinished,
@@ -205,6 +207,8 @@ class Recorder:
     def _emit(self, *events: Event) -> None:
         logger.log(logging.INFO if events[0].severity == Event.INFO else logging.WARNING, "%s", events[0].text)
         for event in events:
+            # Events are recorded: they contain paths below the folder of recordings only.
+            event.text = event.text.replace(f"{self._service.lab.recorder.folder}{os.sep}", "")
             self._service.emit(event)
 
     def _emit_error(self, text: str) -> None:

@@ -1,11 +1,11 @@
 """Certificate store: a folder with certificates and keys, signed by one certificate authority."""
 
-import os
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
+from hilrig_replay.io.output_file import output_file
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.security.x509 import Credential, load, make_authority, names_in
 
@@ -77,11 +77,8 @@ class CertificateStore:
         """Write a certificate and its key; the key is readable by its owner only."""
         for suffix, data, mode in ((".pem", identity.certificate_pem, 0o644), (".key", identity.key_pem, 0o600)):
             path = self._folder / f"{name}{suffix}"
-            try:
-                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
-                    file.write(data)
-            except OSError as error:
-                raise OperationError(f"{path}: can't be written: {error.strerror}") from error
+            with output_file(path, mode=mode) as temporary:
+                temporary.write_bytes(data)
             self.written.append(path)
 
     def _read(self, name: str) -> Credential | None:

@@ -14,6 +14,7 @@ from typing import Any, Final
 from hilrig_console.worker import Worker
 from hilrig_recorder.mcap_format.file_names import recording_stem
 from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
+from hilrig_replay.io.segments import RunFiles
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.errors import HilrigError, InputError
 
@@ -59,8 +60,8 @@ class ListWorker:
 class ReportWorker:
     """Writes reports of recordings, in a worker process."""
 
-    def write(self, recording: Path, page: Path) -> None:
-        """Write the report of a recording.
+    def write(self, recording: RunFiles, page: Path) -> None:
+        """Write the report of a run.
 
         Raises:
             InputError: the recording can't be read.
@@ -85,7 +86,7 @@ class RecordingCatalog(Handle):
         self._list_worker = Worker(ListWorker, folder)
         self._report_worker = Worker(ReportWorker)
         self._reporting = threading.Lock()
-        self._reports: OrderedDict[tuple[str, int, int], Path] = OrderedDict()
+        self._reports: OrderedDict[tuple[Any, ...], Path] = OrderedDict()
         self._cache = tempfile.TemporaryDirectory(prefix="hilrig-console-", ignore_cleanup_errors=True)
 
     def refresh(self) -> None:
@@ -120,26 +121,27 @@ class RecordingCatalog(Handle):
         }
 
     def file(self, path: str) -> Path:
-        """Return the path of a listed recording.
+        """Return the path of a file of a listed run.
 
         Raises:
-            InputError: the recording is not listed or does not exist anymore.
+            InputError: the file is not listed or does not exist anymore.
         """
         found = (self.folder / path).resolve()
-        is_listed = any(entry.path == path for entry in self._entries)
+        is_listed = any(path in entry.paths for entry in self._entries)
         if not is_listed or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
             raise InputError(f"unknown recording {path!r}")
         return found
 
     def report(self, path: str) -> Path:
-        """Return the report page of a listed recording; it is created if it is not cached.
+        """Return the report page of a listed run, by its first file; it is created if it is not cached.
 
         Raises:
             HilrigError: the recording is unknown, or its report can't be created.
         """
-        recording = self.file(path)
-        info = recording.stat()
-        key = (path, info.st_size, info.st_mtime_ns)
+        listed = next((entry.paths for entry in self._entries if entry.path == path), (path,))
+        recording = tuple(map(self.file, listed))
+        states = [one.stat() for one in recording]
+        key = (listed, *(number for info in states for number in (info.st_size, info.st_mtime_ns)))
         with self._reporting:
             page = self._reports.get(key)
             if page is not None:
@@ -172,7 +174,7 @@ def _search_text(entry: RunEntry) -> str:
 
 def _row(entry: RunEntry) -> dict[str, Any]:
     row = asdict(entry)
-    for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab"):
+    for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab", "segment", "span"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
     row["name"] = recording_stem(Path(entry.path).name)

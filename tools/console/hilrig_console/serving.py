@@ -18,8 +18,9 @@ from hilrig_console.auth import HEALTH_PATH, AccessPolicy
 from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.http_limits import MAX_CONNECTIONS, ConnectionTable, LimitedProtocol
 from hilrig_console.subscriber import LabSubscriber
+from hilrig_runtime.addresses import listen_reason
 from hilrig_runtime.config.lab import LabConfig
-from hilrig_runtime.errors import InputError, OperationError, listen_failure
+from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.process.lifecycle import allow_open_files
 
 SHUTDOWN_GRACE_S: Final = 1
@@ -71,7 +72,7 @@ class ListenAddress:
         except OSError as error:
             where = f"{self.host or '0.0.0.0'}:{self.port}"
             raise OperationError(
-                f"can't listen on {where}: {listen_failure(error)}; choose another address with --listen"
+                f"can't listen on {where}: {listen_reason(error)}; choose another address with --listen"
             ) from error
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             # The connections inherit it: a client that does not read its response is disconnected.

@@ -14,6 +14,8 @@ WINDOW_S: Final = 10.0
 """Window of the percentiles of loop latency and age."""
 SILENT_AFTER_S: Final = 3.5
 """Time without a report after which a service is shown as silent and its rig reports are discarded."""
+MAX_RIG_ALERTS: Final = 8
+"""Number of rigs whose alerts are shown; the others are counted."""
 REMOVED_AFTER_S: Final = 600.0
 """Time without a report after which a service is removed: it was stopped, or has another name now."""
 
@@ -52,6 +54,10 @@ class RigStatus:
     """99th percentile of the simulation's tick lateness in the last second, ns."""
     overruns: int = 0
     """Ticks of the simulation that began more than a step late, since its start."""
+    exceptions: dict[tuple[str, int, int], int] = field(default_factory=dict)
+    """By host, function (0: unsupported) and code: number of Modbus exception responses since the edge's start."""
+    alert: str = ""
+    """The newest refused request or foreign protocol, with the fix; empty: none recently."""
     loops_us: list[int] = field(default_factory=list)
     """Loop latencies within the window, µs, sorted."""
     ages_us: list[int] = field(default_factory=list)
@@ -137,6 +143,8 @@ class LabView:
                     status.served = True
                     status.controller, status.session = report.controller, report.session
                     status.connections, status.watchdog_tripped = report.connections, report.watchdog_tripped
+                    status.exceptions = {(row.host, row.function, row.code): row.count for row in report.exceptions}
+                    status.alert = report.alert
                 else:
                     status.recording = status.recording or report.recording
         for rig, loops in self._loops.items():
@@ -149,7 +157,7 @@ class LabView:
         return list(found.values())
 
     def alerts(self, now_s: float) -> list[str]:
-        """Alerts for the operator: silent services and the alerts of services, one line each."""
+        """Alerts for the operator: silent services, and the alerts of services and rigs, one line each."""
         found = []
         for service in self.services():
             health = service.health
@@ -157,6 +165,10 @@ class LabView:
                 found.append(f"{service.name} on {health.host}: silent for {now_s - service.reported_s:.0f} s")
             elif health.alert:
                 found.append(f"{service.name} on {health.host}: {health.alert}")
+        rigs = [rig for rig in self.rigs(now_s) if rig.alert]
+        found += [f"{rig.rig}: {rig.alert}" for rig in rigs[:MAX_RIG_ALERTS]]
+        if len(rigs) > MAX_RIG_ALERTS:
+            found.append(f"{len(rigs) - MAX_RIG_ALERTS} more rigs have such alerts")
         return found
 
     def as_dict(self, now_s: float) -> dict[str, Any]:
@@ -215,4 +227,8 @@ def _rig_row(rig: RigStatus) -> dict[str, Any]:
         "age_p99_ms": rig.age_ms(0.99),
         "lateness_p99_ms": rig.lateness_p99_ns / 1e6,
         "overruns": rig.overruns,
+        "exceptions": [
+            {"host": host, "function": function, "code": code, "count": count}
+            for (host, function, code), count in sorted(rig.exceptions.items())
+        ],
     }

@@ -27,7 +27,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("connections", "gauge", "Modbus connections open.", "connections", 1),
     ("requests_total", "counter", "Modbus requests answered, also with an exception.", "requests", 1),
     ("malformed_total", "counter", "Malformed messages and connections with malformed frames.", "malformed", 1),
-    ("refused_total", "counter", "Connections and writes refused.", "refused", 1),
+    ("refused_total", "counter", "Connections refused, and writes without lease or permission.", "refused", 1),
     ("recordings", "gauge", "Open recordings.", "recordings", 1),
     ("written_bytes_total", "counter", "Bytes written to recordings.", "bytes_written", 1),
     ("clock_offset_seconds", "gauge", "Largest wall clock offset to another service.", "clock_offset_ns", 1e-9),
@@ -71,6 +71,14 @@ def _lines(view: LabView, lab: str, now_s: float) -> Iterator[str]:
                     yield _labels(lab=lab, rig=rig.rig, quantile=f"{share:g}"), value / 1e3
 
     yield from _family("rig_loop_seconds", "gauge", "Loop latency in the last 10 s.", quantiles(RigStatus.loop_ms))
+
+    def exceptions() -> Iterator[tuple[str, float]]:
+        for rig in rigs:
+            for (host, function, code), count in sorted(rig.exceptions.items()):
+                named = str(function) if function else "other"
+                yield _labels(lab=lab, rig=rig.rig, host=host, function=named, code=str(code)), count
+
+    yield from _family("exceptions_total", "counter", "Modbus exception responses.", exceptions())
     text = "Age of the acting command's basis at each step in the last 10 s."
     yield from _family("rig_age_seconds", "gauge", text, quantiles(RigStatus.age_ms))
 

@@ -1,10 +1,13 @@
 """Result files of a study: a Parquet table with one row per run, and a JSON summary."""
 
+import hashlib
 import json
+import platform
 from dataclasses import asdict
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +24,29 @@ from hilrig_study.sweep import CELL_DTYPE, SweepResult
 
 Floats = NDArray[np.float64]
 
+VERSIONED: Final = ("numpy", "scipy", "pyarrow")
+"""Packages whose versions are recorded: results are bit-identical with the same ones."""
+PROVENANCE: Final = ("software", "versions", "machine", "date", "seed", "controller_sha256", "units")
+"""Keys of `provenance`."""
+UNITS: Final = {
+    "controller": "",
+    "run": "1",
+    "gain": "1",
+    "delay_ms": "ms",
+    "jitter_ms": "ms",
+    "loss": "1",
+    "step_ms": "ms",
+    "poll_ms": "ms",
+    "cost": "1",
+    "settled": "",
+    "failed_s": "s",
+    "loop_p50_ms": "ms",
+    "loop_p99_ms": "ms",
+    **{f"error_rms_{name}": "m" if name == "d3" else "rad" for name in JOINT_NAMES},
+    "spectral_radius": "1",
+}
+"""Unit of each column of `runs.parquet`; 1: a pure number, empty: no number."""
+
 
 def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
     """Return one row per run: parameters, outcome and spectral radius; units are in the names, angles in rad."""
@@ -33,7 +59,30 @@ def run_table(study: StudyConfig, swept: SweepResult) -> pa.Table:
     for number, joint in enumerate(JOINT_NAMES):
         columns[f"error_rms_{joint}"] = np.ascontiguousarray(swept.results["error_rms"][:, number])
     columns["spectral_radius"] = swept.radius
-    return pa.table(columns)
+    table = pa.table(columns)
+    fields = [field.with_metadata({"unit": UNITS[field.name]}) for field in table.schema]
+    return table.cast(pa.schema(fields))
+
+
+def provenance(study: StudyConfig, folder: Path) -> dict[str, Any]:
+    """Return the data that repeat a figure: versions, date, seed, hash of each controller file, and units.
+
+    Args:
+        study: the study.
+        folder: folder of the study file, to which controller files are relative.
+    """
+    files = {one.name: one.file for one in study.controllers if one.file is not None}
+    return {
+        "software": f"hilrig {version('hilrig')}",
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in VERSIONED}},
+        "machine": machine_name(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seed": study.seed,
+        "controller_sha256": {
+            name: hashlib.sha256((folder / file).read_bytes()).hexdigest() for name, file in files.items()
+        },
+        "units": UNITS,
+    }
 
 
 def _is_random(swept: SweepResult, controller: int) -> bool:
@@ -65,8 +114,8 @@ def cost_interval(study: StudyConfig, swept: SweepResult, controller: int) -> di
     return {"mean": mean, "half_width": t.ppf(0.975, more) * np.sqrt(variance / more)}
 
 
-def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
-    """Return the study, the machine, and outcome and theory per controller and gain, as JSON values."""
+def summary(study: StudyConfig, swept: SweepResult, folder: Path = Path()) -> dict[str, Any]:
+    """Return the study, its provenance, and outcome and theory per controller and gain, as JSON values."""
     controllers = []
     for number, controller in enumerate(study.controllers):
         settled = swept.plane(study, number, swept.results["settled"])
@@ -88,8 +137,7 @@ def summary(study: StudyConfig, swept: SweepResult) -> dict[str, Any]:
     values = {
         "title": study.title,
         "study": study.model_dump(mode="json"),
-        "software": f"hilrig {version('hilrig')}",
-        "machine": machine_name(),
+        **provenance(study, folder),
         "runs": len(swept.cells),
         "simulated_s": simulated_s,
         "seconds": swept.seconds,
@@ -105,14 +153,28 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return plain
 
 
-def save_results(study: StudyConfig, swept: SweepResult, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
+def save_results(
+    study: StudyConfig, swept: SweepResult, folder: Path, more: dict[str, Any], source: Path = Path()
+) -> dict[str, Any]:
     """Write `runs.parquet` and `study.json`, with `more` at its top level, and return the JSON values.
+
+    The schema metadata `hilrig` of the table is the provenance as JSON; each of its fields has a `unit`.
+
+    Args:
+        study: the study.
+        swept: its results.
+        folder: where the files are written.
+        more: additional JSON values.
+        source: folder of the study file.
 
     Raises:
         OperationError: a file can't be written.
     """
-    written = summary(study, swept) | _plain(more)
+    written = summary(study, swept, source) | _plain(more)
+    origin = {name: written[name] for name in PROVENANCE}
+    table = run_table(study, swept)
+    table = table.replace_schema_metadata({"hilrig": json.dumps(origin)})
     with output_file(folder / "runs.parquet") as table_file, output_file(folder / "study.json") as summary_file:
-        pyarrow.parquet.write_table(run_table(study, swept), table_file)
+        pyarrow.parquet.write_table(table, table_file)
         summary_file.write_text(json.dumps(written, indent=1), encoding="utf-8")
     return written

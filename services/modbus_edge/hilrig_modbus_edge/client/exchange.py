@@ -105,7 +105,7 @@ class Exchange:
         """The state that was written last."""
         self._echo: int | None = None
         """The echo that was read last; None: none was."""
-        self._echo_changed_ns = 0
+        self._echo_changed_ns = self._stale_read_sent_ns = 0
         self._read_time = ResponseTime()
         self._magnet = False
         self._peer = ""
@@ -288,10 +288,11 @@ class Exchange:
         echo = self._echo_in(data)
         if echo is not None:
             if echo == self._echo:
+                self._stale_read_sent_ns = read_sent_ns
                 self._check_program(now_ns)
                 return
             self._echo, self._echo_changed_ns = echo, now_ns
-            found = self._written.basis_of_echo(echo, read_sent_ns)
+            found = self._written.basis_of_echo(echo, read_sent_ns, self._stale_read_sent_ns)
             if found is None:
                 text = f"its echo register contains {echo}, no step number that was written: the program must copy it"
                 raise ControllerError(FaultKind.WRONG_ECHO, text, closes=False)
@@ -309,8 +310,10 @@ class Exchange:
 
     def _check_program(self, now_ns: int) -> None:
         """Report a program that has not copied a step number for the timeout of the watchdog."""
-        if self._echo_changed_ns == 0:
+        if self._echo_changed_ns == 0 or self._echo == self._written.newest_echo:
+            # Without a new state, the program has nothing to copy.
             self._echo_changed_ns = now_ns
+            self._client.fault = ""
         limit_ns = self._device.watchdog.timeout_ns or FAULT_EVENT_PERIOD_NS
         if now_ns - self._echo_changed_ns >= limit_ns:
             self._report(ControllerError(FaultKind.NOT_RUNNING, NOT_RUNNING, closes=False))

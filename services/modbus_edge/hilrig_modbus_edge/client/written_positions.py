@@ -32,6 +32,11 @@ class WrittenPositions:
         """Whether a write was acknowledged."""
         return self._newest.acknowledged_ns != 0
 
+    @property
+    def newest_echo(self) -> int:
+        """Step number of the newest acknowledged write, as a program copies it."""
+        return self._newest.served[0][1] & STEP_MASK
+
     def add(self, served: ServedState) -> None:
         """Add a write that is about to be sent; `served` has the state and the time of sending."""
         step = served[0][1] & STEP_MASK
@@ -44,15 +49,24 @@ class WrittenPositions:
         """Record that this write was acknowledged; ns, monotonic clock."""
         self._newest = self._by_step[served[0][1] & STEP_MASK] = _Write(served, now_ns)
 
-    def basis_of_echo(self, echo: int, read_sent_ns: int) -> tuple[ServedState, PollTimes] | None:
-        """Return the basis of torques beside an echo, read with a request sent at a time; None: unknown step number."""
+    def basis_of_echo(
+        self, echo: int, read_sent_ns: int, stale_read_sent_ns: int
+    ) -> tuple[ServedState, PollTimes] | None:
+        """Return the basis of torques beside an echo; None: its step number was not written.
+
+        Args:
+            echo: the echo.
+            read_sent_ns: time at which the request was sent that read it, ns, monotonic clock.
+            stale_read_sent_ns: the same of the newest request that still read the echo before.
+        """
         write = self._by_step.get(echo)
         if write is None:
             return None
         # A write that was not acknowledged was received before the read was sent at the latest.
         acknowledged_ns = write.acknowledged_ns or read_sent_ns
-        return write.served, PollTimes(acknowledged_ns, read_sent_ns, False)
+        stale_ns = stale_read_sent_ns if stale_read_sent_ns > write.served[1] else 0
+        return write.served, PollTimes(acknowledged_ns, read_sent_ns, stale_ns, False)
 
     def newest_basis(self, read_sent_ns: int) -> tuple[ServedState, PollTimes]:
         """Return the newest state that torques can answer that were read with a request sent at a time."""
-        return self._newest.served, PollTimes(self._newest.acknowledged_ns, read_sent_ns, True)
+        return self._newest.served, PollTimes(self._newest.acknowledged_ns, read_sent_ns, 0, True)

@@ -19,13 +19,11 @@ class PollTimes(NamedTuple):
     """Time at which the controller acknowledged the write of the positions of the basis, ns, monotonic clock."""
     read_sent_ns: int
     """Time at which the request was sent that read the torques, ns, monotonic clock."""
+    stale_read_sent_ns: int
+    """Time at which the newest request was sent that still read the echo before this one, ns, monotonic clock; 0: none
+    since the positions of the basis were sent."""
     basis_is_bound: bool
     """Whether the basis is only the newest state that the torques can answer."""
-
-
-def address_of(host: str, port: int) -> str:
-    """Return "host:port"; an IPv6 host is put in brackets."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 @dataclass(slots=True, eq=False)

@@ -30,6 +30,7 @@ _FIELDS_OF_A_WRITE: Final = (
     "write_received_ns",
     "positions_acknowledged_ns",
     "read_sent_ns",
+    "stale_read_sent_ns",
     "basis_is_bound",
 )
 
@@ -44,6 +45,8 @@ class CommandPublisher:
         """The four torque registers, big-endian; published by `publish_write` or `publish_internal`."""
         self.echo = 0
         """Value of the echo register, 16 bit; the next published write carries it."""
+        self.is_reset_requested = False
+        """Whether the reset register is not 0: the next reset by it needs a 0 in between."""
         self.delayed: DelayedCommands | None = None
         """The impaired command link; None: commands are sent at once."""
         self._clock = clock
@@ -120,7 +123,12 @@ class CommandPublisher:
             if on_other != self._basis_on_other:
                 command.basis_on_other_connection = self._basis_on_other = on_other
         if client.polled is not None:
-            command.positions_acknowledged_ns, command.read_sent_ns, command.basis_is_bound = client.polled
+            (
+                command.positions_acknowledged_ns,
+                command.read_sent_ns,
+                command.stale_read_sent_ns,
+                command.basis_is_bound,
+            ) = client.polled
         command.write_arrived_ns = arrived_ns
         command.write_received_ns = received_ns
         self._set_effort_and_session()

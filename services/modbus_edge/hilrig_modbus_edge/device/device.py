@@ -16,7 +16,6 @@ from hilrig_modbus_edge.device.client import (
     ConnectedController,
     PollTimes,
     ServedState,
-    address_of,
     controller_of,
 )
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
@@ -39,13 +38,19 @@ from hilrig_modbus_edge.registers.map import (
     EXTENDED_END,
     INPUT_END,
     MAGNET_COIL,
+    MIRROR_ADDRESS,
+    MIRROR_END,
     PAPER_END,
     POSITION_ADDRESS,
     RESET_COIL,
+    SWITCH_ADDRESS,
+    SWITCH_END,
+    TORQUE_ADDRESS,
     WATCHDOG_ADDRESS,
     Status,
     struct_of,
 )
+from hilrig_runtime.addresses import format_address
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.process.outage import OutageDetector
 from hilrig_runtime.timing.clock import Clock
@@ -54,7 +59,22 @@ from hilrig_schemas import Event, LeaseStatus
 
 # Looking up an enumeration member is a function call: the one that each request needs is looked up once.
 _INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER
-_EXTENDED: Final = struct_of(RegisterTable.HOLDING_REGISTER, ECHO_ADDRESS)
+_HOLDING_REGISTER: Final = RegisterTable.HOLDING_REGISTER
+_EXTENDED: Final = struct_of(_HOLDING_REGISTER, ECHO_ADDRESS, EXTENDED_END)
+_SWITCHES: Final = struct_of(_HOLDING_REGISTER, SWITCH_ADDRESS, SWITCH_END)
+_BLOCKS: Final = {
+    _INPUT_REGISTER: ((0, INPUT_END),),
+    _HOLDING_REGISTER: (
+        (TORQUE_ADDRESS, PAPER_END),
+        (ECHO_ADDRESS, EXTENDED_END),
+        (MIRROR_ADDRESS, MIRROR_END),
+        (SWITCH_ADDRESS, SWITCH_END),
+    ),
+    RegisterTable.COIL: ((MAGNET_COIL, MAGNET_COIL + 1), (RESET_COIL, RESET_COIL + 1)),
+    RegisterTable.DISCRETE_INPUT: ((0, DISCRETE_END),),
+}
+"""By table: first address of each block without a gap, and the address after it."""
+_ADDRESSES: Final = 0x10000
 MAX_REMEMBERED_CONTROLLERS: Final = 64
 """Number of controllers above which those without a connection are removed."""
 
@@ -76,6 +96,7 @@ class Device:
         self.clients: set[Client] = set()
         self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
+        self._reads_gaps = settings.unmapped_reads == "zeros"
         self._monotonic_ns = clock.monotonic_ns
         self._wall_ns = clock.wall_ns
         self._state_outages = OutageDetector(STATE_TIMEOUT_NS)
@@ -112,7 +133,7 @@ class Device:
     def connect(self, host: str, port: int, *, may_write: bool = True, certificate: str = "") -> Client:
         """Add a connection and return its client; `certificate`: the name in its certificate."""
         now_ns = self._monotonic_ns()
-        client = Client(host, address_of(host, port), certificate, may_write, last_request_ns=now_ns)
+        client = Client(host, format_address(host, port), certificate, may_write, last_request_ns=now_ns)
         name = controller_of(client, self._lease_setting)
         client.controller = self._controllers.setdefault(name, ConnectedController(name))
         client.controller.clients.add(client)
@@ -170,20 +191,23 @@ class Device:
         """
         end = address + count
         if table is _INPUT_REGISTER:
-            if end > INPUT_END:
-                raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-            return self._input_image(client)[2 * address : 2 * end]
-        if end <= POSITION_ADDRESS:
+            if end <= INPUT_END:
+                return self._input_image(client)[2 * address : 2 * end]
+        elif end <= POSITION_ADDRESS:
             return bytes(self._commands.torque[2 * address : 2 * end])
-        if end <= PAPER_END:
+        elif end <= PAPER_END:
             positions = self._serve_state(client).position_words
             if address >= POSITION_ADDRESS:
                 return positions[2 * (address - POSITION_ADDRESS) : 2 * (end - POSITION_ADDRESS)]
             return bytes(self._commands.torque[2 * address :]) + positions[: 2 * (end - POSITION_ADDRESS)]
-        if address >= ECHO_ADDRESS and end <= EXTENDED_END:
-            image = _EXTENDED.pack(self._commands.echo, self.watchdog.timeout_ns // MS)
-            return image[2 * (address - ECHO_ADDRESS) : 2 * (end - ECHO_ADDRESS)]
-        raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
+        self._check_exists(table, address, end)
+        words = bytearray(2 * count)
+        for begin, stop in _BLOCKS[table]:
+            first, last = max(address, begin), min(end, stop)
+            if first < last:
+                block = self._read_block(client, table, begin)
+                words[2 * (first - address) : 2 * (last - address)] = block[2 * (first - begin) : 2 * (last - begin)]
+        return bytes(words)
 
     def read_bits(self, client: Client, table: RegisterTable, address: int, count: int) -> int:
         """Return bits as a number, the first one least significant.
@@ -191,16 +215,13 @@ class Device:
         Raises:
             ModbusError: 02 a bit does not exist.
         """
+        end = address + count
+        self._check_exists(table, address, end)
         if table is RegisterTable.DISCRETE_INPUT:
-            if address + count > DISCRETE_END:
-                raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
             self._states.refresh()
             return (self._status(client) >> address) & ((1 << count) - 1)
-        if count == 1 and address == MAGNET_COIL:
-            return int(self._commands.magnet)
-        if count == 1 and address == RESET_COIL:
-            return 0
-        raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
+        # The reset coil reads 0.
+        return int(self._commands.magnet) << (MAGNET_COIL - address) if address <= MAGNET_COIL < end else 0
 
     def check_readable(self, address: int, count: int) -> None:
         """Check that holding registers can be read now.
@@ -209,10 +230,30 @@ class Device:
             ModbusError: 02 a register does not exist, 04 no state was received yet.
         """
         end = address + count
-        if end > PAPER_END and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
-            raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
-        if POSITION_ADDRESS < end <= PAPER_END and not self.has_state:
+        self._check_exists(_HOLDING_REGISTER, address, end)
+        has_position = address < PAPER_END and end > POSITION_ADDRESS
+        if (has_position or (address < MIRROR_END and end > MIRROR_ADDRESS)) and not self.has_state:
             raise ModbusError(ExcCodes.DEVICE_FAILURE)
+
+    def _check_exists(self, table: RegisterTable, address: int, end: int) -> None:
+        """Check that a block can be read: every address of it exists, or one does and others may be missing.
+
+        Raises:
+            ModbusError: 02 it can't.
+        """
+        existing = sum(max(0, min(end, stop) - max(address, begin)) for begin, stop in _BLOCKS[table])
+        if existing < end - address and not (self._reads_gaps and existing and end <= _ADDRESSES):
+            raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
+
+    def _read_block(self, client: Client, table: RegisterTable, begin: int) -> bytes:
+        """Return the registers of the block of `_BLOCKS` that begins at this address."""
+        if table is _INPUT_REGISTER or begin == MIRROR_ADDRESS:
+            return self._input_image(client)
+        if begin == ECHO_ADDRESS:
+            return _EXTENDED.pack(self._commands.echo, self.watchdog.timeout_ns // MS)
+        if begin == SWITCH_ADDRESS:
+            return _SWITCHES.pack(self._commands.magnet, self._commands.is_reset_requested)
+        return bytes(self._commands.torque) + self._serve_state(client).position_words
 
     # -- writes
 
@@ -223,7 +264,11 @@ class Device:
             ModbusError: 02 a register does not exist or is read-only.
         """
         end = address + count
-        if end > POSITION_ADDRESS and not (address >= ECHO_ADDRESS and end <= EXTENDED_END):
+        if (
+            end > POSITION_ADDRESS
+            and not (address >= ECHO_ADDRESS and end <= EXTENDED_END)
+            and not (address >= SWITCH_ADDRESS and end <= SWITCH_END)
+        ):
             raise ModbusError(ExcCodes.ILLEGAL_ADDRESS)
 
     def write_registers(
@@ -250,6 +295,9 @@ class Device:
             self._publish_write(client, arrived_ns, received_ns)
             return
         self.check_writable(address, len(words) // 2)
+        if address >= SWITCH_ADDRESS:
+            self._write_switches(client, address, words, arrived_ns, received_ns)
+            return
         sets_timeout = address <= WATCHDOG_ADDRESS < end
         if sets_timeout:
             at = 2 * (WATCHDOG_ADDRESS - address)
@@ -283,6 +331,19 @@ class Device:
             self._commands.magnet = on
         else:
             self._commands.reset()
+        self._publish_write(client, arrived_ns, received_ns)
+
+    def _write_switches(self, client: Client, address: int, words: bytes, arrived_ns: int, received_ns: int) -> None:
+        """Write the magnet register, the reset register, or both; arguments as `write_registers`."""
+        item, on = MAGNET + address - SWITCH_ADDRESS, [any(words[at : at + 2]) for at in range(0, len(words), 2)]
+        self._write_access.authorize_write(client, item, item + len(on), arrived_ns)
+        is_reset = item + len(on) > RESET and on[-1] and not self._commands.is_reset_requested
+        if item + len(on) > RESET:
+            self._commands.is_reset_requested = on[-1]
+        if is_reset:
+            self._commands.reset()
+        if item == MAGNET:
+            self._commands.magnet = on[0]
         self._publish_write(client, arrived_ns, received_ns)
 
     def command(

@@ -1,6 +1,8 @@
 """Events of a rig: each has the session and the simulation step; those that may occur in bursts are rate-limited."""
 
-from typing import Final
+from typing import Final, NamedTuple
+
+from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.output import DeviceOutput
@@ -8,7 +10,7 @@ from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_runtime.process.outage import Outage, describe_outage
-from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+from hilrig_runtime.timing.rate_limiter import RateLimiter, RepeatReporter, repeat_suffix
 from hilrig_schemas import Event
 
 LEASE_EVENT_PERIOD_NS: Final = 1_000 * MS
@@ -68,19 +70,33 @@ class EventEmitter:
         self.emit(event)
 
 
+class Refusal(NamedTuple):
+    """A write that is refused."""
+
+    cause: str
+    """Name of the cause: the reasons of one cause differ in times and addresses only."""
+    reason: str
+    """Human-readable."""
+    code: ExcCodes
+    holder: str = ""
+    """Address of the connection for which it is refused; empty: none."""
+
+
 class LeaseEventReporter:
     """Reports acquired, released and denied leases as events, rate-limited per host.
 
     A client may open a new connection for every request, dozens of times a second. Per host, the first acquisition of
     a second is reported and the others are counted. A holder that keeps the lease for a second is always reported.
-    Time is passed in.
+    Denied writes are counted per host, cause and session. Time is passed in.
     """
 
     def __init__(self, rig: str, events: EventEmitter) -> None:
         self._rig = rig
         self._events = events
         self._acquisitions: RateLimiter[str] = RateLimiter(LEASE_EVENT_PERIOD_NS)
-        self._denials: RateLimiter[tuple[str, bool]] = RateLimiter(LEASE_EVENT_PERIOD_NS)
+        self._denials: RepeatReporter[tuple[str, str], tuple[Client, Refusal]] = RepeatReporter(
+            LEASE_EVENT_PERIOD_NS, self._emit_denied
+        )
         self._pending_acquire: tuple[Client, int] | None = None
         """Connection of the lease holder and time of the acquisition (ns), if it was suppressed."""
 
@@ -104,26 +120,36 @@ class LeaseEventReporter:
             Event.LEASE_LOST, Event.INFO, text, client.address, certificate=client.certificate, reason=reason
         )
 
-    def lease_denied(self, client: Client, reason: str, holder: str, now_ns: int) -> None:
-        """Report a denied write; `holder`: address of the lease holder, empty: none; ns, monotonic clock."""
-        count = self._denials.record((client.host, bool(holder)), now_ns)
-        if count:
-            text = f"{client.label}: write to {self._rig} denied: {reason}{repeat_suffix(count)}"
-            self._events.emit_for_controller(
-                Event.LEASE_REFUSED,
-                Event.WARNING,
-                text,
-                client.address,
-                certificate=client.certificate,
-                reason=reason,
-                holder=holder,
-            )
+    def lease_denied(self, client: Client, refusal: Refusal, now_ns: int) -> None:
+        """Report a denied write; ns, monotonic clock."""
+        self._denials.record((client.host, refusal.cause), (client, refusal), now_ns)
+
+    def flush_denials(self) -> None:
+        """Report the denied writes that were not reported, because a session starts or ends."""
+        self._denials.flush()
 
     def check(self, now_ns: int) -> None:
-        """Report a suppressed acquisition after its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`."""
+        """Do everything that is due: report denied writes that were suppressed, and a suppressed acquisition.
+
+        Its holder has kept the lease for `LEASE_EVENT_PERIOD_NS`.
+        """
+        self._denials.check(now_ns)
         if self._pending_acquire is not None and now_ns - self._pending_acquire[1] >= LEASE_EVENT_PERIOD_NS:
             client, self._pending_acquire = self._pending_acquire[0], None
             self._emit_acquired(client)
+
+    def _emit_denied(self, denied: tuple[Client, Refusal], count: int) -> None:
+        client, refusal = denied
+        text = f"{client.label}: write to {self._rig} denied: {refusal.reason}{repeat_suffix(count)}"
+        self._events.emit_for_controller(
+            Event.LEASE_REFUSED,
+            Event.WARNING,
+            text,
+            client.address,
+            certificate=client.certificate,
+            reason=refusal.reason,
+            holder=refusal.holder,
+        )
 
     def _emit_acquired(self, client: Client, count: int = 1) -> None:
         text = f"{client.label} acquired the lease of {self._rig}{repeat_suffix(count)}"

@@ -19,6 +19,7 @@ class DeviceSettings:
     watchdog_max_ns: int
     lease_ns: int
     lease: Literal["controller", "connection"]
+    unmapped_reads: Literal["refuse", "zeros"]
     grace_ns: int
     repeat_ns: int
     impairment: ImpairmentConfig
@@ -41,6 +42,7 @@ class DeviceSettings:
             watchdog_max_ns=round(edge.watchdog_max_ms * MS),
             lease_ns=round(edge.lease_timeout_ms * MS),
             lease=edge.lease,
+            unmapped_reads=edge.unmapped_reads,
             grace_ns=round(edge.session_grace_ms * MS),
             repeat_ns=round(edge.repeat_ms * MS),
             impairment=impairment,

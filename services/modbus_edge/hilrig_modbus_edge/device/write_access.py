@@ -2,26 +2,26 @@
 
 The first controller that writes acquires the lease, for all its connections. Its writes are accepted, and feed the
 watchdog unless the emulated network drops them. The lease expires a timeout after the last request of any kind of its
-writing connections. A session starts with a lease and ends a grace time after it. Time is passed in or read from the
-given clock.
+writing connections, or, after the watchdog has tripped, with the write of another controller. A session starts with a
+lease and ends a grace time after it. Time is passed in or read from the given clock.
 """
 
 import random
 from collections.abc import Set as AbstractSet
-from typing import Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client, ConnectedController
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, StallReporter
+from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, Refusal, StallReporter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
 from hilrig_modbus_edge.device.output import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
-from hilrig_modbus_edge.device.writers import EXTENDED, MAGNET, Writers
+from hilrig_modbus_edge.device.writers import EXTENDED, ITEMS, MAGNET, Writers
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_runtime.process.session_id import session_id
 from hilrig_runtime.timing.clock import Clock
@@ -30,16 +30,6 @@ from hilrig_schemas import Event, LeaseStatus
 CONTROLLER_CHANGE_PERIOD_NS: Final = 1_000 * MS
 """Shortest time between two changes of the controller that writes, ns: two controllers that write alternately would
 otherwise create a recording per write."""
-
-
-class Refusal(NamedTuple):
-    """A write that is refused."""
-
-    reason: str
-    """Human-readable."""
-    code: ExcCodes
-    holder: str = ""
-    """Address of the connection for which it is refused; empty: none."""
 
 
 class Holder(Protocol):
@@ -136,8 +126,10 @@ class WriteAccess:
             return
         refusal = self.authorize(client, begin, end, now_ns)
         if refusal is not None:
-            self._lease_events.lease_denied(client, refusal.reason, refusal.holder, now_ns)
+            self._lease_events.lease_denied(client, refusal, now_ns)
             raise ModbusError(refusal.code)
+        if self.lease.holder not in (None, client.controller):
+            self._release_lease(f"the watchdog has tripped, and {client.label} writes")
         if self.lease.holder is None:
             self._acquire_lease(client, now_ns)
         self._writers.record(client, begin, end, now_ns)
@@ -147,11 +139,8 @@ class WriteAccess:
     def permit(self, names: AbstractSet[str] | None) -> None:
         """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
         self._permitted = names
-        for client in self._clients:
-            if not self.may_write(client):
-                self._writers.remove(client)
         holder = self.lease.holder
-        if holder is not None and not any(client.writes and self.may_write(client) for client in holder.clients):
+        if holder is not None and not any(self.may_write(client) for client in holder.clients):
             self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
 
     def may_write(self, client: Client) -> bool:
@@ -170,33 +159,41 @@ class WriteAccess:
         """
         if not client.may_write:
             return Refusal(
+                "read-only",
                 "read-only: the client certificate lacks the role operator; use a certificate with that role",
                 ExcCodes.ILLEGAL_FUNCTION,
             )
         reserved_for = self._reserved_for
         if reserved_for not in (None, client):
             return Refusal(
+                "reserved",
                 f"the edge is a client of {reserved_for.address}, which alone commands {self._rig}; to write to the "
                 "rig, remove its controller from lab.toml",
                 ExcCodes.DEVICE_BUSY,
                 reserved_for.address,
             )
         if not self.may_write(client):
-            return Refusal(self._not_listed(client), ExcCodes.ILLEGAL_FUNCTION)
+            return Refusal("not listed", self._not_listed(client), ExcCodes.ILLEGAL_FUNCTION)
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
-            return Refusal(f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
-        if self.lease.holder not in (None, client.controller):
+            return Refusal("revoked", f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
+        since_ns = now_ns - (self.watchdog.timeout_ns or self.lease.timeout_ns)
+        if self.lease.holder not in (None, client.controller) and not (
+            # On an impaired link the watchdog trips although the holder writes.
+            self.watchdog.tripped and self._writers.other(client, 0, ITEMS, since_ns) is None
+        ):
             return Refusal(
+                "lease",
                 f"{self._last_writer_label} holds the lease; stop that client, or run: "
                 f"hilrig lease {self._rig} --release",
                 ExcCodes.DEVICE_BUSY,
                 self._holder,
             )
-        other = self._writers.other(client, begin, end, now_ns - (self.watchdog.timeout_ns or self.lease.timeout_ns))
+        other = self._writers.other(client, begin, end, since_ns)
         if other is not None:
             written = "torques" if begin < MAGNET else "the same coil" if begin < EXTENDED else "the same register"
             return Refusal(
+                "two programs",
                 f"two programs on {client.controller.name} write {written}, the other one is {other.address}: stop one",
                 ExcCodes.DEVICE_BUSY,
                 other.address,
@@ -204,6 +201,7 @@ class WriteAccess:
         session = self._session.current
         if session is not None and session.controller is not client.controller and now_ns < self._controller_change_ns:
             return Refusal(
+                "new lease",
                 f"{session.controller.name} acquired the lease less than 1 s ago; write again in 1 s",
                 ExcCodes.DEVICE_BUSY,
             )
@@ -336,6 +334,7 @@ class WriteAccess:
         if controller is None:
             return
         self._writers.clear()
+        self._commands.is_reset_requested = False
         for client in controller.clients:
             client.writes = False
         if self._session.current is not None:
@@ -350,6 +349,7 @@ class WriteAccess:
         if self._session.current is not None:
             self._session.current.released_ns = None
             return
+        self._lease_events.flush_denials()
         self._session_count += 1
         wall_ns = self._wall_ns()
         identity = session_id(self._rig, wall_ns, self._rng)
@@ -386,6 +386,7 @@ class WriteAccess:
         for client in self._clients:
             client.clear_served()
         self.stalls.flush()
+        self._lease_events.flush_denials()
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.address
         event.session_data.certificate = session.certificate
@@ -403,7 +404,7 @@ class WriteAccess:
         missing, rearming = "write", "write"
         if self._reserved_for is not None:
             missing, rearming = "torque of its program", "one"
-            cause = self._reserved_for.fault or f"{self._reserved_for.address} was not read"
+            cause = self._reserved_for.fault or f"no new state was written to {self._reserved_for.address}"
         elif holder is None:
             cause = f"{writer} no longer holds the lease"
         elif (quiet_ns := now_ns - holder.last_request_ns) >= self.watchdog.timeout_ns // 2:

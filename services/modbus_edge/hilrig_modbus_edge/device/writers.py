@@ -1,8 +1,8 @@
 """Writing connections of a rig: each torque register and coil has one at a time, among those of one controller.
 
 The connections of a controller may write different things, for example one the torques and another the magnet. Two
-that write the same are two programs that disturb each other. Items are the writable rows of the register map, in its
-order. Time is passed in.
+that write the same are two programs that disturb each other. Items are the writable values of the register map, in its
+order; a mirror is the same item. Time is passed in.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,9 @@ from typing import Final
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.registers.map import MAP
 
-_ITEMS: Final = [register.name for register in MAP if register.writable]
-_COUNT: Final = len(_ITEMS)
+_ITEMS: Final = [register.name for register in MAP if register.writable and not register.mirrors]
+ITEMS: Final = len(_ITEMS)
+"""Number of items."""
 TORQUES: Final = _ITEMS.index("tau1")
 """Number of the first of the four torque registers."""
 EXTENDED: Final = _ITEMS.index("echo")
@@ -36,7 +37,7 @@ class Writers:
     """The connection that wrote each item last; items are numbered, and written in ranges."""
 
     def __init__(self) -> None:
-        self._writes: list[_Write | None] = [None] * _COUNT
+        self._writes: list[_Write | None] = [None] * ITEMS
 
     def rewrite(self, client: Client, begin: int, end: int, now_ns: int) -> bool:
         """Record a write of items that `client` last wrote with one write too; return False if it did not."""
@@ -66,4 +67,4 @@ class Writers:
 
     def clear(self) -> None:
         """Remove all connections, because the lease was released."""
-        self._writes = [None] * _COUNT
+        self._writes = [None] * ITEMS

@@ -26,7 +26,9 @@ with a scale contains the value times the scale: -12.34° at scale 100 is -1234.
 Holding registers 1-8 and coil 1 are the map of the paper; a controller needs nothing else. A block read returns one
 step of the simulation: no value is torn, and no two values are from different steps. A block write is executed as a
 whole or not at all. A read or write of an address that is not in these tables gets exception 02, and so does a write of
-a read-only register. A watchdog timeout outside the bounds of the lab gets exception 04. A read of a position gets
+a read-only register; with `unmapped_reads = "zeros"` in `[edge]`, the missing addresses of a block read 0. For
+controllers with functions 3, 6, 16 and 23 only, holding registers 201-236 repeat the input registers, 301 the magnet
+and 302 the reset. A watchdog timeout outside the bounds of the lab gets exception 04. A read of a position gets
 exception 04 until the simulation has published its first state.
 """
 

@@ -1,12 +1,14 @@
 """Register map as data: value, type, unit and access of each register.
 
 Holding registers 1-8 and coil 1 are exactly the paper's map (Table II). The extended map uses input registers, discrete
-inputs, and coils and holding registers from number 101 on. Number n is PDU address n - 1. Addresses, binary layouts,
-scales, `docs/registers.md` and the CSV for PLC tools derive from `MAP`, the only place of the layout.
+inputs, and coils and holding registers from number 101 on. For clients without functions for input registers and coils,
+holding registers from 201 on mirror the input registers, and those from 301 on the coils. Number n is PDU address
+n - 1. Addresses, binary layouts, scales, `docs/registers.md` and the CSV for PLC tools derive from `MAP`, the only
+place of the layout.
 """
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, unique
 from typing import Final
 
@@ -51,6 +53,8 @@ class Register:
     """Factor from the value to the register."""
     writable: bool = False
     """Whether a client may write it; the rig writes all others."""
+    mirrors: str = ""
+    """Name of the value in another table that this one repeats; empty: none."""
 
     @property
     def address(self) -> int:
@@ -97,9 +101,11 @@ class Status(IntEnum):
 _STATUS_BITS: Final = 16
 _STATUS_TEXTS: Final = {flag.bit_length(): flag.text for flag in Status}
 _COIL, _DISCRETE, _INPUT, _HOLDING = RegisterTable
+_MIRROR_OFFSET: Final = 200
+"""Difference between the number of a mirror and that of its input register."""
 _BIT, _INT16, _UINT16, _UINT32, _FLOAT32 = ValueType
 
-MAP: Final = (
+_VALUES: Final = (
     Register(_HOLDING, 1, _INT16, "tau1", "commanded effort of joint 1", "N·m", 1000, writable=True),
     Register(_HOLDING, 2, _INT16, "tau2", "commanded effort of joint 2", "N·m", 1000, writable=True),
     Register(_HOLDING, 3, _INT16, "tau3", "commanded effort of joint 3", "N", 1000, writable=True),
@@ -161,6 +167,40 @@ MAP: Final = (
     ),
 )
 
+MAP: Final = (
+    *_VALUES,
+    *(
+        replace(
+            row,
+            table=_HOLDING,
+            number=_MIRROR_OFFSET + row.number,
+            name=f"mirror_{row.name}",
+            text=f"as input register {row.number}: {row.text}",
+            mirrors=row.name,
+        )
+        for row in _VALUES
+        if row.table is _INPUT
+    ),
+    Register(
+        _HOLDING,
+        301,
+        _UINT16,
+        "magnet_register",
+        "as coil 1: 0 switches the magnet off, any other value on",
+        writable=True,
+        mirrors="magnet",
+    ),
+    Register(
+        _HOLDING,
+        302,
+        _UINT16,
+        "reset_register",
+        "as coil 101, when it changes from 0 to another value; a new lease begins with 0",
+        writable=True,
+        mirrors="reset",
+    ),
+)
+
 REGISTERS: Final = {register.name: register for register in MAP}
 """The map by name."""
 
@@ -190,7 +230,11 @@ POSITION_ADDRESS: Final = address_of("theta1")
 PAPER_END: Final = REGISTERS["theta4"].end
 ECHO_ADDRESS: Final = address_of("echo")
 WATCHDOG_ADDRESS: Final = address_of("watchdog_timeout_set")
-EXTENDED_END: Final = end_of(RegisterTable.HOLDING_REGISTER)
+EXTENDED_END: Final = REGISTERS["watchdog_timeout_set"].end
+MIRROR_ADDRESS: Final = address_of("mirror_map_version")
+MIRROR_END: Final = REGISTERS["mirror_applied_tau4"].end
+SWITCH_ADDRESS: Final = address_of("magnet_register")
+SWITCH_END: Final = REGISTERS["reset_register"].end
 MAGNET_COIL: Final = address_of("magnet")
 RESET_COIL: Final = address_of("reset")
 INPUT_END: Final = end_of(RegisterTable.INPUT_REGISTER)

@@ -13,18 +13,24 @@ import selectors
 import socket
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from contextvars import Context
 from selectors import EVENT_READ, EVENT_WRITE
 from time import monotonic, monotonic_ns, time_ns
 from typing import Any, Final, TypeVarTuple
 
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+
 HIGH_WATER: Final = 65_536
 LOW_WATER: Final = 16_384
 """Bytes in the send buffer: above the first limit the protocol is paused, below the second it is resumed."""
 ACCEPT_RETRY_S: Final = 1.0
 """Pause after a connection could not be accepted, s."""
+ACCEPT_LOG_PERIOD_NS: Final = 10_000_000_000
+"""Shortest time between two log messages about it, of all listening sockets, ns."""
+OnAccept = Callable[[socket.socket, Any], Awaitable[None]]
+"""Called with an accepted connection and the address of its peer."""
 
 _RECEIVE_BYTES: Final = 448
 """Maximum number of bytes of one call. Python allocates an object of up to 512 bytes 0.1 µs faster."""
@@ -136,6 +142,7 @@ class DirectEventLoop(asyncio.SelectorEventLoop):
 
     def __init__(self) -> None:
         self.direct = DirectSelector()
+        self.accept_failures: RateLimiter[None] = RateLimiter(ACCEPT_LOG_PERIOD_NS)
         super().__init__(self.direct)
 
     def call_soon(
@@ -342,9 +349,7 @@ def _has_receive_timestamps(connected: socket.socket) -> bool:
     return connected.getsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS) == 1
 
 
-async def accept_connections(
-    loop: DirectEventLoop, listening: socket.socket, on_accept: Callable[[SocketTransport], None]
-) -> None:
+async def accept_connections(loop: DirectEventLoop, listening: socket.socket, on_accept: OnAccept) -> None:
     """Pass each accepted connection to `on_accept`, until the task is canceled."""
     listening.setblocking(False)
     while True:
@@ -352,14 +357,21 @@ async def accept_connections(
             connected, peer = await loop.sock_accept(listening)
         except OSError as error:
             # Out of handles or memory: new connections wait in the backlog.
-            logger.warning(
-                "can't accept a connection on %s: %s; retrying in %g s",
-                listening.getsockname(),
-                error,
-                ACCEPT_RETRY_S,
-            )
+            count = loop.accept_failures.record(None, monotonic_ns())
+            if count:
+                logger.warning(
+                    "can't accept connections, among others on %s: %s%s; retrying every %g s",
+                    listening.getsockname(),
+                    error,
+                    repeat_suffix(count),
+                    ACCEPT_RETRY_S,
+                )
             await asyncio.sleep(ACCEPT_RETRY_S)
             continue
-        on_accept(SocketTransport(loop, connected, peer))
+        try:
+            await on_accept(connected, peer)
+        except OSError:
+            # The client has disconnected.
+            connected.close()
         # A flood of connections must not delay the requests of established ones.
         await asyncio.sleep(0)

@@ -1,34 +1,37 @@
 """Modbus TCP listener: one server per rig, which accepts connections, with or without TLS, and closes them."""
 
 import asyncio
-import errno
 import logging
 import socket
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
+
+from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.request_log import RequestLog
 from hilrig_modbus_edge.server.admission import Admission, Limits
-from hilrig_modbus_edge.server.connection import Connection
+from hilrig_modbus_edge.server.connection import WRITES, Connection
 from hilrig_modbus_edge.server.event_loop import (
     DirectEventLoop,
     SocketTransport,
     accept_connections,
     set_receive_timestamps,
 )
+from hilrig_modbus_edge.server.exception_log import LOG_PERIOD_NS, ExceptionLog
 from hilrig_modbus_edge.server.tcp_figures import tcp_figures
 from hilrig_modbus_edge.server.tls import ClientCertificate, TlsHandshake, TlsPolicy
+from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.errors import OperationError, listen_failure
+from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.clock import Clock
-from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
+from hilrig_runtime.timing.rate_limiter import RepeatReporter, repeat_suffix
 
 BACKLOG: Final = 128
 """Connections that the system queues until they are accepted."""
-MALFORMED_LOG_PERIOD_NS: Final = 1_000_000_000
-"""Shortest time between two log messages about malformed data of one host, ns."""
+ALERT_NS: Final = LOG_PERIOD_NS + 2_000_000_000
+"""Time for which a log message is also an alert of the rig, ns: until the next one if its cause persists."""
 
 NO_CERTIFICATE: Final = ClientCertificate("", may_write=True, expiry_ns=0)
 """Of a connection without TLS."""
@@ -46,10 +49,12 @@ class RigServer:
         self.request_log = RequestLog(device.rig)
         self.connections: set[Connection] = set()
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
-        self._admission = Admission(device, limits, clock.monotonic_ns, counters)
-        self._rate_limiter: RateLimiter[str] = RateLimiter(MALFORMED_LOG_PERIOD_NS)
+        self._admission = Admission(device, limits, clock.monotonic_ns, counters, self._make_room)
+        self._malformed: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
+        self.exceptions = ExceptionLog(self._warn)
+        self._alert = ("", 0)
+        """The last log message, and its time, ns."""
         self._acceptors: list[asyncio.Task[None]] = []
-        self._tls_servers: list[asyncio.Server] = []
 
     async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
         """Accept connections from a listening socket, with TLS if a policy is given; runs on a `DirectEventLoop`.
@@ -58,19 +63,21 @@ class RigServer:
         """
         loop = asyncio.get_running_loop()
         assert isinstance(loop, DirectEventLoop)
-        if policy is None:
-            self._acceptors.append(loop.create_task(accept_connections(loop, listening, self._on_accept)))
-        else:
-            # TLS runs on asyncio's own transports.
-            server = await loop.create_server(
-                lambda: TlsHandshake(self._admission, policy, self.attach), sock=listening, backlog=BACKLOG
-            )
-            self._tls_servers.append(server)
 
-    def _on_accept(self, transport: SocketTransport) -> None:
-        peer = self._admission.admit(transport)
-        if peer is not None:
-            self.attach(transport, *peer)
+        async def accept(connected: socket.socket, peer: Any) -> None:
+            transport = SocketTransport(loop, connected, peer)
+            admitted = self._admission.admit(transport)
+            if admitted is not None:
+                self.attach(transport, *admitted)
+
+        async def accept_tls(connected: socket.socket, peer: Any) -> None:
+            del peer
+            # TLS runs on asyncio's own transports.
+            assert policy is not None
+            await loop.connect_accepted_socket(lambda: TlsHandshake(self._admission, policy, self.attach), connected)
+
+        on_accept = accept if policy is None else accept_tls
+        self._acceptors.append(loop.create_task(accept_connections(loop, listening, on_accept)))
 
     def attach(
         self,
@@ -90,19 +97,26 @@ class RigServer:
         if early:
             connection.data_received(early)
 
-    def report_malformed(self, client: Client, defect: str) -> None:
-        """Count a connection that is closed because of malformed data, and log it, rate-limited."""
+    def report_malformed(self, client: Client, protocol: str, text: str) -> None:
+        """See `ConnectionOwner.report_malformed`; the log is rate-limited."""
         self.counters.malformed += 1
-        count = self._rate_limiter.record(client.host, self.monotonic_ns())
-        if count:
-            logger.warning(
-                "rig %s: closed the connection of %s, which did not send Modbus TCP: %s%s; check protocol and port of "
-                "the client",
-                self.device.rig,
-                client.address,
-                defect,
-                repeat_suffix(count),
-            )
+        self._malformed.record((client.host, protocol), f"{client.address} {text}", self.monotonic_ns())
+
+    def record_exception(self, client: Client, transaction: int, unit: int, request: bytes, code: int) -> None:
+        """See `ConnectionOwner.record_exception`."""
+        if code == ExcCodes.DEVICE_BUSY or (code == ExcCodes.ILLEGAL_FUNCTION and request[0] in WRITES):
+            self.counters.refused += 1
+        self.exceptions.record(client, transaction, unit, request, code, self.monotonic_ns())
+
+    def alert(self) -> str:
+        """Return the last log message about a client if it is recent, else an empty text."""
+        text, reported_ns = self._alert
+        return text if self.monotonic_ns() - reported_ns < ALERT_NS else ""
+
+    def _warn(self, text: str, count: int) -> None:
+        text = f"{text}{repeat_suffix(count)}"
+        self._alert = (text, self.monotonic_ns())
+        logger.warning("rig %s: %s", self.device.rig, text)
 
     def log_tcp_figures(self) -> None:
         """Add the TCP figures of each connection to the request log."""
@@ -111,13 +125,37 @@ class RigServer:
             if figures is not None:
                 self.request_log.record_connection(connection.client.address, *figures)
 
-    def close_idle(self, now_ns: int) -> None:
-        """Close the connections without a request for the idle timeout; ns, monotonic clock."""
-        if not self._idle_ns:
-            return
+    def check(self, now_ns: int) -> None:
+        """Do everything that is due, twice a second: reports, connections without a request; ns, monotonic clock."""
+        self._malformed.check(now_ns)
+        self.exceptions.check(now_ns)
+        self._admission.check(now_ns)
         for connection in list(self.connections):
-            if now_ns - connection.client.last_request_ns >= self._idle_ns:
-                connection.close(f"no request for {self._idle_ns / 1e9:g} s (edge.idle_timeout_s)")
+            connection.report_stall(now_ns)
+            if self._idle_ns and connection.is_silent and self._idle_since(connection, now_ns):
+                connection.close(f"no valid request within {self._idle_ns / 1e9:g} s (edge.idle_timeout_s)")
+
+    def _idle_since(self, connection: Connection, now_ns: int) -> int:
+        """Return for how long a connection has sent no request, if that is longer than the idle timeout, else 0; ns."""
+        idle_ns = now_ns - connection.client.last_request_ns
+        return idle_ns if idle_ns >= self._idle_ns else 0
+
+    def _make_room(self, host: str, close_now: bool) -> bool:
+        """Return whether a connection was idle for the idle timeout, and close the one that was for the longest time.
+
+        Args:
+            host: only connections of this host; empty: of all hosts.
+            close_now: close it; otherwise it is only considered.
+        """
+        now_ns = self.monotonic_ns()
+        candidates = [connection for connection in self.connections if host in ("", connection.client.host)]
+        longest = min(candidates, key=lambda connection: connection.client.last_request_ns, default=None)
+        if not self._idle_ns or longest is None or not self._idle_since(longest, now_ns):
+            return False
+        if close_now:
+            idle_s = self._idle_since(longest, now_ns) / 1e9
+            longest.make_room(f"no request for {idle_s:.0f} s, and its place is needed")
+        return True
 
     def close_certificate(self, name: str, reason: str) -> int:
         """Close the connections of the clients with this name in their certificate; return their number."""
@@ -136,15 +174,13 @@ class RigServer:
         """Stop listening and close every connection."""
         for acceptor in self._acceptors:
             acceptor.cancel()
-        for server in self._tls_servers:
-            server.close()
         for handshake in self._admission.pending_handshakes:
             handshake.close()
         for connection in list(self.connections):
             connection.close(reason)
 
 
-def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> socket.socket:
+def bind(rig: str, host: str, port: int, setting: str = "edge.first_port, or `port` of the rig") -> socket.socket:
     """Return a listening socket for the clients of a rig; `setting`: key of lab.toml that the port comes from.
 
     Raises:
@@ -152,18 +188,12 @@ def bind(rig: str, host: str, port: int, setting: str = "edge.first_port") -> so
     """
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        # All addresses of IPv6 include those of IPv4.
+        dual = address[0] == "::" and socket.has_dualstack_ipv6()
+        listening = socket.create_server(address[:2], family=family, backlog=BACKLOG, dualstack_ipv6=dual)
     except OSError as error:
-        reason = listen_failure(error)
-        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            hint = "edge.host in lab.toml must be an address of this host"
-        elif error.errno in (errno.EMFILE, errno.ENFILE):
-            hint = "allow more open files (ulimit -n, or LimitNOFILE of the service)"
-        else:
-            hint = (
-                f"stop the program that listens there, or choose another port in lab.toml ({setting}, or `port` of the "
-                "rig)"
-            )
-        raise OperationError(f"rig {rig!r} can't listen on {host}:{port}: {reason}; {hint}") from error
+        hint = listen_hint(error, port, "edge.host, or `host` of the rig,", setting)
+        where = format_address(host, port)
+        raise OperationError(f"rig {rig!r} can't listen on {where}: {listen_reason(error)}; {hint}") from error
     set_receive_timestamps(listening)
     return listening

@@ -29,6 +29,17 @@ MAX_WRITE_REGISTERS: Final = 123
 MAX_READ_WRITE_REGISTERS: Final = 121
 """Quantity limits of the specification; the last one is for the written registers of function 23."""
 
+MAX_QUANTITY: Final = {
+    FunctionCode.READ_COILS: MAX_READ_BITS,
+    FunctionCode.READ_DISCRETE_INPUTS: MAX_READ_BITS,
+    FunctionCode.READ_HOLDING_REGISTERS: MAX_READ_REGISTERS,
+    FunctionCode.READ_INPUT_REGISTERS: MAX_READ_REGISTERS,
+    FunctionCode.WRITE_MULTIPLE_COILS: MAX_WRITE_BITS,
+    FunctionCode.WRITE_MULTIPLE_REGISTERS: MAX_WRITE_REGISTERS,
+    FunctionCode.READ_WRITE_MULTIPLE_REGISTERS: MAX_READ_REGISTERS,
+}
+"""Limit of the quantity of each function that has one; of function 23, that of the registers that it reads."""
+
 # Looking up an enumeration member is a function call: those that each request needs are looked up once.
 _HOLDING_REGISTER: Final = RegisterTable.HOLDING_REGISTER
 _INPUT_REGISTER: Final = RegisterTable.INPUT_REGISTER

@@ -105,7 +105,7 @@ class TlsHandshake(asyncio.Protocol):
         """See `asyncio.BaseProtocol`."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        peer = self._admission.admit(transport)
+        peer = self._admission.admit(transport, before_handshake=True)
         if peer is not None:
             self.peer = peer
             self._admission.begin_handshake(self)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from hilrig_recorder.mcap_format.channels import EVENT_CHANNEL
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import decode_message_head
 
 SECOND_NS: Final = 1_000_000_000
@@ -43,10 +44,10 @@ class Recording:
     """Start of the session, wall clock of the owner, ns."""
     opened_ns: int
     """When the recording was opened, monotonic clock, ns."""
-    store: "RecordingStore" = field(repr=False)
-    """Has its file."""
     certificate: str = ""
     """Name in the controller's certificate; empty: it has none."""
+    file: "RecordingOutput | None" = field(default=None, repr=False)
+    """Its open file, set by the store; None: it has failed or is closed."""
     counters: LossCounters = field(default_factory=LossCounters)
     seen: set[tuple[int, int, int]] | None = None
     """(channel id, sequence, publish time) of messages in the previous segment; None: no duplicates are expected."""
@@ -75,8 +76,8 @@ class Recording:
         """Write those messages that belong to this file and arrived at `not_before_ns` (wall clock) or later."""
         if self.seen is not None or self.end_wall_ns is not None or not_before_ns:
             records = [record for record in records if self._accepts(record, not_before_ns)]
-        if records:
-            self.store.write(self, records)
+        if records and self.file is not None:
+            self.file.write(records)
 
     def _accepts(self, record: bytes, not_before_ns: int) -> bool:
         header = decode_message_head(record)
@@ -101,20 +102,24 @@ class Recording:
         return True
 
 
+class RecordingOutput(Protocol):
+    """The open file of a recording; implemented by `storage.segment_file.SegmentFile`."""
+
+    def write(self, records: Sequence[bytes]) -> None:
+        """Write encoded messages. It must not raise: write errors are handled."""
+
+
 class RecordingStore(Protocol):
     """Storage of recordings; implemented by `storage.store.FileStore`."""
 
     def open(self, recording: Recording) -> bool:
-        """Open the file of a recording; False: it must not or can't be recorded.
+        """Open the file of a recording and set `recording.file`; False: it must not or can't be recorded.
 
         It may set `recording.seen`, `recording.last` and `recording.horizon_ns`.
         """
 
-    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
-        """Write encoded messages to the file of a recording. It must not raise: the store handles write errors."""
-
-    def close(self, recording: Recording, end: str, reason: str) -> None:
-        """Finish the file of a recording; `end` is a machine-readable cause, `reason` a sentence."""
+    def close(self, recording: Recording, end: Ending, reason: str) -> None:
+        """Finish the file of a recording; `reason` is a sentence."""
 
     def record_loss(self, recording: Recording, source: str, key: str, transport: int, recorder: int) -> None:
         """Record a loss in the file: number of messages lost in transport and in the recorder."""

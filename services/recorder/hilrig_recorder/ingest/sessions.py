@@ -24,6 +24,7 @@ from hilrig_recorder.ingest.sources import (
     PublisherTracker,
 )
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
@@ -106,6 +107,10 @@ class SessionTracker:
     def recordings(self) -> list[Recording]:
         """The open recordings."""
         return list(self._recordings.values())
+
+    def last_received(self) -> dict[str, int]:
+        """Arrival of the last batch of each publisher, monotonic clock, ns."""
+        return self._publishers.last_received()
 
     def has_received(self, rig: str) -> bool:
         """Whether any message of a rig was received."""
@@ -326,7 +331,6 @@ class SessionTracker:
             owner,
             opened.start_wall_ns,
             now_ns,
-            self._store,
             certificate=opened.certificate,
         )
         if not self._store.open(recording):
@@ -375,7 +379,7 @@ class SessionTracker:
             if recording.end_wall_ns is None:
                 self._check_owner(recording, last_received.get(recording.owner, 0), now_ns)
             elif self._is_drained(recording, now_ns):
-                self._close(recording, "ended", recording.end_reason)
+                self._close(recording, Ending.ENDED, recording.end_reason)
         for session, until_ns in list(self._blocked_until.items()):
             if now_ns > until_ns:
                 del self._blocked_until[session]
@@ -387,6 +391,9 @@ class SessionTracker:
     def _check_outages(self, last_received: dict[str, int], now_ns: int, wall_ns: int) -> None:
         """Report the publishers of open recordings whose recording streams stopped or arrive again."""
         for name, last_ns in last_received.items():
+            if name.startswith("recorder/"):
+                # Only the services of the loop publish all the time.
+                continue
             outage = self._outages.setdefault(name, OutageDetector(STREAM_TIMEOUT_NS)).check(last_ns, now_ns)
             if outage is None:
                 continue
@@ -407,7 +414,7 @@ class SessionTracker:
             # The session is not blocked: when the owner announces it again, it continues in a new segment.
             self._rigs[recording.rig].flush_block(self._wall_ns)
             self.drop(recording)
-            self._store.close(recording, "keeper lost", reason)
+            self._store.close(recording, Ending.OWNER_LOST, reason)
 
     def _is_drained(self, recording: Recording, now_ns: int) -> bool:
         draining_ns = now_ns - recording.ended_ns
@@ -431,9 +438,9 @@ class SessionTracker:
         """Close every recording, because the recorder stops."""
         for recording in self.recordings:
             if recording.end_wall_ns is None:
-                self._close(recording, "recorder stopped", "the recorder was stopped during the session")
+                self._close(recording, Ending.RECORDER_STOPPED, "the recorder was stopped during the session")
             else:
-                self._close(recording, "ended", recording.end_reason)
+                self._close(recording, Ending.ENDED, recording.end_reason)
 
     def drop(self, recording: Recording) -> None:
         """Remove a recording without closing its file; its session may be opened again."""
@@ -442,7 +449,7 @@ class SessionTracker:
         if rig is not None and recording in rig.recordings:
             rig.recordings.remove(recording)
 
-    def _close(self, recording: Recording, end: str, reason: str) -> None:
+    def _close(self, recording: Recording, end: Ending, reason: str) -> None:
         self._rigs[recording.rig].flush_block(self._wall_ns)
         self.drop(recording)
         self._block(recording.session, recording.ended_ns + _ENDED_SESSION_MEMORY_NS)

@@ -10,7 +10,7 @@ PART_SUFFIX: Final = ".part"
 UNFINISHED_SUFFIX: Final = f"{MCAP_SUFFIX}{PART_SUFFIX}"
 """End of the name of a recording that is being written, or whose recorder was killed."""
 RECOVERING_SUFFIX: Final = ".recovering"
-"""Appended to the name of a file while it is being recovered."""
+"""Appended to the name of a file while it is written by `hilrig recover`, `join` or `export`."""
 MCAP_PATTERN: Final = f"*{MCAP_SUFFIX}"
 """Glob pattern of the finished recordings in a folder."""
 
@@ -21,7 +21,7 @@ NAME_PARTS: Final = {
     RECOVERED_SUFFIX: "written by `hilrig recover` beside the damaged file",
     MCAP_SUFFIX: "suffix of every recording",
     PART_SUFFIX: "the file is being written, or its recorder was killed",
-    RECOVERING_SUFFIX: "the file is being recovered",
+    RECOVERING_SUFFIX: "the file is being written by `hilrig recover`, `join` or `export`",
 }
 """Parts of a file name in their order, as in docs/recordings.md."""
 
@@ -52,7 +52,7 @@ def part_path(path: Path) -> Path:
 
 
 def recovering_path(path: Path) -> Path:
-    """The path of a recovered file while it is being written."""
+    """The path of a recovered, joined or exported file while it is being written."""
     return path.with_name(path.name + RECOVERING_SUFFIX)
 
 

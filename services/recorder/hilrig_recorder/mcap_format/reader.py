@@ -4,7 +4,9 @@ All code that reads records of a file uses this module. A `RecordReader` reads f
 """
 
 import zlib
+from array import array
 from collections.abc import Callable, Container, Iterator
+from itertools import pairwise
 from typing import IO, NamedTuple, overload
 
 import lz4.frame
@@ -182,6 +184,7 @@ class RecordReader:
         """
         found = 0
         stated = None
+        offsets, ends = array("Q"), array("Q")
         for offset, opcode, content, _ in self.summary_records(summary):
             if opcode == Opcode.CHUNK_INDEX:
                 found += 1
@@ -192,6 +195,8 @@ class RecordReader:
                         f"and {summary.start}",
                         offset,
                     )
+                offsets.append(index.offset)
+                ends.append(index.offset + index.length)
                 yield index
                 continue
             item = decode_record(opcode, content, offset)
@@ -199,6 +204,9 @@ class RecordReader:
                 stated = item.chunk_count
             if item is not None:
                 yield item
+        # Otherwise a small file could state any number of messages.
+        if any(end > offset for (_, end), (offset, _) in pairwise(sorted(zip(offsets, ends, strict=True)))):
+            raise DamagedError("chunk indexes overlap, or two are of the same chunk", summary.start)
         if stated not in (None, found):
             raise DamagedError(f"{found} chunk indexes, expected {stated}", summary.start)
 
@@ -309,6 +317,8 @@ def chunk_records(raw: bytes, wanted: Container[int] | None = None) -> Iterator[
                 raise DamagedError(f"message of {length} bytes, expected at least {MESSAGE_FIXED_BYTES}", at)
             if wanted is None or channel_id in wanted:
                 yield Message(channel_id, sequence, log_time, publish_time, raw[at + payload_at : following])
+        elif opcode == 0:
+            raise DamagedError("opcode 0 in a chunk", at)
         elif wanted is None:
             record = decode_record(opcode, raw[at + head_size : following], at)
             if isinstance(record, Schema | Channel):

@@ -36,6 +36,9 @@ COMPRESSION: Final = "zstd"
 """Compression of the chunks that hilrig writes; `chunk.compressor` makes it, `reader.decompress` reads it."""
 MAX_CHUNK_BYTES: Final = 128 << 20
 """Maximum uncompressed size of a chunk, bytes. A chunk that states a larger size is treated as damaged."""
+MAX_CHUNK_RATIO: Final = 1000
+"""Maximum ratio of uncompressed and compressed size of a chunk larger than `MIN_CHUNK_LIMIT`; that of states is 10."""
+MIN_CHUNK_LIMIT: Final = 1 << 20
 MAX_TIME_NS: Final = (1 << 63) - 1
 COPY_SUFFIX: Final = ".copy"
 """End of the name of a metadata record that repeats one of the beginning of the file. The first copy has precedence."""
@@ -265,10 +268,11 @@ def encode_chunk_record(first_ns: int, last_ns: int, raw: bytes, data: bytes) ->
 def decode_chunk(content: Buffer, offset: int) -> Chunk:
     """A chunk from the content of its record."""
     info, compression, crc, data_at = _chunk_head(content, offset)
-    if data_at + info.data_size != len(content) or info.raw_size > MAX_CHUNK_BYTES:
+    limit = min(MAX_CHUNK_BYTES, MIN_CHUNK_LIMIT + MAX_CHUNK_RATIO * info.data_size)
+    if data_at + info.data_size != len(content) or info.raw_size > limit:
         raise DamagedError(
             f"chunk with inconsistent lengths: {info.data_size} bytes of data, {info.raw_size} bytes uncompressed; "
-            f"expected {len(content) - data_at}, and at most {MAX_CHUNK_BYTES}",
+            f"expected {len(content) - data_at}, and at most {limit}",
             offset,
         )
     return Chunk(offset, info.first_ns, info.last_ns, compression, info.raw_size, crc, content[data_at:])

@@ -8,15 +8,17 @@ import errno
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
 
-from hilrig_recorder.mcap_format.file_names import recovering_path
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.fsutil import lock_file, map_file, open_file
 from hilrig_recorder.mcap_format.metadata_checks import add_metadata
+from hilrig_recorder.mcap_format.new_file import new_file
 from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.records import (
     COPY_SUFFIX,
@@ -41,6 +43,8 @@ from hilrig_runtime.errors import InputError, OperationError
 
 _REPEATED: Final = ("hilrig.session", "hilrig.config")
 """Names of the metadata records that are in a file twice."""
+MAX_TAIL_SEARCHES: Final = 64
+"""Maximum number of `scan.SEARCH_BYTES` of damaged ranges that are searched for the end of a file."""
 _REASON_UNFINISHED: Final = (
     "the file was not finished: the recorder was killed, or the file was truncated; the last messages may be missing"
 )
@@ -84,7 +88,7 @@ class SegmentTail:
 
 
 def read_tail(path: Path, tail_ns: int) -> SegmentTail:
-    """Read how a file ended and the keys of its messages of the last `tail_ns`.
+    """Read how a file ended and the keys of its messages of the last `tail_ns`, in bounded time.
 
     Raises:
         InputError: the file can't be read.
@@ -93,11 +97,19 @@ def read_tail(path: Path, tail_ns: int) -> SegmentTail:
     last: dict[int, tuple[int, int]] = {}
     chunks: list[Chunk] = []
     keys: set[tuple[int, int, int]] = set()
-    for _, item in scan(map_file(path)):
-        if isinstance(item, Metadata) and item.name == "hilrig.summary":
-            end = item.metadata.get("ended", "")
-        elif isinstance(item, Chunk):
-            chunks.append(item)
+    searched = count(1)
+
+    def on_search() -> None:
+        if next(searched) > MAX_TAIL_SEARCHES:
+            raise DamagedError("a large range is damaged")
+
+    # What follows a large damaged range is not read here: the recorder waits. It is recovered later.
+    with contextlib.suppress(DamagedError):
+        for _, item in scan(map_file(path), on_search):
+            if isinstance(item, Metadata) and item.name == "hilrig.summary":
+                end = item.metadata.get("ended", "")
+            elif isinstance(item, Chunk):
+                chunks.append(item)
     last_ns = max((chunk.last_ns for chunk in chunks), default=0)
     for chunk in chunks:
         if chunk.last_ns >= last_ns - tail_ns:
@@ -142,14 +154,7 @@ def _recover(source: Path, path: Path, should_continue: Callable[[], bool]) -> R
     finished = is_complete(view)
     if finished and _is_intact(view, source, should_continue):
         return recovery
-    temporary_path = recovering_path(path)
-    try:
-        if path.exists():
-            raise InputError(f"{path}: file exists; choose another name for the file recovered from {source.name}")
-        temporary_path.unlink(missing_ok=True)
-        _Copier(view, recovery, finished).write(path, temporary_path, should_continue)
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror}") from error
+    _Copier(view, recovery, finished).write(path, should_continue)
     recovery.path = path
     return recovery
 
@@ -159,7 +164,7 @@ def _is_intact(view: memoryview, source: Path, should_continue: Callable[[], boo
     try:
         buffer_reader(view).check_indexes()
         metadata: dict[str, dict[str, str]] = {}
-        for offset, item in scan(view):
+        for offset, item in scan(view, lambda: _check_interrupt(should_continue, source)):
             if isinstance(item, Metadata):
                 add_metadata(metadata, item, offset)
             if isinstance(item, Damage):
@@ -215,35 +220,26 @@ class _Copier:
         """Offsets of the metadata records and attachments that were found by reading the file in order."""
         self._last_ns = 0
 
-    def write(self, path: Path, temporary_path: Path, should_continue: Callable[[], bool]) -> None:
+    def write(self, path: Path, should_continue: Callable[[], bool]) -> None:
+
+        def on_search() -> None:
+            _check_interrupt(should_continue, self._recovery.source)
+
         header = next((item for _, item in scan(self._view[:MAX_BEGIN_BYTES]) if isinstance(item, Header)), None)
-        if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view)):
+        if header is None and not any(isinstance(item, Chunk) for _, item in scan(self._view, on_search)):
             if self._view[: len(MAGIC)] != MAGIC:
                 raise InputError(f"{self._recovery.source}: not an MCAP file (bad magic)")
             raise InputError(f"{self._recovery.source}: MCAP file without a complete record: nothing to recover")
         index = self._read_summary()
         # Without a header, the metadata tells who wrote the file.
         is_hilrig = header.library == LIBRARY if header else any(item.name.startswith("hilrig.") for item in index)
-        writer = RecordingWriter(
-            path,
-            temporary_path=temporary_path,
-            schemas=(),
-            channels=(),
-            profile=header.profile if header else "",
-            library=header.library if header else LIBRARY,
-        )
-        try:
+        profile, library = (header.profile, header.library) if header else ("", LIBRARY)
+        with new_file(path, schemas=(), channels=(), profile=profile, library=library) as writer:
             for item in self._declarations:
                 self._declare(writer, item)
             self._copy(writer, is_hilrig, should_continue)
             self._copy_indexed(writer, index)
             writer.finish(lambda: self._final_metadata(is_hilrig))
-            if writer.dropped_count:
-                raise OperationError(f"{path}: can't be written: no space left on the disk")
-            writer.publish()
-        except BaseException:
-            writer.discard()
-            raise
 
     def _read_summary(self) -> list[MetadataIndex | AttachmentIndex]:
         """The index of metadata and attachments; stores the schemas and channels. Empty without an intact summary."""
@@ -272,7 +268,7 @@ class _Copier:
 
     def _copy(self, writer: RecordingWriter, is_hilrig: bool, should_continue: Callable[[], bool]) -> None:
         recovery = self._recovery
-        for offset, item in scan(self._view):
+        for offset, item in scan(self._view, lambda: _check_interrupt(should_continue, recovery.source)):
             if isinstance(item, Chunk):
                 _check_interrupt(should_continue, recovery.source)
                 self._copy_chunk(writer, item)
@@ -368,7 +364,7 @@ class _Copier:
         }
         if is_hilrig and "hilrig.summary" not in self._metadata:
             records["hilrig.summary"] = {
-                "ended": "recovered",
+                "ended": Ending.RECOVERED,
                 "reason": _REASON_DAMAGED if self._finished else _REASON_UNFINISHED,
                 "end_wall_ns": str(self._last_ns),
                 "messages": str(recovery.messages),

@@ -4,7 +4,7 @@ After a damaged record, reading continues at the next complete chunk, which its 
 with a wrong checksum is skipped entirely.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,6 +29,8 @@ from hilrig_recorder.mcap_format.records import (
 
 MAX_BEGIN_BYTES: Final = 64 * 1024
 """Size of the begin of a file that contains its header and its session metadata."""
+SEARCH_BYTES: Final = 64 * 1024
+"""Bytes of a damaged range that are searched without a pause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +45,14 @@ class Damage:
 Item = Chunk | Message | McapRecord | Damage
 
 
-def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
+def scan(buffer: Buffer, on_search: Callable[[], None] = lambda: None) -> Iterator[tuple[int, Item]]:
     """Yield each complete record up to the end of the data section, and each damaged range.
 
     Message indexes are skipped. Chunks are not decompressed: use `read_chunk`.
+
+    Args:
+        buffer: the file.
+        on_search: called for each 64 KiB of a damaged range that are searched for the next chunk; it may raise.
 
     Yields:
         (offset, item): a `Chunk`, a `Message` outside chunks, a record of the mcap library, or `Damage`.
@@ -56,7 +62,7 @@ def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
     if reader.read(0, len(MAGIC)) == MAGIC:
         offset = len(MAGIC)
     else:
-        following = _next_chunk(reader, 0)
+        following = _next_chunk(reader, 0, on_search)
         yield 0, Damage(0, following, "bad magic")
         offset = following
     while offset < reader.size:
@@ -65,12 +71,12 @@ def scan(buffer: Buffer) -> Iterator[tuple[int, Item]]:
             following = record.end
             if record.opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 # No chunk follows the end of the data section. If one does, this record is damaged.
-                if _next_chunk(reader, following) < reader.size:
+                if _next_chunk(reader, following, on_search) < reader.size:
                     raise DamagedError("data end record before the last chunk", offset)
                 return
             item = _item(record)
         except DamagedError as damage:
-            following = _next_chunk(reader, offset + 1)
+            following = _next_chunk(reader, offset + 1, on_search)
             item = Damage(offset, following - offset, damage.problem)
         if item is not None:
             yield offset, item
@@ -123,11 +129,11 @@ def _item(found: Record) -> Item | None:
     return record
 
 
-def _next_chunk(reader: RecordReader, offset: int) -> int:
+def _next_chunk(reader: RecordReader, offset: int, on_search: Callable[[], None]) -> int:
     """Offset of the next complete chunk at or after `offset`; the end of the file if no chunk follows."""
-    window = 1 << 20
     while offset < reader.size:
-        block = bytes(reader.read(offset, window))
+        block = bytes(reader.read(offset, SEARCH_BYTES))
+        on_search()
         at = block.find(Opcode.CHUNK)
         while at >= 0:
             try:

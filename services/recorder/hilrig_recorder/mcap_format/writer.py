@@ -23,7 +23,7 @@ from hilrig_recorder.mcap_format.chunk import (
     encode_chunk,
     split_into_chunks,
 )
-from hilrig_recorder.mcap_format.file_names import part_path
+from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, part_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
 from hilrig_recorder.mcap_format.reader import RecordReader
 from hilrig_recorder.mcap_format.records import COPY_SUFFIX, MAGIC, ChunkInfo, DamagedError, encode_records
@@ -33,10 +33,10 @@ LIBRARY: Final = "hilrig"
 
 
 class FileReplacedError(OSError):
-    """The file being written, or its folder, was moved or deleted."""
+    """The file being written was moved, deleted or truncated, alone or with its folder."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(errno.ENOENT, "file was moved or deleted while it was being written", str(path))
+    def __init__(self, path: Path, change: str = "moved or deleted") -> None:
+        super().__init__(errno.ENOENT, f"file was {change} while it was being written", str(path))
 
 
 class RecordingWriter:
@@ -64,6 +64,7 @@ class RecordingWriter:
         self.temporary_path = part_path(path) if temporary_path is None else temporary_path
         self._file = FileIO(self.temporary_path, "x+")
         self._folder_synced = False
+        self._is_truncated = False
         lock_file(self._file.fileno())
         self.size = 0
         """Bytes in the file, all of complete records."""
@@ -161,8 +162,10 @@ class RecordingWriter:
                 may contain `dropped_count`.
 
         Raises:
+            FileReplacedError: the file was truncated by another process.
             OSError: not even an index without chunks could be written. The file can be recovered.
         """
+        self._check_size()
         if self._pending:
             # The shared compressor belongs to the writing thread.
             self._compress = compressor()
@@ -217,7 +220,8 @@ class RecordingWriter:
         """Make the written records survive a power failure.
 
         Raises:
-            FileReplacedError: the temporary path no longer refers to this file. Writing continues to the open file.
+            FileReplacedError: the temporary path no longer refers to this file, or bytes of it are missing. Writing
+                continues to the open file.
         """
         os.fsync(self._file.fileno())
         if not self._folder_synced:
@@ -225,23 +229,40 @@ class RecordingWriter:
             # Without it, the file itself may be missing after a power failure.
             sync_folder(self.path.parent)
         self._check_path()
+        self._check_size()
 
     def _check_path(self) -> None:
-        try:
-            is_same = os.path.samestat(self.temporary_path.stat(), os.fstat(self._file.fileno()))
-        except FileNotFoundError:
-            is_same = False
-        if not is_same:
+        if not self._is_at(self.temporary_path):
             raise FileReplacedError(self.temporary_path)
+
+    def _check_size(self) -> None:
+        self._note_truncation()
+        if self._is_truncated:
+            raise FileReplacedError(self.temporary_path, "truncated")
+
+    def _note_truncation(self) -> None:
+        self._is_truncated |= os.fstat(self._file.fileno()).st_size < self.size
+
+    def _is_at(self, path: Path) -> bool:
+        try:
+            return os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
+        except OSError:
+            return False
 
     def publish(self, *, durably: bool = True) -> Path:
         """Rename the finished file to its final path and return that path.
 
         Args:
             durably: whether file and rename must survive a power failure.
+
+        Raises:
+            FileReplacedError: the file was moved or deleted. A moved file gets its final name in its new folder, if the
+                system knows that folder (Linux).
         """
         try:
-            self._check_path()
+            if not self._is_at(self.temporary_path):
+                self._publish_moved()
+                raise FileReplacedError(self.temporary_path)
             if self.path.exists():
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
             if durably:
@@ -252,6 +273,15 @@ class RecordingWriter:
         if durably:
             sync_folder(self.path.parent)
         return self.path
+
+    def _publish_moved(self) -> None:
+        try:
+            moved = Path(f"/proc/self/fd/{self._file.fileno()}").readlink()
+        except OSError:
+            return
+        final = moved.with_name(moved.name.removesuffix(PART_SUFFIX))
+        if self._is_at(moved) and not final.exists():
+            moved.rename(final)
 
     def close(self) -> None:
         """Close the file as it is, under its temporary path."""
@@ -267,6 +297,8 @@ class RecordingWriter:
         return self._file.read(size)
 
     def _append(self, data: bytes) -> None:
+        # The next write would extend a truncated file to its old size, with zeros between.
+        self._note_truncation()
         rest = memoryview(data)
         try:
             while rest:

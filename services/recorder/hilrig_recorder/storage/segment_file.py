@@ -10,16 +10,21 @@ from dataclasses import asdict
 from typing import Final
 
 from hilrig_recorder.ingest.recording import Recording
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import RigConfig
 
 MAX_LOSS_RECORDS: Final = 1000
 """Maximum number of metadata records of losses in a file; the summary counts all losses."""
-
-
-_ABSOLUTE_PATH: Final = re.compile(r"""(["'])(?:~|[A-Za-z]:)?[/\\][^"'\n]*?([^"'/\\\n]*)[/\\]?\1""")
-"""A quoted absolute path; its second group is the name of the file or folder."""
+_ABSOLUTE_PATH: Final = re.compile(
+    r"""(?<![^\s"'=,;:(\[{])
+    (?:~[\w.-]*[/\\]+|(?:[A-Za-z]:[/\\]+|(?<!:)[/\\]+|(?<=:)(?:/{3,}|/(?!/)|\\+))(?=[^\s/\\"']))
+    [^"'\n\r,;)\]}]*""",
+    re.VERBOSE,
+)
+"""An absolute path in a text: after a space, quote, bracket or prefix such as `trace:`, up to the end of the string."""
+_HOMES: Final = ("home", "Users")
 
 
 class SegmentFile:
@@ -106,13 +111,13 @@ class SegmentFile:
         self._attach("lab.toml", "application/toml", lab_toml)
         self._attach(f"{config.rig}.urdf", "application/xml", config.urdf)
 
-    def finisher(self, end: str, reason: str) -> Callable[[], None]:
+    def finisher(self, end: Ending, reason: str) -> Callable[[], None]:
         """A function that writes the final metadata and the index; any thread may call it.
 
         Nothing else may be written to this file any more. The function raises the errors of `RecordingWriter.finish`.
 
         Args:
-            end: machine-readable cause of the end.
+            end: cause of the end.
             reason: a sentence that explains the end.
         """
         writer, recording = self.writer, self.recording
@@ -149,7 +154,14 @@ class SegmentFile:
 
 def without_folders(lab_toml: str) -> str:
     """The text of a lab file with file names instead of absolute paths, which can reveal a user's name."""
-    return _ABSOLUTE_PATH.sub(r"\1\2\1", lab_toml)
+    return _ABSOLUTE_PATH.sub(lambda found: _last_name(found[0]), lab_toml)
+
+
+def _last_name(path: str) -> str:
+    """The name of a file or folder; `home` for the folder of a user."""
+    first, *names = [name for name in re.split(r"[/\\]+", path) if name]
+    is_home = not names if first.startswith("~") else len(names) == 1 and first in _HOMES
+    return "home" if is_home else (names[-1] if names else first)
 
 
 def numbered(name: str, number: int) -> str:

@@ -12,6 +12,7 @@ from mcap.records import Metadata
 from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording
 from hilrig_recorder.mcap_format.channels import SCHEMA_VERSION
 from hilrig_recorder.mcap_format.chunk import compressor
+from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.writer import FileReplacedError, RecordingWriter
 from hilrig_recorder.storage.disk_reserve import MIB, DiskReserve
 from hilrig_recorder.storage.segment_file import SegmentFile
@@ -25,6 +26,8 @@ MAX_ALERTS_IN_REPORT: Final = 3
 """Maximum number of alerts named in a health report; each alert is also an event and a log line."""
 SLOW_SYNC_S: Final = 5.0
 """An alert is raised when written data is not synced within this time."""
+MAX_SESSIONS: Final = 4096
+"""Maximum number of sessions whose newest segment is remembered."""
 _SPEED_ALERT: Final = " speed"
 """Key of the alert about a slow disk; not a valid rig name."""
 _SPACE_ALERT: Final = ""
@@ -75,7 +78,7 @@ class FileStore:
         self._finishing: dict[RecordingWriter, Recording] = {}
         self._last_tick_ns = clock.monotonic_ns()
         self._speed_valid_ns = 0
-        self._newest: dict[Recording, str] = {}
+        self._newest: dict[str, str] = {}
         """Name of the newest segment of each session: its folder may be replaced, and restored later."""
         self._alerts: dict[str, str] = {}
         self._reserve = DiskReserve(self.folder, instance, config.min_free_mib)
@@ -106,21 +109,15 @@ class FileStore:
             return False
         if segment.previous is not None:
             tail = read_session_tail(folder, recording.session, segment.number - 1, self._repeated_ns)
-            if tail.end == "ended":
+            if tail.end == Ending.ENDED:
                 return False
             recording.seen, recording.last = tail.keys, tail.last
             recording.horizon_ns = horizon_by_channel(tail)
         return not self._reserve.is_exhausted and self._open(recording, segment) is not None
 
-    def write(self, recording: Recording, records: Sequence[bytes]) -> None:
-        """Write encoded messages to the file of a recording."""
-        file = self._files.get(recording)
-        if file is not None:
-            file.write(records)
-
-    def close(self, recording: Recording, end: str, reason: str) -> None:
+    def close(self, recording: Recording, end: Ending, reason: str) -> None:
         """Finish the file of a recording in the background."""
-        self._newest.pop(recording, None)
+        recording.file = None
         file = self._files.pop(recording, None)
         if file is not None:
             self._finish(file, end, reason)
@@ -205,7 +202,7 @@ class FileStore:
     def _next_segment(self, recording: Recording, after: str = "") -> NextSegment | None:
         folder = self.folder / recording.rig
         try:
-            return next_segment(folder, recording.session, after or self._newest.get(recording, ""))
+            return next_segment(folder, recording.session, after or self._newest.get(recording.session, ""))
         except OSError as error:
             self._report(recording, f"{folder}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
@@ -218,8 +215,11 @@ class FileStore:
         except OSError as error:
             self._report(recording, f"{segment.path}: can't be recorded: {self._reserve.describe_error(error)}")
             return None
-        self._newest[recording] = segment.path.name
+        self._newest[recording.session] = segment.path.name
+        if len(self._newest) > MAX_SESSIONS:
+            del self._newest[next(iter(self._newest))]
         file = self._files[recording] = SegmentFile(recording, writer, self._clock, self._on_failure)
+        recording.file = file
         self._sync_worker.follow(writer)
         self._request_config(recording.rig)
         self._alerts.pop(recording.rig, None)
@@ -260,12 +260,12 @@ class FileStore:
             file.opened_ns = self._clock.monotonic_ns()
             file.is_replaced = False
             return
-        self._finish(file, "continued", f"the session continues in {following.writer.path.name}")
+        self._finish(file, Ending.CONTINUED, f"the session continues in {following.writer.path.name}")
         recording.counters = LossCounters()
         for source, incarnation in file.sources:
             following.record_source(source, incarnation)
 
-    def _finish(self, file: SegmentFile, end: str, reason: str) -> None:
+    def _finish(self, file: SegmentFile, end: Ending, reason: str) -> None:
         self._finishing[file.writer] = file.recording
         self._sync_worker.finish(file.writer, file.finisher(end, reason))
 
@@ -278,8 +278,9 @@ class FileStore:
 
     def _finish_failed(self, file: SegmentFile, error: OSError) -> None:
         recording = file.recording
+        recording.file = None
         del self._files[recording]
-        end = "disk full" if error.errno in _NO_SPACE_ERRORS else "write failed"
+        end = Ending.DISK_FULL if error.errno in _NO_SPACE_ERRORS else Ending.WRITE_FAILED
         reason = f"{error.strerror}; the recording ends here"
         # The file contains its name only: the path could reveal the name of a user.
         self._finish(file, end, f"{file.writer.path.name}: {reason}")

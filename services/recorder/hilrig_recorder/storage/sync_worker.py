@@ -143,5 +143,5 @@ class SyncWorker:
 def describe_failure(writer: RecordingWriter, error: OSError) -> str:
     """A human-readable text for a file that could not be finished."""
     if isinstance(error, FileReplacedError):
-        return f"{writer.path}: {error.strerror}"
+        return f"{writer.path}: {error.strerror}; the session continues in another file"
     return f"{writer.temporary_path}: can't be finished: {error.strerror}; it will be recovered at the next start"

@@ -6,19 +6,21 @@ The whole curves of the fixed step and of automatic sub-steps are compared with 
 """
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics, stage_views
 from hilrig_sim.arm.integrators import EULER, RK4, RKF45, Tableau, reference_solution
 from hilrig_sim.arm.model import GRAVITY, ArmParameters, RigParameters, SceneParameters, StepParameters
 from hilrig_sim.arm.stability import fastest_mode
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.plant import Plant
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
@@ -248,15 +250,11 @@ def _reference(time_s: Floats) -> Solution:
     return Solution("dop853", "Dormand–Prince, variable step", time_s, y[:2], y[2:])
 
 
-def draw(result: ExperimentResult, folder: Path) -> list[Path]:
-    """Draw figures 4, 5 and 6 into `folder`, which is created if needed; returns the files.
-
-    Raises:
-        OperationError: the folder can't be written.
-    """
+def draw(result: ExperimentResult) -> "dict[str, Figure]":
+    """Draw figures 4, 5 and 6, by the names of their files."""
     from matplotlib.figure import Figure
 
-    written = []
+    figures = {}
     for number, solution in ((4, result.euler), (5, result.reference), (6, result.fehlberg)):
         figure = Figure(figsize=(8, 5), layout="constrained", dpi=120)
         angles, speeds = figure.subplots(2, 1, sharex=True)
@@ -275,11 +273,5 @@ def draw(result: ExperimentResult, folder: Path) -> list[Path]:
         angles.set_xlim(0, DURATION_S)
         speeds.set_xlabel("time, s")
         figure.suptitle(f"Figure {number}: {solution.title}")
-        path = folder / f"figure{number}_{solution.name}.png"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path)
-        except OSError as error:
-            raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
-        written.append(path)
-    return written
+        figures[f"figure{number}_{solution.name}.png"] = figure
+    return figures

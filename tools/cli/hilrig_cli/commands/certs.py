@@ -69,7 +69,8 @@ def certs(
     controllers = CertificateStore(folder, now, days, renew=renew)
     bus = CertificateStore(folder / "bus", now, days, renew=renew)
     authority = controllers.authority(f"hilrig {lab.name}: controllers")
-    edge_names = list(dict.fromkeys([*(host or []), *_reachable(lab.edge.host), *loopback]))
+    rig_hosts = [name for rig in lab.rigs for name in _reachable(lab.host_of(rig))]
+    edge_names = list(dict.fromkeys([*(host or []), *rig_hosts, *loopback]))
     if controllers.is_due("edge", edge_names):
         controllers.write("edge", issue_server(authority, controllers.host_names("edge", edge_names), now, days))
     for name, role in clients.items():
@@ -109,7 +110,9 @@ def certs(
 
 def _reachable(host: str) -> list[str]:
     """The host in a list; empty for a wildcard address, which no peer can connect to."""
-    return [] if host in ("", "0.0.0.0", "::") else [host]
+    from hilrig_runtime.addresses import WILDCARDS
+
+    return [] if host in WILDCARDS else [host]
 
 
 def _parse_client(text: str) -> tuple[str, str]:

@@ -24,6 +24,7 @@ def check(
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_runtime.addresses import format_address
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
     from hilrig_sim.accuracy import accuracy_warnings
@@ -47,7 +48,7 @@ def check(
         substeps = "" if lab.sim.substeps == 1 else f", {describe_substeps(lab.sim.substeps)}"
         allowed = [", ".join(map(str, rig.allow)) or "all"] if is_restricted else []
         step = (f"{lab.sim.step_ms:g} ms", lab.sim.integrator + substeps)
-        table.add_row(rig.name, *addresses[rig.name].values(), *allowed, *step)
+        table.add_row(rig.name, *(format_address(*one) for one in addresses[rig.name].values()), *allowed, *step)
     TerminalConsole().print(table)
     for rig in lab.rigs:
         if rig.controller is not None:

@@ -40,6 +40,7 @@ def compare(
     """
     from hilrig_replay.analysis.compare import compare as compare_runs
     from hilrig_replay.io.isolation import isolated
+    from hilrig_replay.io.paths import find_each_run
     from hilrig_replay.io.run import open_run
     from hilrig_replay.plots.comparison_plot import save_comparison_plot
     from hilrig_replay.rerun_view.view import save_rrd
@@ -47,13 +48,16 @@ def compare(
     from hilrig_runtime.escaping import printable
 
     opened, unreadable = [], []
-    for path in runs:
+    found = find_each_run(runs)
+    if len(found) == 1:
+        raise InputError(f"a comparison requires at least two runs, got one: {found[0][0]}")
+    for files in found:
         try:
-            with isolated(path):
-                opened.append(open_run(path))
+            with isolated(files[0]):
+                opened.append(open_run(files))
         except HilrigError as error:
             # One unreadable recording of several is skipped; the reference is required.
-            if not opened or len(runs) == 2:
+            if not opened or len(found) == 2:
                 raise
             unreadable.append(str(error))
     if unreadable and len(opened) == 1:

@@ -9,6 +9,8 @@ import typer
 from hilrig_cli.options import AsJson, Config
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from hilrig_cli.doctor import CheckResult
     from hilrig_runtime.config.lab import LabConfig
 
@@ -28,7 +30,7 @@ def doctor(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Check ports, bus, services, certificates, versions, clocks, limits and disk, and print how to fix errors.
+    """Check ports, bus, services, controllers, certificates, versions, clocks, limits, disk; print how to fix errors.
 
     Run it on each host, before or while the lab runs. Exit code 1: at least one error was found.
     """
@@ -49,15 +51,16 @@ def doctor(
 def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     from importlib.metadata import version
 
-    from hilrig_cli.doctor import CheckResult, host, services
+    from hilrig_cli.doctor import CheckResult, host, processes, services
 
     text = f"{lab.name!r}: {len(lab.rigs)} rig{'s' * (len(lab.rigs) > 1)}, step {lab.sim.step_ms:g} ms"
     results = [CheckResult.ok("lab", text)]
     results += host.check_software()
-    bus_results, joined = services.check_bus(lab)
+    local = processes.local_processes(lab)
+    bus_results, joined = services.check_bus(lab, local)
     results += bus_results
     if joined is not None:
-        results += services.check_services(lab, joined)
+        results += services.check_services(lab, joined, local)
     # Without the bus the services are unknown; the checks of this host still run.
     snapshot = joined or services.BusSnapshot()
     results += services.check_realtime(lab, snapshot)
@@ -66,6 +69,8 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     if lab.bus.tls is not None or lab.edge.tls is not None:
         results += _check_certificates(lab)
     results += host.check_ports(lab, snapshot.services)
+    if any(rig.controller is not None for rig in lab.rigs):
+        results += _check_controllers(lab, snapshot.services)
     results += host.check_open_files(lab)
     results += host.check_timer_accuracy(lab)
     results += host.check_disk(lab)
@@ -85,6 +90,21 @@ def _check_certificates(lab: "LabConfig") -> "list[CheckResult]":
         fix = "pip install 'hilrig[edge]', or check copies of the certificates on another host"
         return [CheckResult.warning("certificates", text, fix)]
     return list(check_certificates(lab, datetime.now(UTC)))
+
+
+def _check_controllers(lab: "LabConfig", running: "Collection[str]") -> "list[CheckResult]":
+    from hilrig_cli.doctor import CheckResult
+
+    try:
+        from hilrig_cli.doctor.controllers import check_controllers
+    except ModuleNotFoundError as error:
+        text = f"not tested: {error.name!r} is not installed on this host"
+        return [
+            CheckResult.warning(
+                "controllers", text, "pip install 'hilrig[edge]', or run hilrig doctor on the edge's host"
+            )
+        ]
+    return list(check_controllers(lab, running))
 
 
 def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[CheckResult]":

@@ -21,6 +21,7 @@ def export(
     """Convert a recording for other tools; print the path of each file that was written."""
     from hilrig_replay.export.export import export_foxglove, export_tables
     from hilrig_replay.io.isolation import isolated
+    from hilrig_replay.io.paths import find_run
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.escaping import printable
@@ -29,7 +30,7 @@ def export(
         raise InputError("no output given: add --foxglove OUT.MCAP, --csv FOLDER or --parquet FOLDER")
     written: list[Path] = []
     with isolated(run):
-        opened = open_run(run)
+        opened = open_run(find_run(run))
         if foxglove is not None:
             written.append(export_foxglove(opened, foxglove))
         for folder, kind in ((csv, "csv"), (parquet, "parquet")):

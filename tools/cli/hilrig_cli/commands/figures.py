@@ -21,10 +21,21 @@ def figures(
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_replay.plots.output import check_plot_path, save_figure
+    from hilrig_runtime.errors import OperationError
     from hilrig_sim.validation.paper_figures import compute, draw
 
     found = compute(step_ms)
-    files = draw(found, out)
+    drawn = draw(found)
+    files = [out / name for name in drawn]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OperationError(f"{out}: can't be written: {error.strerror}") from error
+    for path in files:
+        check_plot_path(path)
+    for path, figure in zip(files, drawn.values(), strict=True):
+        save_figure(figure, path)
     if as_json:
         print(json.dumps(found.as_dict() | {"files": [str(path) for path in files]}))
     else:

@@ -84,10 +84,11 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
     if trace is not None:
         from hilrig_replay.export.delay_trace import delay_trace
         from hilrig_replay.io.isolation import isolated
+        from hilrig_replay.io.paths import find_run
         from hilrig_replay.io.run import open_run
 
         with isolated(trace):
-            delays["command"] = delay_trace(open_run(trace))
+            delays["command"] = delay_trace(open_run(find_run(trace)))
     losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
     links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
     return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})

@@ -16,7 +16,7 @@ def join(
 
     The segments are kept. Their losses are added, and messages that two of them contain are written once.
     """
-    from hilrig_recorder.mcap_format.join import join as join_segments
+    from hilrig_replay.export.join import join as join_segments
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.escaping import printable
 

@@ -43,24 +43,25 @@ def latency(
     from hilrig_replay.analysis.intervals import aggregate
     from hilrig_replay.analysis.latency import measure
     from hilrig_replay.io.isolation import isolated
-    from hilrig_replay.io.paths import display_names, find_recordings
+    from hilrig_replay.io.paths import display_names, find_runs
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.errors import HilrigError, InputError
     from hilrig_runtime.escaping import printable
 
-    paths = find_recordings(runs)
+    found = find_runs(runs)
+    paths = [files[0] for files in found]
     if plot is not None:
         from hilrig_replay.plots.latency_plot import save_plot
         from hilrig_replay.plots.output import check_plot_path
 
         if len(paths) > 1:
             raise InputError(f"--plot: expected one recording, got {len(paths)}")
-        check_plot_path(plot, paths)
+        check_plot_path(plot, found[0])
     reports, unreadable = [], []
-    for path in paths:
+    for path, files in zip(paths, found, strict=True):
         try:
             with isolated(path):
-                run = open_run(path)
+                run = open_run(files)
                 report = measure(run, task=_task(run))
         except HilrigError as error:
             # An unreadable recording of several is reported in its own line.
@@ -107,7 +108,6 @@ def print_report(report: "LatencyReport") -> None:
     from hilrig_replay.analysis.diagnosis.evidence import sections
     from hilrig_replay.analysis.distribution import STATISTICS_TITLES
     from hilrig_replay.analysis.intervals import cells
-    from hilrig_replay.analysis.stages import LOOP_STAGES
 
     console = TerminalConsole()
     title = f"Loop latency of {report.session}: {report.samples} samples, step {report.step_ms:g} ms"
@@ -118,7 +118,7 @@ def print_report(report: "LatencyReport") -> None:
         table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
         table.add_row("loop", *cells(report.loop_ms, report.intervals_ms["loop"]), style="bold", end_section=True)
-        for stage in LOOP_STAGES:
+        for stage in report.stages:
             table.add_row(f"  {stage.title}", *cells(report.stages_ms[stage.key], report.intervals_ms[stage.key]))
         table.add_section()
     if report.age_ms is not None:

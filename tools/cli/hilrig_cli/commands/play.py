@@ -24,6 +24,7 @@ def play(
     """Publish a recording on the bus with its original timing, for tools that subscribe to a running rig."""
     from hilrig_replay.export.player import Player, publish_recording, rig_config
     from hilrig_replay.io.isolation import isolated
+    from hilrig_replay.io.paths import find_run
     from hilrig_replay.io.run import open_run
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
@@ -34,7 +35,7 @@ def play(
 
     lab = load_lab(config)
     with isolated(run):
-        opened = open_run(run)
+        opened = open_run(find_run(run))
     name = rig or opened.rig
     if not is_name(name) or name in RESERVED_RIG_NAMES:
         raise InputError(f"--rig: {name!r} is not a valid rig name")

@@ -20,6 +20,7 @@ def replay(
 ) -> None:
     """Show recordings in the rerun viewer: the arm in 3D, its curves, the loop latency and its stages, events."""
     from hilrig_replay.io.isolation import isolated
+    from hilrig_replay.io.paths import find_each_run
     from hilrig_replay.io.run import open_run
     from hilrig_replay.rerun_view.view import save_rrd, send_runs
     from hilrig_replay.rerun_view.viewer import browser_address, free_port, running_viewer, wait_for_end
@@ -29,9 +30,9 @@ def replay(
     if save is not None and web:
         raise InputError("--save and --web can't be combined: use one of them")
     opened = []
-    for path in runs:
-        with isolated(path):
-            opened.append(open_run(path))
+    for files in find_each_run(runs):
+        with isolated(files[0]):
+            opened.append(open_run(files))
     if save is not None:
         with isolated(save if len(runs) > 1 else runs[0]):
             save_rrd(opened, save)

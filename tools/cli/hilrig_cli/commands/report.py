@@ -39,19 +39,19 @@ def report(
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_replay.grading.task_loading import load_task
     from hilrig_replay.io.output_file import check_output, output_file
-    from hilrig_replay.io.paths import find_recordings
+    from hilrig_replay.io.paths import find_runs
     from hilrig_replay.report.report import build_report
     from hilrig_runtime.escaping import printable
 
-    paths = find_recordings(runs)
-    inputs = paths if task is None else [*paths, task]
+    found = find_runs(runs)
+    inputs = [path for files in found for path in files] + ([] if task is None else [task])
     check_output(out, inputs)
     graded_by = None if task is None else load_task(task)
     console = TerminalConsole(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("reading and plotting", total=1.0)
         result = build_report(
-            paths,
+            found,
             verified=verify,
             task=graded_by,
             on_progress=lambda share: progress.update(bar, completed=share),
@@ -62,7 +62,13 @@ def report(
     if as_json:
         print(
             json.dumps(
-                {"page": str(out), "runs": result.runs, "left_out": result.left_out, "alike": result.same_torques}
+                {
+                    "page": str(out),
+                    "runs": result.runs,
+                    "left_out": result.left_out,
+                    "alike": result.same_torques,
+                    "overlaps": result.overlaps,
+                }
             )
         )
     else:
@@ -71,5 +77,7 @@ def report(
             print(f"skipped: {printable(reason)}", file=sys.stderr)
         for pair in result.same_torques:
             print(f"same torques: {printable(pair)}", file=sys.stderr)
+        for sentence in result.overlaps:
+            print(printable(sentence), file=sys.stderr)
     if result.left_out:
         raise typer.Exit(1)

@@ -148,7 +148,8 @@ def _print_json(folder: Path, entries: "list[RunEntry]", total: int) -> None:
     runs = []
     for entry in entries:
         values = asdict(entry)
-        del values["mtime_ns"], values["measured"]
+        del values["mtime_ns"], values["measured"], values["segment"], values["span"]
+        values["segments"] = [str(folder / path) for path in entry.paths]
         values["path"] = str(folder / entry.path)
         values["start"] = _date(entry.start_wall_ns, "%Y-%m-%dT%H:%M:%SZ")
         runs.append(values)
@@ -215,8 +216,12 @@ def _ending(entry: "RunEntry") -> "Text":
     if entry.error:
         return Text(entry.error, style="red")
     if entry.ended in ABNORMAL_ENDINGS:
-        return Text(f"{entry.ended}: {entry.reason}", style="yellow")
-    return Text(entry.ended)
+        ending = Text(f"{entry.ended}: {entry.reason}", style="yellow")
+    else:
+        ending = Text(entry.ended)
+    if entry.overlaps:
+        ending.append(f"; overlaps with {', '.join(entry.overlaps)}")
+    return ending
 
 
 def _duration(seconds: float) -> str:

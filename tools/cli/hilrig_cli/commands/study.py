@@ -117,7 +117,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
             plot_paths += save_plots(figure, out / f"plane-{number + 1}")
         save_study_rrd(chosen, swept, simulated_traces, out / "study.rrd")
         extra = {"pictures": [str(path) for path in plot_paths], "live": measured}
-        return save_results(chosen, swept, out, extra)
+        return save_results(chosen, swept, out, extra, file.parent)
 
 
 def _print_results(results: dict[str, Any], out: Path) -> None:
@@ -166,13 +166,14 @@ def _ms(seconds: float | None) -> str:
 
 def _from_recording(path: Path, file: Path | None, as_json: bool, console: "TerminalConsole") -> None:
     from hilrig_replay.io.isolation import isolated
+    from hilrig_replay.io.paths import find_run
     from hilrig_replay.io.run import open_run
     from hilrig_study.live.from_recording import evaluate_gains
     from hilrig_study.study_config import load_study
 
     study = None if file is None else load_study(file)
     with console.status("evaluating gains"), isolated(path):
-        evaluation = evaluate_gains(open_run(path), study).as_dict()
+        evaluation = evaluate_gains(open_run(find_run(path)), study).as_dict()
     if as_json:
         print(json.dumps(evaluation))
     else:

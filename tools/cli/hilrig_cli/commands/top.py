@@ -37,6 +37,7 @@ RIG_COLUMNS: Final = {
     "p99 ms": 0,
     "age p99": 1,
     "samples": 4,
+    "refused": 3,
     "recorded": 3,
     "state": 0,
 }
@@ -125,12 +126,15 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
             "p99 ms": _or_dash(rig.loop_ms(0.99)),
             "age p99": _or_dash(rig.age_ms(0.99)),
             "samples": str(len(rig.loops_us)),
+            "refused": str(sum(rig.exceptions.values()) or ""),
             "recorded": "yes" if rig.recording else "",
             "state": rig.state,
         }
         for rig in rig_views[:max_rigs]
     ]
-    return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, RIG_COLUMNS, width), *alerts)
+    has_refused = any(rig["refused"] for rig in rigs)
+    rig_columns = {name: rank for name, rank in RIG_COLUMNS.items() if name != "refused" or has_refused}
+    return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, rig_columns, width), *alerts)
 
 
 def _table(

@@ -36,6 +36,7 @@ def up(
     """
     from hilrig_cli.local.local_lab import POLL_S, lab_file_of_controller, running_lab
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
+    from hilrig_runtime.addresses import format_address, reachable_hosts
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import call_on_hangup, stop_on_signals
@@ -55,7 +56,10 @@ def up(
     with written, running_lab(lab, config, report, stopping, processes, ["--log-format", log_format]) as supervisor:
         if not stopping.is_set():
             for rig, kinds in zip(lab.rigs, lab.addresses().values(), strict=True):
-                addresses = ", ".join(f"{kind} at {address}" for kind, address in kinds.items())
+                addresses = ", ".join(
+                    f"{kind} at {' or '.join(format_address(one, port) for one in reachable_hosts(host))}"
+                    for kind, (host, port) in kinds.items()
+                )
                 impairment = lab.impairment_of(rig).describe()
                 suffix = "" if impairment == "none" else f", impairment: {impairment}"
                 say(f"{rig.name}: {addresses}, step {lab.sim.step_ms:g} ms{suffix}")

@@ -36,33 +36,34 @@ def verify(
     from hilrig_replay.analysis.index import write_verdict
     from hilrig_replay.analysis.verify import verify as resimulate
     from hilrig_replay.io.isolation import isolated
-    from hilrig_replay.io.paths import find_recordings
+    from hilrig_replay.io.paths import find_runs
     from hilrig_runtime.errors import HilrigError
     from hilrig_runtime.escaping import printable
 
     console = TerminalConsole()
     verifications, unreadable = [], []
-    paths = find_recordings(runs)
-    for path in paths:
+    found = find_runs(runs)
+    for files in found:
+        path = files[0]
         try:
             with isolated(path):
-                verification = resimulate(path, tolerance)
+                verification = resimulate(files, tolerance)
         except HilrigError as error:
             # An unreadable recording of several is reported in its own line.
-            if len(paths) == 1:
+            if len(found) == 1:
                 raise
             unreadable.append({"path": str(path), "reason": str(error)})
             print(printable(str(error)), file=sys.stderr)
             continue
         # The verdict is shown by `hilrig runs`; in a read-only folder it is not stored.
-        with suppress(OSError):
-            write_verdict(path, verification.same, verification.sentence())
+        with suppress(OSError, HilrigError):
+            write_verdict(files, verification.same, verification.sentence())
         verifications.append(verification)
         if not as_json:
             style = "green" if verification.same else "red"
             console.print(Text(f"{path.name}: {verification.sentence()}", style=style), soft_wrap=True)
     if as_json:
         plain = [each.as_dict() for each in verifications]
-        print(json.dumps(plain[0] if len(paths) == 1 else {"runs": plain, "unreadable": unreadable}))
+        print(json.dumps(plain[0] if len(found) == 1 else {"runs": plain, "unreadable": unreadable}))
     if unreadable or not all(each.same for each in verifications):
         raise typer.Exit(1)

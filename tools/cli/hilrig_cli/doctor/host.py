@@ -14,7 +14,9 @@ from typing import Final
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_cli.local.local_lab import bind_error
 from hilrig_cli.options import format_size
+from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
 from hilrig_runtime.config.lab import LabConfig
+from hilrig_runtime.errors import list_names
 from hilrig_runtime.timing.realtime import set_short_slice
 
 RESERVED_HANDLES: Final = 200
@@ -42,27 +44,29 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResul
         lab: the lab.
         running: kinds of service that are alive on the bus.
     """
-    ports = [*(lab.ports.items() if lab.edge.plain else ()), *lab.tls_ports.items()]
+    ports = [(rig, *address) for rig, kinds in lab.addresses().items() for address in kinds.values()]
     served, free = 0, 0
-    for rig, port in ports:
-        reason = bind_error(lab.edge.host, port)
-        if reason is None:
+    for rig, host, port in ports:
+        error = bind_error(host, port)
+        if error is None:
             free += 1
-        elif _is_hilrig_edge(lab.edge.host, port) or (port in lab.tls_ports.values() and "edge" in running):
+        elif _is_hilrig_edge(host, port) or (port in lab.tls_ports.values() and "edge" in running):
             served += 1
         else:
             yield CheckResult.error(
                 "ports",
-                f"rig {rig!r}: {lab.edge.host}:{port} is unavailable ({reason}) and not served by a hilrig edge",
-                "stop the program that uses the port, or change edge.first_port or the rig's port in lab.toml",
+                f"rig {rig!r}: {format_address(host, port)} is unavailable ({listen_reason(error)}) and not served by "
+                "a hilrig edge",
+                listen_hint(error, port, "edge.host, or `host` of the rig,", "edge.first_port, or `port` of the rig"),
             )
     if served + free == len(ports):
         yield CheckResult.ok("ports", f"{served} of {len(ports)} Modbus ports served by hilrig, {free} free")
-    is_open = lab.edge.plain and not all(rig.allow for rig in lab.rigs)
-    if is_open and lab.edge.host not in ("127.0.0.1", "::1", "localhost"):
+    exposed = {lab.host_of(rig) for rig in lab.rigs if not rig.allow} - {"127.0.0.1", "::1", "localhost"}
+    if lab.edge.plain and exposed:
         yield CheckResult.warning(
             "ports",
-            f"edge.host is {lab.edge.host}: any host that reaches the edge can control a rig without a certificate",
+            f"edge.host is {list_names(sorted(exposed))}: any host that reaches the edge can control a rig without a "
+            "certificate",
             "list the networks that may connect to each rig (allow), or use [edge.tls] with plain = false",
         )
 

@@ -1,5 +1,6 @@
 """Checks of the services on the bus: reachability, completeness, alerts, real-time policy, versions, clocks."""
 
+import platform
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import Final
 from google.protobuf.message import DecodeError
 
 from hilrig_cli.doctor import CheckResult, Level
+from hilrig_cli.doctor.processes import LocalProcess, RouterState, can_list_processes, probe_router
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.counters import Counters
@@ -16,7 +18,7 @@ from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.control import release_series
 from hilrig_runtime.process.discovery import ClockOffset, query_services, worst_offset
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
-from hilrig_schemas import Health
+from hilrig_schemas import Health, PeerReport
 from hilrig_schemas.topics import HEALTH, SERVICES, alive_key, source_of_key
 
 COLLECT_TIMEOUT_S: Final = 2.5
@@ -25,6 +27,9 @@ CLOCK_TIMEOUT_S: Final = 0.5
 """Timeout of the query for the clocks; it ends early when all services have replied."""
 CLOCK_WARNING_S: Final = 1.0
 CLOCK_ERROR_S: Final = 60.0
+_CERTIFICATE_FIX: Final = (
+    "copy a command's certificate and key (viewer or operator) to this host, into the folder of ca.pem"
+)
 _REALTIME_FIX: Final = (
     'on Linux add "<user> - rtprio 3" to /etc/security/limits.conf and log in again, or LimitRTPRIO=3 to the systemd '
     "unit, or ulimits: {rtprio: 3} to the container; then restart the services"
@@ -46,6 +51,11 @@ class BusSnapshot:
     def services(self) -> set[str]:
         """Kinds of service that are alive."""
         return {name.partition("/")[0] for name in self.alive}
+
+    def peers(self) -> Iterator[PeerReport]:
+        """The reports of all services about others."""
+        for health in self.healths.values():
+            yield from health.peers
 
 
 def matches(name: str, wanted: str) -> bool:
@@ -99,41 +109,72 @@ def collect(
     return snapshot
 
 
-def check_bus(lab: LabConfig) -> tuple[list[CheckResult], BusSnapshot | None]:
-    """Check that the bus can be joined; return the results and a snapshot, or None if it can't be joined."""
+def check_bus(lab: LabConfig, processes: Sequence[LocalProcess] = ()) -> tuple[list[CheckResult], BusSnapshot | None]:
+    """Check that the bus can be joined; return the results and a snapshot, or None if it can't be joined.
+
+    `processes`: those of the lab on this host.
+    """
     where = f"router {lab.bus.router}" if lab.bus.topology == "router" else f"mesh on {lab.bus.host}"
     try:
         snapshot = collect(lab)
+    except InputError as error:
+        return [CheckResult.error("bus", str(error), _CERTIFICATE_FIX if lab.bus.tls else "see lab.toml")], None
     except HilrigError as error:
-        return [CheckResult.error("bus", str(error), _bus_fix(lab, error))], None
+        return list(_explain_unreachable_bus(lab, str(error), processes)), None
     return [CheckResult.ok("bus", f"{where}: joined")], snapshot
 
 
-def _bus_fix(lab: LabConfig, error: HilrigError) -> str:
-    if lab.bus.tls is not None and isinstance(error, InputError):
-        return "copy a command's certificate and key (viewer or operator) to this host, into the folder of ca.pem"
-    if lab.bus.topology == "router":
-        fix = "start the router (hilrig router), and compare bus.router in lab.toml with its address"
+def _explain_unreachable_bus(lab: LabConfig, error: str, processes: Sequence[LocalProcess]) -> Iterator[CheckResult]:
+    """Tell a missing router, a stopped one and a cut link apart, as far as this host can prove it."""
+    certificates = "" if lab.bus.tls is None else "; check the certificates below"
+    if lab.bus.topology != "router":
+        yield CheckResult.error("bus", error, f"see the log of the service{certificates}")
+        return
+    state = probe_router(lab)
+    stopped = next((one for one in processes if one.service == "router" and one.is_stopped), None)
+    if stopped is not None:
+        fix = _continue_fix(stopped)
+    elif state is RouterState.REFUSES:
+        fix = (
+            f"check on {lab.bus.router_host} whether the router runs; start it if it does not (hilrig router). Compare "
+            "bus.router in lab.toml with its address"
+        )
+    elif state is RouterState.UNREACHABLE:
+        fix = (
+            f"check the network link of this host first, then that of {lab.bus.router_host}. A cut link needs "
+            "no restart of a service"
+        )
     else:
-        fix = "see the log of the service"
-    return fix if lab.bus.tls is None else f"{fix}; check the certificates below"
+        fix = f"check on {lab.bus.router_host} whether the router is stopped or overloaded{certificates}"
+    yield CheckResult.error("bus", f"{error}: {state.value}", fix)
+    for process in processes:
+        if process.service != "router":
+            if process.is_stopped:
+                yield CheckResult.error("services", _stopped_text(process), _continue_fix(process))
+            else:
+                text = f"{process.service} runs on this host (process {process.pid}) and waits for the router"
+                yield CheckResult.warning("services", text, "do not restart it: it continues when the router answers")
 
 
-def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResult]:
-    """Check that every kind of service runs, reports its health and has no alert."""
-    if not snapshot.services & set(SERVICES):
+def check_services(
+    lab: LabConfig, snapshot: BusSnapshot, processes: Sequence[LocalProcess] = ()
+) -> Iterator[CheckResult]:
+    """Check that every kind of service runs, reports its health and has no alert.
+
+    `processes`: those of the lab on this host.
+    """
+    if not snapshot.services & set(SERVICES) and not any(one.service in SERVICES for one in processes):
         text = f"no service of lab {lab.name!r} is running"
         yield CheckResult.warning("services", text, "start the lab: hilrig up, or each service")
         return
     missing = [service for service in SERVICES if service not in snapshot.services]
-    if missing:
-        yield CheckResult.error("services", f"not running: {', '.join(missing)}", f"start it: hilrig {missing[0]}")
+    for service in missing:
+        yield _explain_missing(lab, service, snapshot, processes)
     silent = sorted(
         name for name in snapshot.alive if name.partition("/")[0] in SERVICES and name not in snapshot.healths
     )
-    if silent:
-        text = f"{', '.join(silent)}: alive, but sends no health reports"
-        yield CheckResult.error("services", text, "restart it")
+    for name in silent:
+        yield _explain_silent(name, snapshot, processes)
     if not missing and not silent:
         yield CheckResult.ok("services", f"running: {', '.join(sorted(snapshot.alive))}")
     for name, health in sorted(snapshot.healths.items()):
@@ -143,6 +184,72 @@ def check_services(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResul
             lost = health.lost_transport + health.lost_recorder
             text = f"{name}: {lost} messages lost since its start"
             yield CheckResult.warning("services", text, "see 'Sizing' in docs/operations.md")
+
+
+def _explain_missing(
+    lab: LabConfig, service: str, snapshot: BusSnapshot, processes: Sequence[LocalProcess]
+) -> CheckResult:
+    """Explain that no instance of a service has a liveliness token: it ended, or its link is down for seconds."""
+    local = [one for one in processes if one.service == service]
+    stopped = next((one for one in local if one.is_stopped), None)
+    if stopped is not None:
+        return CheckResult.error("services", _stopped_text(stopped), _continue_fix(stopped))
+    if local:
+        text = f"{service} runs on this host (process {local[0].pid}), but is not on the bus"
+        return CheckResult.error("services", text, "see its log: it starts, or waits for the bus; do not restart it")
+    known = sorted({peer.service for peer in snapshot.peers() if peer.service.startswith(f"{service}/")})
+    text = f"not running: {service}" + "".join(f"; {_observations(name, snapshot)}" for name in known)
+    if lab.bus.topology == "mesh" and can_list_processes():
+        return CheckResult.error("services", f"{text}: no process on this host", f"start it: hilrig {service}")
+    where = _host_of(known[0], snapshot) if known else ""
+    if where == platform.node() and can_list_processes():
+        fix = f"start it here (hilrig {service}): it ran on this host, and has no process now"
+    else:
+        fix = f"{_check_there(where)}. Start it (hilrig {service}) only if no process runs there: it may be cut off"
+    return CheckResult.error("services", f"not connected: {service}" + text.partition(service)[2], fix)
+
+
+def _explain_silent(name: str, snapshot: BusSnapshot, processes: Sequence[LocalProcess]) -> CheckResult:
+    """Explain that a service has a liveliness token, but sends no health reports."""
+    service = name.partition("/")[0]
+    local = [one for one in processes if one.service == service]
+    stopped = next((one for one in local if one.is_stopped), None)
+    if stopped is not None:
+        return CheckResult.error("services", _stopped_text(stopped), _continue_fix(stopped))
+    text = f"{name}: alive, but sends no health reports; {_observations(name, snapshot)}"
+    if local:
+        fix = f"check the load of this host, and the log of process {local[0].pid}; do not restart it before"
+        return CheckResult.error("services", text, fix)
+    fix = f"{_check_there(_host_of(name, snapshot))}. From here, a stopped process and a cut link look the same"
+    return CheckResult.error("services", text, fix)
+
+
+def _check_there(host: str) -> str:
+    return f"run hilrig doctor on {host or 'its host'} first: it tells whether the process runs or its link is cut"
+
+
+def _host_of(name: str, snapshot: BusSnapshot) -> str:
+    return next((peer.host for peer in snapshot.peers() if peer.service == name and peer.host), "")
+
+
+def _observations(name: str, snapshot: BusSnapshot) -> str:
+    """Return when which service received the last message of a service."""
+    found = [
+        f"{observer} received its last message {peer.silent_ns / 1e9:.1f} s ago"
+        for observer, health in sorted(snapshot.healths.items())
+        for peer in health.peers
+        if peer.service == name and peer.silent_ns
+    ]
+    host = _host_of(name, snapshot)
+    return f"{name}{f' on {host}' if host else ''}: " + (", ".join(found) or "no other service receives its messages")
+
+
+def _stopped_text(process: LocalProcess) -> str:
+    return f"{process.service} on this host is stopped (process {process.pid}): it does nothing until it is continued"
+
+
+def _continue_fix(process: LocalProcess) -> str:
+    return f"continue it: kill -CONT {process.pid}"
 
 
 def check_realtime(lab: LabConfig, snapshot: BusSnapshot) -> Iterator[CheckResult]:

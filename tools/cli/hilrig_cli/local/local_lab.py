@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, ProcessSpec, Supervisor
+from hilrig_runtime.addresses import format_address, listen_hint, listen_reason
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import MESH_ORDER
 from hilrig_runtime.config.lab import LabConfig
@@ -68,24 +69,25 @@ def _check_ports(lab: LabConfig) -> None:
 
     It also prevents that services of another lab on the same bus ports are mistaken for this lab's.
     """
-    required: list[tuple[str, str, int, str]] = []
-    if lab.edge.plain:
-        key = "edge.first_port or the rig's port"
-        required += [(f"rig {rig!r}", lab.edge.host, port, key) for rig, port in lab.ports.items()]
-    required += [(f"rig {rig!r}", lab.edge.host, port, "edge.tls.first_port") for rig, port in lab.tls_ports.items()]
+    keys = {"Modbus TCP": "edge.first_port, or `port` of the rig", "Modbus TCP with TLS": "edge.tls.first_port"}
+    required = [
+        (f"rig {rig!r}", host, port, "edge.host, or `host` of the rig,", keys[kind])
+        for rig, kinds in lab.addresses().items()
+        for kind, (host, port) in kinds.items()
+    ]
     if lab.bus.topology == "mesh":
         ports = range(lab.bus.first_port, lab.bus.first_port + len(MESH_ORDER))
-        required += [("the bus", lab.bus.host, port, "bus.first_port") for port in ports]
-    for owner, host, port, key in required:
-        if (reason := bind_error(host, port)) is not None:
+        required += [("the bus", lab.bus.host, port, "bus.host", "bus.first_port") for port in ports]
+    for owner, host, port, host_key, port_key in required:
+        if (error := bind_error(host, port)) is not None:
+            hint = listen_hint(error, port, host_key, port_key)
             raise OperationError(
-                f"{owner}: can't listen on {host}:{port} ({reason}): is another hilrig running here? "
-                f"Stop the program that uses the port, or change {key} in lab.toml"
+                f"{owner}: can't listen on {format_address(host, port)}: {listen_reason(error)}; {hint}"
             )
 
 
-def bind_error(host: str, port: int) -> str | None:
-    """Reason why a TCP port of this host can't be bound; None: it is free."""
+def bind_error(host: str, port: int) -> OSError | None:
+    """Return the error of binding a TCP port of this host; None: it is free."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:
@@ -94,7 +96,7 @@ def bind_error(host: str, port: int) -> str | None:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
-        return error.strerror or str(error)
+        return error
     return None
 
 

@@ -333,7 +333,11 @@ function showRuns(list) {
       links.append(html("a", {href: `reports/${pathOf(run.path)}`, target: "_blank", rel: "noopener",
         "aria-label": `Report of ${run.name}`}, "Report"));
     }
-    if (!run.open) links.append(html("a", {href: `recordings/${pathOf(run.path)}`, download: "", "aria-label": `Recording ${run.name}`}, "MCAP"));
+    const files = run.open ? [] : run.segments.length ? run.segments : [run.path];
+    files.forEach((path, number) => {
+      const label = files.length > 1 ? ` ${number + 1}` : "";
+      links.append(html("a", {href: `recordings/${pathOf(path)}`, download: "", "aria-label": `Recording ${run.name}${label}`}, `MCAP${label}`));
+    });
     if (run.error) {
       row.append(html("td", {class: "long", colspan: "9"}, run.error), links);
       return row;
@@ -342,7 +346,7 @@ function showRuns(list) {
     const fit = html("td", run.fit === null ? {} : {class: run.fit ? "good" : "bad", title: run.unfit}, run.fit === null ? "–" : run.fit ? "yes" : "no");
     const figures = [run.open ? "–" : lengthOf(run.duration_s), sizeOf(run.size), fixed(run.loop_p50_ms, 1), fixed(run.loop_p99_ms, 1), fixed(run.age_p99_ms, 1)];
     row.append(html("td", {}, run.controller || "none"), ...figures.map((text) => html("td", {class: "n"}, text)),
-      html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, run.open ? "recording" : run.ended), links);
+      html("td", {class: lost ? "n bad" : "n"}, String(lost)), fit, html("td", {title: run.reason}, [run.open ? "recording" : run.ended, ...run.overlaps.map((session) => `overlaps with ${session}`)].join("; ")), links);
     return row;
   }));
 }

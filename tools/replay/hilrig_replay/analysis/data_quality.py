@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.age import LoopAge
 from hilrig_replay.analysis.distribution import Statistics, median
-from hilrig_replay.analysis.stages import STAGES
+from hilrig_replay.analysis.stages import ALL_STAGES
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
@@ -58,6 +58,11 @@ OPEN_LOOP: Final = Reason(
     "open_loop",
     "open loop: positions were read on another connection than torques were written, and the torques do not follow "
     "these positions",
+)
+NO_ECHO: Final = Reason(
+    "no_echo",
+    "the controller has no echo register: its program is not supervised, and the latency is a lower bound, because the "
+    "torques may answer older positions than those that it had",
 )
 
 
@@ -161,7 +166,7 @@ class DataQuality:
             bases = samples["basis_step"].astype(np.int64)
             self.bases += int((np.diff(bases, prepend=self._last_basis) != 0).sum())
             self._last_basis = int(bases[-1])
-        self._negative += sum(int((samples[stage] < 0).sum()) for stage in STAGES)
+        self._negative += sum(int((samples[stage.key] < 0).sum()) for stage in ALL_STAGES)
 
     def _add_commands(self, commands: Rows) -> None:
         self._gaps += _gaps(commands, self._last_command)

@@ -14,8 +14,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from hilrig_replay.analysis.age import AgeTable
-from hilrig_replay.analysis.data_quality import NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
+from hilrig_replay.analysis.client_role.device_scan import DeviceScan, device_scan
+from hilrig_replay.analysis.client_role.older_positions import OlderPositions, older_positions
+from hilrig_replay.analysis.data_quality import NO_ECHO, NO_SAMPLES, OPEN_LOOP, DataQuality, Lost, Reason
 from hilrig_replay.analysis.diagnosis.diagnose import diagnose
 from hilrig_replay.analysis.diagnosis.edge_stalls import edge_stalls
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, windows_of
@@ -24,7 +28,7 @@ from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
 from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
-from hilrig_replay.analysis.stages import STAGES
+from hilrig_replay.analysis.stages import CLIENT_STAGES, CONTROLLER, LOOP_STAGES, Stage
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.io.disk_table import Blocks
 from hilrig_replay.io.records import Records
@@ -56,7 +60,10 @@ class LatencyReport:
     step_ms: float
     loop_ms: Statistics | None
     """None: no closed loop (see `reasons`)."""
+    client_role: bool
+    """Whether the edge was the client of the controller."""
     stages_ms: dict[str, Statistics]
+    """By the key of each of `stages`."""
     intervals_ms: dict[str, dict[str, Interval]]
     """95 % confidence intervals of the percentiles of `loop`, each stage and `age`, by percentile (`intervals.SHARES`);
     an infinite bound is not supported by the samples."""
@@ -75,6 +82,11 @@ class LatencyReport:
     kernel_timestamps: bool
     """Whether the kernel's timestamps separate *controller* from *edge*; else *controller* includes the wake-up of the
     edge."""
+    device_scan: DeviceScan | None
+    """Scan time of the controller's program in the client role; None: not measured."""
+    older_positions: OlderPositions | None
+    """Estimate of the time by which the latency exceeds its bound in the client role without an echo register; None: it
+    is exact, or the torques do not show it."""
     network: NetworkShare | None
     """Share of the network in *controller*; None: not recorded."""
     jitter_ms: Jitter
@@ -96,9 +108,16 @@ class LatencyReport:
         """Copy without the samples and ages, to save memory when many reports are kept."""
         return replace(self, table=SampleTable(), ages=None)
 
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Stages of the loop in the role of the edge."""
+        return CLIENT_STAGES if self.client_role else LOOP_STAGES
+
     def notes(self) -> list[str]:
         """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
         notes = []
+        if self.older_positions is not None:
+            notes.append(str(self.older_positions))
         if self.age_ms is not None and self.control_period_ms is not None and self.longest_hold_ms is not None:
             older = ", ".join(f"{share:.1%} > {steps}" for steps, share in self.older_than_steps.items())
             notes.append(
@@ -109,7 +128,11 @@ class LatencyReport:
             notes.append(str(self.network))
         if self.loop_ms is not None and self.read_on_other_connection:
             notes.append("read on another connection: positions and torques of the controller have one each")
-        if self.loop_ms is not None and not self.kernel_timestamps:
+        if self.device_scan is not None:
+            notes.append(str(self.device_scan))
+        if self.client_role:
+            notes.append("client of the controller: position write and torque read include the wake-up of the edge")
+        elif self.loop_ms is not None and not self.kernel_timestamps:
             notes.append("without kernel timestamps: controller includes the wake-up of the edge")
         if self.repaired.duplicates:
             notes.append(f"dropped duplicate messages: {self.repaired.duplicates}")
@@ -120,6 +143,22 @@ class LatencyReport:
     def reason_text(self) -> str:
         """Reasons why the recording is not valid, as one text; empty: it is valid."""
         return "; ".join(reason.text for reason in self.reasons)
+
+    def frame(self, library: str = "pandas") -> Any:
+        """The samples as a data frame, one row per new command that took effect; times in ns as in `SAMPLE_DTYPE`.
+
+        Args:
+            library: `pandas` or `polars`.
+
+        Raises:
+            InputError: unknown library.
+            OperationError: the library is not installed.
+        """
+        import pyarrow as pa
+
+        from hilrig_replay.io.frames.tables import frame
+
+        return frame(pa.table({name: self.table[name] for name in self.table.dtype.names or ()}), library)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the samples; None for an infinite bound."""
@@ -157,29 +196,35 @@ def measure(
     age, loop, stages, spread = ages.statistics(), None, {}, 0.0
     intervals: dict[str, dict[str, Interval]] = {}
     windows = windows_of(run)
-    other_connection = _other_connection_share(table) >= 0.5
+    other_connection = _share(table, "basis_on_other_connection") >= 0.5
+    client_role = _share(table, "polled") >= 0.5
+    role_stages = CLIENT_STAGES if client_role else LOOP_STAGES
     open_loop = other_connection and not follows_positions((window.states, window.commands) for window in windows)
     if open_loop:
         # The basis of the commands is not their basis.
         table, age = SampleTable(), None
     if len(table):
         loop = Statistics.of(table.column("loop"))
-        stages = {stage: Statistics.of(table.column(stage)) for stage in STAGES}
+        stages = {stage.key: Statistics.of(table.column(stage.key)) for stage in role_stages}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
-        intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *STAGES)}
+        intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *stages)}
     if age is not None:
         intervals["age"] = _intervals_ms(ages.ages_ns)
     stalled = edge_stalls(quality.edge_stalls, table, windows, run.time_ns)
     reasons = tuple(quality.reasons(matcher.unmatched, loop, age, stalled))
     if open_loop:
         reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
-    network = network_share(windows, stages["controller"].p50 if stages else None)
+    is_bound = _share(table, "basis_is_bound") > 0
+    if is_bound:
+        reasons = (*reasons, NO_ECHO)
+    network = network_share(windows, stages[CONTROLLER.key].p50 if CONTROLLER.key in stages else None)
     evidence = Evidence(
         step_ns=run.step_ns,
         samples=table,
         windows=windows,
         duration_s=run.duration_s,
+        client_role=client_role,
         age=age,
         stalls=quality.stalls,
         edge_stalls=stalled,
@@ -198,6 +243,7 @@ def measure(
         samples=len(table),
         step_ms=run.step_ns / 1e6,
         loop_ms=loop,
+        client_role=client_role,
         stages_ms=stages,
         intervals_ms=intervals,
         age_ms=age.age_ms if age else None,
@@ -207,6 +253,8 @@ def measure(
         older_than_steps=age.older_than_steps if age else {},
         read_on_other_connection=other_connection,
         kernel_timestamps=_kernel_timestamps(table),
+        device_scan=device_scan(np.concatenate([window.commands for window in windows])),
+        older_positions=older_positions(evidence.gains, run.step_ns) if is_bound else None,
         network=network,
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),
@@ -224,9 +272,9 @@ def _intervals_ms(values_ns: Blocks) -> dict[str, Interval]:
     return {name: (low / 1e6, high / 1e6) for name, (low, high) in found.items()}
 
 
-def _other_connection_share(samples: SampleTable) -> float:
-    """Share of the samples whose basis was served to another connection than the one that wrote."""
-    marked = sum(int(values.sum()) for values in samples.column("basis_on_other_connection")())
+def _share(samples: SampleTable, name: str) -> float:
+    """Share of the samples with a property, a column of `SAMPLE_DTYPE`."""
+    marked = sum(int(values.sum()) for values in samples.column(name)())
     return marked / max(len(samples), 1)
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hilrig_replay.analysis.stages import LOOP_STAGES, STAGES, fill_stages
+from hilrig_replay.analysis.stages import ALL_STAGES, LOOP_STAGES, fill_stages
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE, Rows
 from hilrig_replay.io.disk_table import DiskTable
 
@@ -22,15 +22,18 @@ SAMPLE_DTYPE: Final = np.dtype(
         ("basis_step", "<u8"),
         ("command_seq", "<u8"),
         ("loop", "<i8"),
-        *((stage, "<i8") for stage in STAGES),
+        *((stage.key, "<i8") for stage in ALL_STAGES),
         ("write_arrived_ns", "<i8"),
         ("write_received_ns", "<i8"),
         ("state_served_ns", "<i8"),
         ("basis_on_other_connection", "|b1"),
+        ("polled", "|b1"),
+        ("basis_is_bound", "|b1"),
     ]
 )
 """One row per sample: `loop` and the stages in ns, `sampled_ns` on the clock of the simulation, `write_arrived_ns`,
-`write_received_ns` and `state_served_ns` on the clock of the edge."""
+`write_received_ns` and `state_served_ns` on the clock of the edge. `polled`: the edge was the client of the
+controller."""
 
 MATCH_WINDOW_ROWS: Final = 4096
 """Rows of previous blocks that are searched for a match: more than a minute at a step of 20 ms."""
@@ -107,8 +110,15 @@ def _samples(states: Rows, commands: Rows) -> NDArray[np.void]:
     samples = np.empty(len(states), SAMPLE_DTYPE)
     for name in ("step", "incarnation", "sampled_ns", "wall_ns", "basis_step", "command_seq"):
         samples[name] = states[name]
-    for name in ("write_arrived_ns", "write_received_ns", "state_served_ns", "basis_on_other_connection"):
+    for name in (
+        "write_arrived_ns",
+        "write_received_ns",
+        "state_served_ns",
+        "basis_on_other_connection",
+        "basis_is_bound",
+    ):
         samples[name] = commands[name]
+    samples["polled"] = commands["read_sent_ns"] > 0
     samples["loop"] = states["loop_latency_ns"]
     fill_stages(samples, LOOP_STAGES, states, commands)
     return samples

@@ -50,6 +50,33 @@ CONTROLLER: Final = Stage(
     added=("write_received_ns",),
     subtracted=("state_served_ns",),
 )
+POSITION_WRITE: Final = Stage(
+    key="position_write",
+    title="position write",
+    color="#eeca3b",
+    span="positions sent to the controller → acknowledged",
+    clock="edge",
+    added=("positions_acknowledged_ns",),
+    subtracted=("state_served_ns",),
+)
+DEVICE: Final = Stage(
+    key="device",
+    title="device",
+    color="#f58518",
+    span="acknowledged → read sent: scan of the controller's program, and the wait for the read before the tick",
+    clock="edge",
+    added=("read_sent_ns",),
+    subtracted=("positions_acknowledged_ns",),
+)
+TORQUE_READ: Final = Stage(
+    key="torque_read",
+    title="torque read",
+    color="#ff9da6",
+    span="read sent → torques received",
+    clock="edge",
+    added=("write_received_ns",),
+    subtracted=("read_sent_ns",),
+)
 EDGE: Final = Stage(
     key="edge",
     title="edge",
@@ -90,14 +117,30 @@ LOOP_STAGES: Final = (REGISTER_WAIT, CONTROLLER, EDGE, INJECTED, TICK_WAIT, TRAN
 STAGES: Final = tuple(stage.key for stage in LOOP_STAGES)
 """Names of the stages of the loop."""
 
+_POLLED_STAGES: Final = (POSITION_WRITE, DEVICE, TORQUE_READ)
+"""The parts of *controller* if the edge is the client of the controller."""
+
+CLIENT_STAGES: Final = (REGISTER_WAIT, *_POLLED_STAGES, EDGE, INJECTED, TICK_WAIT, TRANSPORT)
+"""Stages of the loop in the client role."""
+
+ALL_STAGES: Final = (*LOOP_STAGES, *_POLLED_STAGES)
+"""The stages of both roles."""
+
 
 def fill_stages(samples: NDArray[np.void], stages: Sequence[Stage], states: Rows, commands: Rows) -> None:
-    """Compute the stages of samples whose `loop` is set, from their states and commands, row by row."""
+    """Compute the stages of samples whose `loop` is set, from their states and commands, row by row.
+
+    The parts of *controller* are 0 if the edge was no client.
+    """
     remainder = samples["loop"].copy()
     for stage in stages[:-1]:
         samples[stage.key] = _total(stage.added, states, commands) - _total(stage.subtracted, states, commands)
         remainder -= samples[stage.key]
     samples[stages[-1].key] = remainder
+    polled = commands["read_sent_ns"] > 0
+    for stage in _POLLED_STAGES:
+        duration_ns = _total(stage.added, states, commands) - _total(stage.subtracted, states, commands)
+        samples[stage.key] = np.where(polled, duration_ns, 0)
 
 
 def _total(names: Sequence[str], states: Rows, commands: Rows) -> NDArray[np.int64]:

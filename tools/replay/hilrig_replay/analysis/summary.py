@@ -13,6 +13,7 @@ from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.analysis.similarity import TorqueSketch
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.grading.grade import Grade, Grader
+from hilrig_replay.grading.overlap import Span
 from hilrig_replay.grading.placement import PlacementReport, evaluate_placement
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import JointValues, Rows, joint_values
@@ -92,6 +93,10 @@ class RunSummary:
     trajectory: Trajectory = field(repr=False, compare=False)
     torques: TorqueSketch = field(repr=False, compare=False)
     """Torques written by the controllers, to be compared with other runs."""
+    span: Span = field(repr=False, compare=False)
+    """When the session was recorded."""
+    overlaps: tuple[str, ...] = ()
+    """Sessions of the same rig at the same time, among the runs of a report."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the data for plots."""
@@ -112,6 +117,7 @@ class RunSummary:
             "parts_placed": None if self.placement is None else self.placement.placed,
             "largest_placing_error_mm": None if self.placement is None else self.placement.largest_error_mm,
             "grade": None if self.grade is None else self.grade.as_dict(),
+            "overlaps": self.overlaps,
         }
 
 
@@ -147,6 +153,19 @@ def summarize(run: Run, task: TaskConfig | None = None) -> RunSummary:
         box_ms=_box_ms(latency),
         trajectory=collector.trajectory(),
         torques=collector.torques,
+        span=_span(run),
+    )
+
+
+def _span(run: Run) -> Span:
+    states = run.file.states
+    return Span(
+        session=run.session,
+        rig=run.rig,
+        is_manual=not run.controller,
+        start_ns=run.number("session", "start_wall_ns") or 0,
+        end_ns=run.number("summary", "end_wall_ns") or 0,
+        incarnations=() if states is None else tuple(one.incarnation for one in states),
     )
 
 

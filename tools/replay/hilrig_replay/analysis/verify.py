@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from hilrig_replay.io.columns import JointValues, Rows, StringTable, joint_values
 from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.io.segments import RunFiles
 from hilrig_runtime.errors import InputError
 from hilrig_schemas import Event
 from hilrig_sim.arm.joints import JOINT_SCALE
@@ -128,20 +129,22 @@ class Verification:
         return f"θ1 {theta1:.3g}°, θ2 {theta2:.3g}°, d3 {d3:.3g} mm, θ4 {theta4:.3g}°"
 
 
-def verify(path: Path, tolerance: float | None = None) -> Verification:
+def verify(files: Path | RunFiles, tolerance: float | None = None) -> Verification:
     """Re-simulate a recording and compare it with the recorded states.
 
     Args:
-        path: the recording.
+        files: the recording, or the segments of a session.
         tolerance: allowed deviation of a joint; None: 0 if the run was recorded on the same platform as this one, else
             `OTHER_PLATFORM_TOLERANCE`.
 
     Raises:
         InputError: the file is not a recording, or it does not contain the parameters of the simulation.
     """
-    run = open_run(path)
+    run = open_run(files)
     if not run.parameters_json:
-        raise InputError(f"{path}: can't be verified: the recording does not contain the parameters of the simulation")
+        raise InputError(
+            f"{run.path}: can't be verified: the recording does not contain the parameters of the simulation"
+        )
     parameters = RigParameters.from_json(run.parameters_json)
     machine = run.metadata.get("hilrig.config", {}).get("machine", "")
     if tolerance is None:

@@ -1,78 +1,49 @@
 """Exports recordings: MCAP with visualization messages for Foxglove and rerun, tables for pandas and MATLAB."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 from google.protobuf.message import Message
-from mcap.reader import SeekingReader
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hilrig_recorder.mcap_format.channels import file_descriptor_set
+from hilrig_recorder.mcap_format.channels import (
+    CHANNEL_OF_TOPIC,
+    CHANNELS,
+    EVENT_CHANNEL,
+    SCHEMAS,
+    file_descriptor_set,
+)
+from hilrig_recorder.mcap_format.new_file import new_file
 from hilrig_recorder.mcap_format.records import Message as RecordedMessage
 from hilrig_recorder.mcap_format.records import encode_message
 from hilrig_recorder.mcap_format.writer import RecordingWriter
 from hilrig_replay.export import foxglove_messages as foxglove
+from hilrig_replay.export.copying import copy_metadata, own_messages
 from hilrig_replay.geometry.scene import ArmGeometry, parse_arm
 from hilrig_replay.geometry.urdf_geometry import VisualShape, fixed_joints, visual_shapes
-from hilrig_replay.io.columns import Rows, StringTable
+from hilrig_replay.io.columns import StringTable
+from hilrig_replay.io.frames.tables import TABLES, table
 from hilrig_replay.io.output_file import output_file
-from hilrig_replay.io.records import Decoder, Records, concatenate_records, enum_name
-from hilrig_replay.io.run import ALL_TOPICS, BLOCK_ROWS, Run
+from hilrig_replay.io.records import Decoder, concatenate_records, enum_name
+from hilrig_replay.io.run import BLOCK_ROWS, Run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_runtime.errors import InputError, OperationError
 from hilrig_runtime.escaping import csv_text
 from hilrig_schemas import Event
+from hilrig_schemas.topics import STATE
 
 WORLD_FRAME: Final = "world"
 _STATIC_PERIOD_STATES: Final = 500
 """Static frames and shapes are repeated after this many states, for players that start in the middle of the file."""
-_VECTOR_NAMES: Final = ("theta1", "theta2", "d3", "theta4")
 
-TABLES: Final[dict[str, Callable[[Records], Rows]]] = {
-    "state": lambda records: records.states,
-    "command": lambda records: records.commands,
-    "event": lambda records: records.events,
-    "traffic": lambda records: records.traffic,
-}
-"""Tables of a recording by name."""
-_INTERNED_FIELDS: Final = frozenset({"session", "held_part", "controller", "part"})
-"""Fields that hold a code of the run's string table."""
-TEMPORARY_SUFFIX: Final = ".exporting"
-"""Suffix of an incomplete export."""
-
-
-# -- tables ---------------------------------------------------------------------------------------------------------
-
-
-def table(run: Run, rows: Rows, escape: Callable[[str], str] = str) -> pa.Table:
-    """Convert rows of one of `TABLES` to an Arrow table.
-
-    Units are SI as in the schemas, and `time_s` is the time since the run's first state. A joint vector becomes four
-    columns, one per joint. `escape` converts each text.
-    """
-    columns: dict[str, Any] = {"time_s": run.time_s(rows)}
-    for field in rows.dtype.names or ():
-        values = rows[field]
-        if field == "message":
-            continue
-        if field in _INTERNED_FIELDS:
-            columns[field] = pa.array(map(escape, run.names.texts(values).tolist()), pa.string())
-        elif values.ndim == 2:
-            for number, joint in enumerate(_VECTOR_NAMES):
-                columns[f"{field}_{joint}"] = np.ascontiguousarray(values[:, number])
-        elif values.dtype == object:
-            columns[field] = pa.array(map(escape, values.tolist()), pa.string())
-        else:
-            columns[field] = np.ascontiguousarray(values)
-    return pa.table(columns)
+_STATE_CHANNEL: Final = CHANNEL_OF_TOPIC[STATE.name]
 
 
 def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
@@ -92,7 +63,7 @@ def export_tables(run: Run, folder: Path, kind: str) -> list[Path]:
             for name, rows_of in TABLES.items():
                 schema = table(run, rows_of(empty)).schema
                 writer = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
-                temporary = closing.enter_context(output_file(paths[name], [run.path]))
+                temporary = closing.enter_context(output_file(paths[name], run.file.paths))
                 writers[name] = closing.enter_context(writer(temporary, schema))
             for block in run.blocks():
                 for name, rows_of in TABLES.items():
@@ -120,58 +91,22 @@ def export_foxglove(run: Run, path: Path) -> Path:
     """
     if not run.urdf:
         raise InputError(f"{run.path}: has no URDF attachment, which is needed to draw the arm")
-    if path.exists():
-        raise InputError(f"{path}: already exists; choose another name")
     arm, shapes = parse_arm(run.urdf), visual_shapes(run.urdf)
-    temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
-    try:
-        # Left behind by an export that was killed.
-        temporary.unlink(missing_ok=True)
-        with run.path.open("rb") as stream:
-            reader = SeekingReader(stream)
-            summary = reader.get_summary()
-            if summary is None:
-                raise InputError(f"{run.path}: has no index; create one with `hilrig recover`")
-            writer = RecordingWriter(path, temporary_path=temporary, schemas=(), channels=(), library="hilrig export")
-            try:
-                visualization = _Visualization(
-                    writer, run, arm, shapes, max(summary.schemas, default=0), max(summary.channels)
-                )
-                for schema in summary.schemas.values():
-                    writer.add_schema(schema)
-                for channel in summary.channels.values():
-                    writer.add_channel(channel)
-                visualization.write_channels()
-                for record in reader.iter_metadata():
-                    writer.add_metadata(record.name, record.metadata)
-                for item in reader.iter_attachments():
-                    writer.add_attachment(
-                        item.name, item.media_type, item.data, log_time=item.log_time, create_time=item.create_time
-                    )
-                _copy(run, writer, visualization)
-                writer.finish()
-                if writer.dropped_count:
-                    raise OperationError(f"{path}: can't be written: no space left on device")
-                writer.publish()
-            except BaseException:
-                writer.discard()
-                raise
-    except OSError as error:
-        raise OperationError(f"{path}: can't be written: {error.strerror or error}") from error
+    with new_file(path, library="hilrig export") as writer:
+        visualization = _Visualization(writer, run, arm, shapes)
+        visualization.write_channels()
+        copy_metadata(run.file, writer)
+        messages = own_messages(run.file)
+        while block := list(islice(messages, BLOCK_ROWS)):
+            visualization.prepare(message for message in block if message.channel_id == _STATE_CHANNEL)
+            for message in block:
+                writer.add(encode_message(*message))
+                if message.channel_id == _STATE_CHANNEL:
+                    visualization.add_state(message.log_time)
+                elif message.channel_id == EVENT_CHANNEL:
+                    visualization.add_event(message.log_time, Event.FromString(message.data))
+        writer.finish()
     return path
-
-
-def _copy(run: Run, writer: RecordingWriter, visualization: "_Visualization") -> None:
-    messages = run.file.messages(ALL_TOPICS)
-    while block := list(islice(messages, BLOCK_ROWS)):
-        visualization.prepare(message for message in block if run.file.topics[message.channel_id] == "state")
-        for message in block:
-            writer.add(encode_message(*message))
-            topic = run.file.topics[message.channel_id]
-            if topic == "state":
-                visualization.add_state(message.log_time)
-            elif topic == "event":
-                visualization.add_event(message.log_time, Event.FromString(message.data))
 
 
 class _Visualization:
@@ -183,8 +118,6 @@ class _Visualization:
         run: Run,
         arm: ArmGeometry,
         shapes: list[VisualShape],
-        last_schema: int,
-        last_channel: int,
     ) -> None:
         self._writer = writer
         self._arm = arm
@@ -195,8 +128,7 @@ class _Visualization:
             "/log": foxglove.Log,
             **{f"/points/{shape.link}": foxglove.PointCloud for shape in shapes},
         }
-        self._last_schema = last_schema
-        self._ids = {topic: last_channel + number for number, topic in enumerate(self._types, start=1)}
+        self._ids = {topic: len(CHANNELS) + number for number, topic in enumerate(self._types, start=1)}
         self._sequences = dict.fromkeys(self._types, 0)
         self._fixed_joints = fixed_joints(run.urdf)
         self._scene = _scene(shapes)
@@ -219,7 +151,7 @@ class _Visualization:
         for topic, message in self._types.items():
             name = message.DESCRIPTOR.full_name
             if name not in schema_ids:
-                schema_ids[name] = self._last_schema + len(schema_ids) + 1
+                schema_ids[name] = len(SCHEMAS) + len(schema_ids) + 1
                 schema = Schema(schema_ids[name], file_descriptor_set(message), "protobuf", name)
                 self._writer.add_schema(schema)
             self._writer.add_channel(
@@ -264,7 +196,8 @@ class _Visualization:
         self._sequences[topic] += 1
         channel_id = self._ids[topic]
         payload = message.SerializeToString()
-        self._writer.add(encode_message(channel_id, self._sequences[topic], log_ns, stamp, payload))
+        # The time of a sender whose clock is before 1970 is negative; MCAP has no negative times.
+        self._writer.add(encode_message(channel_id, self._sequences[topic], log_ns, max(stamp, 0), payload))
 
 
 def _scene(shapes: list[VisualShape]) -> Any:

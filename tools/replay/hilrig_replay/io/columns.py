@@ -82,6 +82,9 @@ COMMAND_DTYPE: Final = np.dtype(
         ("sent_ns", "<i8"),
         ("state_injected_ns", "<i8"),
         ("command_injected_ns", "<i8"),
+        ("positions_acknowledged_ns", "<i8"),
+        ("read_sent_ns", "<i8"),
+        ("stale_read_sent_ns", "<i8"),
         ("log_ns", "<i8"),
         ("sequence", "<u4"),
         ("resets", "<u4"),
@@ -91,6 +94,7 @@ COMMAND_DTYPE: Final = np.dtype(
         ("magnet", "|b1"),
         ("safe", "|b1"),
         ("basis_on_other_connection", "|b1"),
+        ("basis_is_bound", "|b1"),
     ]
 )
 """One row per `TorqueCommand`, units as in torque_command.proto; `session` and `controller` are codes of a
@@ -298,6 +302,9 @@ def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
             message.sent_ns,
             message.state_injected_ns,
             message.command_injected_ns,
+            message.positions_acknowledged_ns,
+            message.read_sent_ns,
+            message.stale_read_sent_ns,
             log_ns,
             sequence,
             message.resets,
@@ -307,6 +314,7 @@ def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
             message.magnet,
             message.safe,
             message.basis_on_other_connection,
+            message.basis_is_bound,
         )
 
     return decode

@@ -1,4 +1,4 @@
-"""Beginning and duration of a recording, from the states in its first and its last chunk.
+"""Beginning and duration of a recording, from its first and its last state.
 
 The arrival at the recorder is no measure: after an outage, the states of half a minute arrive at once. Nor is the wall
 clock, which can be set. Two states of one simulation differ by its monotonic clock.
@@ -14,6 +14,13 @@ from hilrig_recorder.mcap_format.records import DamagedError, Message
 from hilrig_schemas import JointState
 
 
+class StateRange(NamedTuple):
+    """The first and the last state of a recording."""
+
+    first: JointState
+    last: JointState
+
+
 class Extent(NamedTuple):
     """Beginning and duration of the states of a recording."""
 
@@ -26,9 +33,9 @@ class Extent(NamedTuple):
 MAX_DURATION_S: Final = 1e9
 
 
-def state_extent(
+def state_range(
     reader: RecordReader, chunks: Iterable[tuple[int, int]], reverse: Iterable[tuple[int, int]], channel: int
-) -> Extent | None:
+) -> StateRange | None:
     """Read the first and the last state of a file; None: it has no state.
 
     Args:
@@ -53,7 +60,12 @@ def state_extent(
             last = message
         if last is not None:
             break
-    begin, end = _decode(first), _decode(last or first)
+    return StateRange(_decode(first), _decode(last or first))
+
+
+def extent_of(states: StateRange) -> Extent:
+    """Beginning and duration of a recording with these first and last states."""
+    begin, end = states
     duration_ns = end.sampled_ns - begin.sampled_ns
     if end.incarnation != begin.incarnation:
         # The clock of a restarted simulation can be that of another host.

@@ -41,12 +41,13 @@ def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 @contextlib.contextmanager
-def output_file(path: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
+def output_file(path: Path, inputs: Iterable[Path] = (), *, mode: int = 0o666) -> Iterator[Path]:
     """Yield the path of a new file in the same folder, which gets the name `path` when the block succeeds.
 
     Args:
         path: the output file. A device is written directly.
         inputs: the files that the command reads.
+        mode: access rights of the file, without those of the process's umask.
 
     Raises:
         InputError: as `check_output`.
@@ -62,7 +63,7 @@ def output_file(path: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
         target = path.resolve()
         # A short name: that of the target may have the maximum length. The suffix selects the format of a plot.
         temporary = target.with_name(f".hilrig-{secrets.token_hex(4)}{target.suffix[:8]}")
-        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
         try:
             yield temporary
             check_output(path, inputs)

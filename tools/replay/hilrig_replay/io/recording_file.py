@@ -26,7 +26,7 @@ from hilrig_recorder.mcap_format.reader import (
 from hilrig_recorder.mcap_format.records import MAX_TIME_NS, Chunk, ChunkIndex, DamagedError, Message
 from hilrig_recorder.mcap_format.scan import Damage, read_chunk, scan
 from hilrig_replay.io.columns import RowBuffer, Rows
-from hilrig_replay.io.extent import Extent, state_extent
+from hilrig_replay.io.extent import Extent, StateRange, extent_of, state_range
 from hilrig_runtime.errors import InputError
 from hilrig_schemas.topics import RECORDED
 
@@ -57,8 +57,7 @@ class RecordingFile:
     path: Path
     metadata: dict[str, dict[str, str]]
     """Metadata values by record name, then by key."""
-    attachments: dict[str, bytes]
-    """Content of the attachments by name."""
+    attachment_records: tuple[Attachment, ...]
     counts: dict[str, int]
     """Number of messages by topic."""
     start_ns: int
@@ -103,24 +102,44 @@ class RecordingFile:
         except (DamagedError, OSError) as error:
             raise DamagedRecordingError(self.path, str(error)) from error
 
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files that it is read from."""
+        return (self.path,)
+
     @cached_property
+    def attachments(self) -> dict[str, bytes]:
+        """Content of the attachments by name; of several with one name the last."""
+        return {item.name: item.data for item in self.attachment_records}
+
+    @property
     def extent(self) -> Extent:
         """Beginning and duration of the states; without states, or an index of them, of the arrivals.
 
         Raises:
             InputError: the file is damaged.
         """
-        found = None
+        if self.states is None:
+            return Extent(self.start_ns, (self.end_ns - self.start_ns) / 1e9)
+        return extent_of(self.states)
+
+    @cached_property
+    def states(self) -> StateRange | None:
+        """The first and the last state; None: there are no states, or no index of them.
+
+        Raises:
+            InputError: the file is damaged.
+        """
         channels = [channel for channel, topic in self.topics.items() if topic == "state"]
         chunks = self._select_chunks(channels, -1, MAX_TIME_NS)
         try:
             if channels and len(chunks):
                 with open_file(self.path) as stream:
                     places = [(int(chunk["offset"]), int(chunk["length"])) for chunk in chunks]
-                    found = state_extent(file_reader(stream), places, places[::-1], channels[0])
+                    return state_range(file_reader(stream), places, places[::-1], channels[0])
         except (DamagedError, OSError) as error:
             raise DamagedRecordingError(self.path, str(error)) from error
-        return found or Extent(self.start_ns, (self.end_ns - self.start_ns) / 1e9)
+        return None
 
     def _select_chunks(self, channels: Iterable[int], low: int, high: int) -> Rows:
         """The chunks that may contain messages of the given channels in a time range."""
@@ -138,7 +157,7 @@ class _FileContents:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     """Number of messages by channel id."""
     start_ns: int = 0
@@ -154,7 +173,7 @@ class _FileContents:
         elif isinstance(record, Metadata):
             add_metadata(self.metadata, record, offset)
         elif isinstance(record, Attachment):
-            self.attachments[record.name] = record.data
+            self.attachments.append(record)
         elif isinstance(record, Message):
             if not self.counts:
                 self.start_ns = self.end_ns = record.log_time
@@ -185,21 +204,22 @@ def open_recording(path: Path) -> RecordingFile:
         raise InputError(f"{path}: {unfinished}{error}: run `hilrig recover {path}` to complete it") from error
     except DamagedError as error:
         raise DamagedRecordingError(path, str(error)) from error
+    chunks = contents.chunks.drain()
+    chunks = chunks[np.argsort(chunks["offset"], kind="stable")]
     topics = _topics(path, contents)
     counts = dict.fromkeys(RECORDED, 0)
     for channel, count in contents.counts.items():
         if channel in topics:
             counts[topics[channel]] += count
-    chunks = contents.chunks.drain()
     return RecordingFile(
         path=path,
         metadata=contents.metadata,
-        attachments=contents.attachments,
+        attachment_records=tuple(contents.attachments),
         counts=counts,
         start_ns=contents.start_ns,
         end_ns=contents.end_ns,
         topics=topics,
-        _chunks=chunks[np.argsort(chunks["offset"], kind="stable")],
+        _chunks=chunks,
     )
 
 

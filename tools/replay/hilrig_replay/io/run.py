@@ -5,18 +5,19 @@ blocks, so one pass needs the same memory for a minute and for a day; `between` 
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from hilrig_replay.io.columns import Rows, StringTable
-from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile, open_recording
+from hilrig_replay.io.joined_recording import open_segments
+from hilrig_replay.io.recording_file import DamagedRecordingError, RecordingFile
 from hilrig_replay.io.records import Decoder, Records, concatenate_records
 from hilrig_replay.io.sequence_order import Repairs, in_sequence
 from hilrig_replay.io.timebase import Timebase
@@ -201,6 +202,26 @@ class Run:
         """All Modbus requests, shape (n,), fields as `columns.TRAFFIC_DTYPE`."""
         return self._read_all("traffic").traffic
 
+    def frame(self, table: str, library: str = "pandas") -> Any:
+        """One table of the run as a data frame: `state`, `command`, `event` or `traffic`, SI units as in the schemas.
+
+        A joint vector becomes four columns, a code its text, and `time_s` is the time from the first state.
+
+        Args:
+            table: name of the table.
+            library: `pandas` or `polars`.
+
+        Raises:
+            InputError: unknown name.
+            OperationError: the library is not installed.
+        """
+        from hilrig_replay.io.frames import tables
+
+        if table not in tables.TABLES:
+            raise InputError(f"table: expected one of {', '.join(tables.TABLES)}, got {table!r}")
+        rows = tables.TABLES[table](self._read_all(table))
+        return tables.frame(tables.table(self, rows), library)
+
     def between(self, from_s: float, until_s: float, topics: frozenset[str] = ALL_TOPICS) -> Records:
         """Messages that were sent in a time range, `until_s` excluded; only that part of the file is read."""
         low, high = (self.start_wall_ns + round(limit * 1e9) for limit in (from_s, until_s))
@@ -259,11 +280,25 @@ class Run:
                 count += 1
                 if count >= rows:
                     count = 0
-                    yield decoder.drain()
+                    yield self._checked(decoder.drain())
         except (DecodeError, struct.error, OverflowError) as error:
             raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:
-            yield decoder.drain()
+            yield self._checked(decoder.drain())
+
+    def _checked(self, records: Records) -> Records:
+        """Refuse numbers that no simulation sends, before anything is computed from them."""
+        for rows, names in (
+            (records.states, ("position", "velocity", "effort")),
+            (records.commands, ("effort",)),
+            (records.parts, ("x", "y", "z", "yaw")),
+        ):
+            for name in names:
+                finite = np.isfinite(rows[name])
+                if not finite.all():
+                    wrong = rows[name][~finite][0]
+                    raise InputError(f"{self.path}: unusable content: {name} is {wrong}; expected finite numbers")
+        return records
 
     def _read_all(self, topic: str) -> Records:
         return concatenate_records(list(self.blocks(frozenset({topic}))))
@@ -279,10 +314,10 @@ class Run:
         return self.timebase.time_ns(rows)
 
 
-def open_run(path: Path | str) -> Run:
-    """Open a recording; its arrays are read on first access.
+def open_run(files: Path | str | Sequence[Path]) -> Run:
+    """Open a recording, or the segments of a session as one run; the arrays are read on first access.
 
     Raises:
-        InputError: the file is missing, not a recording, empty, truncated, damaged, or of a newer version.
+        InputError: a file is missing, not a recording, empty, truncated, damaged, or of a newer version.
     """
-    return Run(open_recording(Path(path)))
+    return Run(open_segments([Path(files)] if isinstance(files, Path | str) else files))

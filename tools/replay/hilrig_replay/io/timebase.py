@@ -13,6 +13,8 @@ MAX_BEFORE_START_NS: Final = 10_000_000_000
 """Longest time from the first row of a run to its first state."""
 STEP_TOLERANCE_NS: Final = 100_000_000
 """A step is noticed at the next row of its service, which may be later than a row of another service."""
+MAX_STEPS: Final = 100
+"""Up to this number of steps, each of them is considered for each row."""
 
 
 class Timebase:
@@ -38,7 +40,7 @@ class Timebase:
         """Add commands, fields as `columns.COMMAND_DTYPE`, after the states of their block."""
         if len(commands) and not self._edge_base_ns and self.start_wall_ns:
             (first,) = self._sim_clock.without_steps(commands["wall_ns"][:1]).tolist()
-            self._edge_base_ns = first - int(commands["sent_ns"][0])
+            self._edge_base_ns = _int64(first - int(commands["sent_ns"][0]))
         self._edge_clock.update(commands["wall_ns"], commands["sent_ns"], self.start_wall_ns)
 
     def update(self, states: Rows) -> None:
@@ -54,25 +56,25 @@ class Timebase:
             incarnation = int(row["incarnation"])
             if incarnation not in self._offsets:
                 axis_ns = int(row["wall_ns"]) - self.start_wall_ns - self._sim_clock.step_ns
-                self._offsets[incarnation] = axis_ns - int(row["sampled_ns"])
+                self._offsets[incarnation] = _int64(axis_ns - int(row["sampled_ns"]))
         self._sim_clock.update(states["wall_ns"], states["sampled_ns"], self.start_wall_ns)
-        self._anchor = (int(states["wall_ns"][-1]), int(states["step"][-1]))
+        self._anchor = (int(states["wall_ns"][-1]), _int64(int(states["step"][-1])))
 
     def time_ns(self, rows: Rows) -> NDArray[np.int64]:
         """Times at which the rows were sent, ns from the first state of the run, shape as `rows`."""
         names = rows.dtype.names or ()
         if "sampled_ns" not in names:
             return np.asarray(self._wall_ns(rows) - self.start_wall_ns - self.origin_ns)
-        times = rows["sampled_ns"].copy()
-        incarnations = rows["incarnation"]
-        for incarnation, offset in self._offsets.items():
-            times[incarnations == incarnation] += offset
-        return np.asarray(times - self.origin_ns)
+        if len(self._offsets) == 1:
+            return np.asarray(rows["sampled_ns"] + _int64(next(iter(self._offsets.values())) - self.origin_ns))
+        found, place = np.unique(rows["incarnation"], return_inverse=True)
+        offsets = np.array([self._offsets.get(incarnation, 0) for incarnation in found.tolist()], np.int64)
+        return np.asarray(rows["sampled_ns"] + offsets[place] - self.origin_ns)
 
     def steps(self, rows: Rows, step_ns: int) -> NDArray[np.int64]:
         """Simulation step of each row, shape as `rows`; estimated from the wall clock if a row has no step."""
         wall_ns, step = self._anchor
-        anchor_ns = wall_ns - self._sim_clock.step_ns
+        anchor_ns = _int64(wall_ns - self._sim_clock.step_ns)
         estimated = np.maximum(step + (self._wall_ns(rows) - anchor_ns) // step_ns, 0)
         if "step" not in (rows.dtype.names or ()):
             return np.asarray(estimated)
@@ -138,15 +140,22 @@ class _WallClock:
         corrected = np.empty(len(wall_ns), np.int64)
         current = 0
         for row, wall in enumerate(wall_ns.tolist()):
-            best = None
-            for number, total in enumerate(self._sums):
-                axis_ns = wall - self._start_ns - total
+
+            def rank(number: int, wall: int = wall, current: int = current) -> tuple[int, bool, int]:
+                axis_ns = wall - self._start_ns - self._sums[number]
                 # The row belongs to the time between two steps in which this sum was in force.
                 outside_ns = max(begins[number] - axis_ns, axis_ns - begins[number + 1], 0)
                 # Of several, that of the row before, or the next later one.
-                rank = (outside_ns // STEP_TOLERANCE_NS, number < current, number)
-                best = min(best or (rank, number), (rank, number))
-            assert best is not None
-            current = best[1]
-            corrected[row] = wall - self._sums[current]
+                return outside_ns // STEP_TOLERANCE_NS, number < current, number
+
+            # A damaged or forged run may have a step at each row: only the nearest ones are tried then.
+            few = len(self._sums) <= MAX_STEPS
+            tried = range(len(self._sums)) if few else range(max(0, current - 2), min(len(self._sums), current + 3))
+            current = min(tried, key=rank)
+            corrected[row] = _int64(wall - self._sums[current])
         return corrected
+
+
+def _int64(number: int) -> int:
+    """A number in the range of the arrays; differences of impossible timestamps exceed it."""
+    return max(-(1 << 63), min(number, (1 << 63) - 1))

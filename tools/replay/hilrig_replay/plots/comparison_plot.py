@@ -22,7 +22,7 @@ def save_comparison_plot(comparison: Comparison, path: Path) -> None:
         InputError: the path is not usable.
         OperationError: the file can't be written.
     """
-    inputs = [run.path for run in comparison.runs]
+    inputs = [path for run in comparison.runs for path in run.file.paths]
     check_plot_path(path, inputs)
     save_figure(comparison_figure(comparison.summaries), path, inputs)
 

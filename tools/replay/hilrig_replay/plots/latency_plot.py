@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from hilrig_replay.analysis.distribution import complementary_cdf
 from hilrig_replay.analysis.latency import LatencyReport
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.axes_style import label_axes, set_log_scale
@@ -23,6 +22,8 @@ from hilrig_runtime.escaping import plot_text
 Floats = NDArray[np.float64]
 
 _PERCENTILE_COLOR: Final = "#d62728"
+MAX_HISTOGRAM_STEPS: Final = 500
+"""Largest extent of the histogram, steps of the simulation: damaged timestamps would make it arbitrarily large."""
 _MAX_HISTORY_POINTS: Final = 4000
 """Points of the plot over time: a few per pixel."""
 
@@ -39,10 +40,10 @@ def save_plot(report: LatencyReport, run: Run, path: Path) -> None:
         InputError: the run has no latency samples, or the path is not usable.
         OperationError: the file can't be written.
     """
-    check_plot_path(path, [run.path])
+    check_plot_path(path, run.file.paths)
     if report.loop_ms is None:
         raise InputError(f"{run.path}: no latency samples to plot")
-    save_figure(latency_figure(report, run), path, [run.path])
+    save_figure(latency_figure(report, run), path, run.file.paths)
 
 
 def latency_figure(report: LatencyReport, run: Run) -> Figure:
@@ -71,7 +72,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
     statistics, step = report.loop_ms, report.step_ms
     assert statistics is not None
     # Outliers beyond the limit would compress the histogram: they are counted in its title and shown in the tail plot.
-    limit = max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step)
+    limit = min(max(step * np.ceil(statistics.p999 / step + 0.25), 2 * step), MAX_HISTOGRAM_STEPS * step)
     edges = np.arange(0, limit + step / 80, step / 40)
     counts, beyond = np.zeros(len(edges) - 1, np.int64), 0
     for loop_ns in report.table.column("loop")():
@@ -92,7 +93,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
         near_right = value > 0.75 * limit
         axes.annotate(
             f"{name} {value:.2f} ms",
-            (value, 0.97 - 0.07 * row),
+            (min(value, limit), 0.97 - 0.07 * row),
             xycoords=("data", "axes fraction"),
             xytext=(-4 if near_right else 4, 0),
             textcoords="offset points",
@@ -109,7 +110,7 @@ def _histogram(axes: Axes, report: LatencyReport) -> None:
 
 
 def _stages(axes: Axes, report: LatencyReport) -> None:
-    for row, stage in enumerate(LOOP_STAGES):
+    for row, stage in enumerate(report.stages):
         statistics = report.stages_ms[stage.key]
         axes.barh(row, statistics.p50, color=stage.color, height=0.6)
         axes.plot([statistics.p50, statistics.p99], [row, row], color=TEXT_COLOR, linewidth=1.2)
@@ -123,7 +124,7 @@ def _stages(axes: Axes, report: LatencyReport) -> None:
             fontsize=8,
             color=TEXT_COLOR,
         )
-    axes.set_yticks(range(len(LOOP_STAGES)), [stage.title for stage in LOOP_STAGES])
+    axes.set_yticks(range(len(report.stages)), [stage.title for stage in report.stages])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max(1e-3, *(statistics.p99 for statistics in report.stages_ms.values())))
     label_axes(axes, "Stage latencies (bar and number: p50, line: p99)", "latency, ms", "")

@@ -11,14 +11,15 @@ from hilrig_replay.analysis.diagnosis.evidence import sections
 from hilrig_replay.analysis.distribution import STATISTICS_TITLES
 from hilrig_replay.analysis.intervals import cells
 from hilrig_replay.analysis.similarity import find_similar
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import RunSummary, summarize
 from hilrig_replay.analysis.verify import Verification, verify
 from hilrig_replay.geometry.scene import parameters_of
+from hilrig_replay.grading.overlap import overlapping
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import display_names
 from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.io.segments import RunFiles, as_files
 from hilrig_replay.plots.distribution_plot import distribution_figure
 from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.plots.motion_plot import motion_figure
@@ -60,10 +61,12 @@ class Report:
     """Reason why a recording is not in the report, one sentence per recording."""
     same_torques: tuple[str, ...]
     """Pairs of runs with the same torques, one sentence per pair."""
+    overlaps: tuple[str, ...]
+    """Manual recordings of other runs, which are not graded; one sentence per recording."""
 
 
 def build_report(
-    paths: Sequence[Path],
+    runs: Sequence[Path | RunFiles],
     *,
     verified: bool = False,
     task: TaskConfig | None = None,
@@ -75,7 +78,7 @@ def build_report(
     """Build the report of one run, or of several with a ranking; unreadable recordings are listed in the report.
 
     Args:
-        paths: recordings.
+        runs: recordings, each of one file or several segments.
         verified: re-simulate each run and report whether the result is identical.
         task: grading task for all runs; None: the task in each recording's lab.toml.
         on_progress: called with the completed share of the runs, 0 to 1.
@@ -88,22 +91,44 @@ def build_report(
     """
     pages: list[_Page] = []
     left_out: list[str] = []
-    for done, one in enumerate(_pages(paths, verified, task, workers), start=1):
+    for done, one in enumerate(_pages(runs, verified, task, workers), start=1):
         if isinstance(one, _Page):
             pages.append(one)
-        elif len(paths) == 1:
+        elif len(runs) == 1:
             raise one
         else:
             left_out.append(str(one))
         if on_progress is not None:
-            on_progress(done / len(paths))
+            on_progress(done / len(runs))
     if not pages:
         raise InputError("no readable recording:\n" + "\n".join(left_out))
-    pages.sort(key=_rank)
+    pages = sorted(_marked(pages), key=_rank)
     verdicts = [{} if page.verified is None else {"verify": page.verified.as_dict()} for page in pages]
     values = tuple({**page.summary.as_dict(), **verdict} for page, verdict in zip(pages, verdicts, strict=True))
     pairs = _same_torques(pages)
-    return Report(_html(pages, left_out, pairs, title, introduction), values, tuple(left_out), pairs)
+    overlaps = tuple(
+        f"{page.summary.name}: recorded manually at the time of {', '.join(page.summary.overlaps)}: not graded"
+        for page in pages
+        if _is_second_recording(page)
+    )
+    return Report(
+        _html(pages, left_out, pairs, overlaps, title, introduction), values, tuple(left_out), pairs, overlaps
+    )
+
+
+def _marked(pages: Sequence[_Page]) -> list[_Page]:
+    """The pages with the sessions that overlap; a manual recording of a controller's session is not graded."""
+    marked = []
+    for page, sessions in zip(pages, overlapping([page.summary.span for page in pages]), strict=True):
+        summary = replace(page.summary, overlaps=sessions)
+        if sessions and summary.span.is_manual:
+            summary = replace(summary, grade=None, placement=None)
+        marked.append(replace(page, summary=summary))
+    return marked
+
+
+def _is_second_recording(page: _Page) -> bool:
+    return bool(page.summary.overlaps) and page.summary.span.is_manual
 
 
 def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
@@ -119,7 +144,14 @@ def _same_torques(pages: Sequence[_Page]) -> tuple[str, ...]:
     )
 
 
-def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str], title: str, introduction: str) -> str:
+def _html(
+    pages: Sequence[_Page],
+    left_out: Sequence[str],
+    pairs: Sequence[str],
+    overlaps: Sequence[str],
+    title: str,
+    introduction: str,
+) -> str:
     if len(pages) == 1 and not left_out:
         summary = pages[0].summary
         title = title or f"Run {summary.session}"
@@ -135,7 +167,11 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str],
             f"{_run(number, page)}</details>"
             for number, page in enumerate(pages, start=1)
         )
-        notes = _list_section("Skipped recordings", left_out) + _list_section("Runs with the same torques", pairs)
+        notes = (
+            _list_section("Skipped recordings", left_out)
+            + _list_section("Runs with the same torques", pairs)
+            + _list_section("Second recordings of a session", overlaps)
+        )
         body = f"<h1>{as_html(title)}</h1>{introduction}{_overview(pages)}{notes}{details}"
     scripts = "".join(f"<script>{script}</script>" for script in assets.scripts())
     return (
@@ -148,12 +184,14 @@ def _html(pages: Sequence[_Page], left_out: Sequence[str], pairs: Sequence[str],
 
 
 def _pages(
-    paths: Sequence[Path], verified: bool, task: TaskConfig | None, workers: int | None
+    runs: Sequence[Path | RunFiles], verified: bool, task: TaskConfig | None, workers: int | None
 ) -> Iterator[_Page | HilrigError]:
-    """Page of each run, or the reason why it is missing, in the order of `paths`."""
+    """Page of each run, or the reason why it is missing, in the order of `runs`."""
+    files = list(map(as_files, runs))
+    paths = [run[0] for run in files]
     names = display_names(paths)
     rows = min(MAX_ROWS, _MAX_ROWS_OF_GROUP // len(paths))
-    tasks = paths, [names[path] for path in paths], repeat(verified), repeat(task), repeat(rows)
+    tasks = files, [names[path] for path in paths], repeat(verified), repeat(task), repeat(rows)
     if workers == 1 or len(paths) < _MIN_RUNS_FOR_PROCESSES:
         yield from map(_page_or_error, *tasks)
     else:
@@ -162,11 +200,11 @@ def _pages(
 
 
 def _page_or_error(
-    path: Path, name: str, verified: bool, task: TaskConfig | None, max_rows: int
+    files: RunFiles, name: str, verified: bool, task: TaskConfig | None, max_rows: int
 ) -> _Page | HilrigError:
     try:
-        with isolated(path):
-            return _page(open_run(path), name, verified, task, max_rows)
+        with isolated(files[0]):
+            return _page(open_run(files), name, verified, task, max_rows)
     except HilrigError as error:
         # The exceptions of recordings can't be sent between processes.
         return OperationError(str(error)) if isinstance(error, OperationError) else InputError(str(error))
@@ -187,7 +225,7 @@ def _page(run: Run, name: str, verified: bool, task: TaskConfig | None, max_rows
     columns = timeline(run, summary.latency, parameters, targets, summary.grade, max_rows=max_rows)
     # Frees the samples once they are drawn: a group may have many runs.
     summary = replace(summary, name=name, latency=summary.latency.without_table())
-    return _Page(summary, motion, latency, columns, verify(run.path) if verified else None)
+    return _Page(summary, motion, latency, columns, verify(run.file.paths) if verified else None)
 
 
 def _run(number: int, page: _Page) -> str:
@@ -215,7 +253,8 @@ def _origin(summary: RunSummary) -> str:
 def _session_and_origin(summary: RunSummary) -> str:
     # For a renamed file, also the session under which it was recorded.
     session = "" if summary.name == summary.session else f"{summary.session} · "
-    return session + _origin(summary)
+    overlaps = f" · overlaps with {', '.join(summary.overlaps)}" if summary.overlaps else ""
+    return session + _origin(summary) + overlaps
 
 
 def _facts(page: _Page) -> str:
@@ -275,7 +314,7 @@ def _latency(summary: RunSummary) -> str:
     if latency.loop_ms is not None:
         known = latency.intervals_ms
         rows.append(["loop", *cells(latency.loop_ms, known["loop"])])
-        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in LOOP_STAGES]
+        rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in latency.stages]
     if latency.age_ms is not None:
         rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
     rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])
@@ -369,6 +408,8 @@ def _or_dash(value: float | None, digits: int = 2) -> str:
 
 def _rank(page: _Page) -> tuple[float, ...]:
     task, grade = page.summary.placement, page.summary.grade
+    if _is_second_recording(page):
+        return (2.0,)
     # Without a controller the tool path is the shortest, so that such a run comes last among equals.
     path_m = page.summary.motion.tool_path_m if page.summary.latency.samples else float("inf")
     if grade is not None:

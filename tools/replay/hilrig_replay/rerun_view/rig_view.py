@@ -380,7 +380,8 @@ class RerunRigWriter:
     def _times(self, rows: Rows) -> list[rr.TimeColumn]:
         return [
             rr.TimeColumn(SIM_TIME, duration=self._timebase.time_ns(rows).astype("timedelta64[ns]")),
-            rr.TimeColumn(WALL, timestamp=rows["wall_ns"].astype("datetime64[ns]")),
+            # The smallest number of 64 bits means that there is no time.
+            rr.TimeColumn(WALL, timestamp=np.maximum(rows["wall_ns"], -(1 << 62)).astype("datetime64[ns]")),
             rr.TimeColumn(STEP, sequence=self._timebase.steps(rows, self._geometry.step_ns)),
         ]
 

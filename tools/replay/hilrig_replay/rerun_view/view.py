@@ -36,7 +36,7 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
         OperationError: the file can't be written.
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
-    with output_file(path, [run.path for run in chosen]) as temporary:
+    with output_file(path, [path for run in chosen for path in run.file.paths]) as temporary:
         _write(to_file(temporary, _name(chosen), _layout(chosen)), chosen, file=path)
 
 

@@ -118,8 +118,8 @@ def evaluate_gains(run: Run, study: StudyConfig | None = None) -> GainReport:
     """
     report = measure(run)
     chain = age_chain(recorded_ages(report))
-    assert report.loop_ms is not None
-    assert report.age_ms is not None
+    if report.loop_ms is None or report.age_ms is None:
+        raise InputError(f"{run.path}: no latency to evaluate: {report.reason_text()}")
     rig = RigParameters.from_json(run.parameters_json)
     pose = np.clip(
         np.median(run.states["position"], axis=0),

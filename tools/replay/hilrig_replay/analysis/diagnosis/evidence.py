@@ -73,14 +73,14 @@ class Evidence:
     windows: Sequence[Records]
     """Messages of windows that are evenly spread over the run."""
     duration_s: float
+    client_role: bool = False
+    """Whether the edge was the client of the controller."""
     age: LoopAge | None = None
     """None: no command that is based on a state took effect."""
     stalls: Stalls = NO_STALLS
     """Ticks that were late by more than one step."""
     edge_stalls: Stalls = NO_STALLS
     """Stalls of the edge, reported by it or found in the request log."""
-    stolen_ns: int = 0
-    """CPU steal time during the stalls."""
     watchdog_gaps: int = 0
     """Trips of the watchdog after which the controller wrote again."""
     gains: RoundingGains = NO_GAINS

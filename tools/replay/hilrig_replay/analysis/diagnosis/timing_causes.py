@@ -309,27 +309,6 @@ def simulation_stall(evidence: Evidence) -> Finding | None:
     )
 
 
-def cpu_steal(evidence: Evidence) -> Finding | None:
-    """Stalls of the services in which the host of the virtual machine took the processors."""
-    stalls = [one for one in (evidence.stalls, evidence.edge_stalls) if one.count]
-    if not stalls or not evidence.stolen_ns:
-        return None
-    longest_ns = max(one.longest_ns for one in stalls)
-    if evidence.stolen_ns < 0.5 * longest_ns:
-        return None
-    stolen_ms = evidence.stolen_ns / MS
-    return _cause(
-        evidence,
-        "cpu_steal",
-        f"the host of the virtual machine took {stolen_ms:.0f} ms of processor time (CPU steal) around the stalls of "
-        f"the services, the longest of {longest_ns / MS:.0f} ms",
-        "a machine of its own, or a virtual machine with reserved processors",
-        _per_time(evidence, max(one.area_ns2 for one in stalls)),
-        stolen_ms=stolen_ms,
-        longest_ms=longest_ns / MS,
-    )
-
-
 def injected_delay(evidence: Evidence) -> Finding | None:
     """Delay that was injected by a configured impairment."""
     total_ns, largest_ns = 0.0, 0.0
@@ -431,7 +410,6 @@ RULES: Final[tuple[Rule, ...]] = (
     computing_time,
     network,
     retransmissions,
-    cpu_steal,
     edge_stall,
     simulation_stall,
     injected_delay,
@@ -439,7 +417,11 @@ RULES: Final[tuple[Rule, ...]] = (
     watchdog_gaps,
     competing_clients,
 )
-RARE: Final = frozenset({"retransmissions", "cpu_steal", "edge_stall", "simulation_stall", "watchdog_gaps"})
+OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
+    {previous_poll, delayed_acknowledgement, wait_before_write, slow_polling, computing_time, beating}
+)
+"""Rules about a program that polls the rig; in the client role the edge itself polls."""
+RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "watchdog_gaps"})
 SUPPRESSED: Final = {
     "open_loop": frozenset(rule.__name__ for rule in RULES[1:]),
     "delayed_acknowledgement": frozenset({"wait_before_write", "slow_polling", "computing_time", "network", "beating"}),
@@ -447,7 +429,6 @@ SUPPRESSED: Final = {
     "computing_time": frozenset({"beating"}),
     "slow_polling": frozenset({"beating"}),
     "network": frozenset({"beating"}),
-    "cpu_steal": frozenset({"edge_stall", "simulation_stall", "watchdog_gaps"}),
     "edge_stall": frozenset({"watchdog_gaps"}),
     "simulation_stall": frozenset({"watchdog_gaps"}),
     "retransmissions": frozenset({"watchdog_gaps"}),

@@ -1,0 +1,141 @@
+"""The guides of docs/controllers, followed literally in an empty folder: from the installation to the arm at 30°.
+
+Each needs minutes and packages from the network, so the tests run only if HILRIG_LONG is set. The programs of the
+guides are also tested with each change, by tests/rig/test_modbus_controllers.py.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from support.clients import mbpoll_read
+from support.edge_rig import RawClient
+from support.guides import commands, write_programs
+from support.labs import RunningLab, write_lab
+from support.waiting import eventually
+
+pytestmark = [
+    pytest.mark.rig,
+    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),
+]
+
+GOAL = (30.0, -45.0, 50.0, 20.0)
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[RunningLab]:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    with RunningLab(write_lab(folder)) as lab:
+        yield lab
+
+
+def require(*programs: str) -> None:
+    for program in programs:
+        if shutil.which(program) is None:
+            pytest.skip(f"needs {program}")
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a user: without this environment of Python."""
+    hidden = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
+    path = [folder for folder in os.environ["PATH"].split(":") if folder != str(Path(sys.executable).parent)]
+    return {name: value for name, value in os.environ.items() if name not in hidden} | {"PATH": ":".join(path)}
+
+
+def run(lines: list[str], folder: Path) -> str:
+    """Run command lines in one shell, which ends at the first that fails."""
+    done = subprocess.run(
+        ["bash", "-e", "-c", "\n".join(lines)],
+        cwd=folder,
+        env=environment(),
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=400,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def positions(port: int) -> list[float]:
+    with RawClient("127.0.0.1", port) as client:
+        return [(word - 65536 if word > 32767 else word) / 100 for word in client.read(4, 4)]
+
+
+def is_at_goal(port: int) -> bool:
+    return max(abs(goal - position) for goal, position in zip(GOAL, positions(port), strict=True)) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("guide", "programs"),
+    [("python", ["python3"]), ("c", ["gcc", "pkg-config"]), ("nodejs", ["node", "npm"])],
+)
+def test_guide_is_followed_literally(lab: RunningLab, tmp_path: Path, guide: str, programs: list[str]) -> None:
+    require(*programs)
+    write_programs(guide, tmp_path, lab.port)
+    output = run(commands(guide, lab.port), tmp_path)
+    assert ("at the end" in output) == (guide != "c") or "error at the end" in output
+
+
+def test_program_of_the_guide_runs_with_pymodbus_2(lab: RunningLab, tmp_path: Path) -> None:
+    require("python3")
+    write_programs("python", tmp_path, lab.port)
+    program = (tmp_path / "hold.py").read_text(encoding="utf-8")
+    new, old = "from pymodbus.client import ModbusTcpClient", "from pymodbus.client.sync import ModbusTcpClient"
+    assert new in program
+    (tmp_path / "hold.py").write_text(program.replace(new, old), encoding="utf-8")
+    lines = ["python3 -m venv venv", ". venv/bin/activate", "pip install pymodbus==2.5.*", "python hold.py 5"]
+    assert "at the end" in run(lines, tmp_path)
+
+
+@pytest.mark.parametrize("flow", ["hold.json", "hold_modbustcp.json"])
+def test_node_red_flow_holds_the_arm(lab: RunningLab, tmp_path: Path, flow: str) -> None:
+    require("node", "npm")
+    write_programs("node-red", tmp_path, lab.port)
+    text = (tmp_path / flow).read_text(encoding="utf-8")
+    (tmp_path / flow).write_text(text.replace("5020", str(lab.port)), encoding="utf-8")
+    install, start = commands("node-red", lab.port)
+    run([install], tmp_path)
+    with started(start.replace("hold.json", flow).replace("1880", "0"), tmp_path):
+        eventually(lambda: is_at_goal(lab.port))
+        # It stays there.
+        time.sleep(3)
+        assert is_at_goal(lab.port)
+        assert mbpoll_read(lab.port, 8, 1, kind="input") == [2]
+
+
+@contextmanager
+def started(command: str, folder: Path) -> Iterator[None]:
+    """Run a command in the context, with all its child processes."""
+    process = subprocess.Popen(
+        ["bash", "-c", command],
+        cwd=folder,
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        yield
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def test_octave_program_holds_the_arm(lab: RunningLab, tmp_path: Path) -> None:
+    require("octave-cli")
+    check = 'pkg load instrument-control; modbus("tcpip", "127.0.0.1", ' + f"{lab.port});"
+    if subprocess.run(["octave-cli", "--eval", check], check=False, capture_output=True).returncode:
+        pytest.skip("needs Octave's package instrument-control, compiled with libmodbus")
+    write_programs("octave", tmp_path, lab.port)
+    *_, start = commands("octave", lab.port)
+    assert "at the end" in run([start], tmp_path)

@@ -1,0 +1,1 @@
+"""Analysis of recordings of the client role: the controller was a Modbus server."""

@@ -1,0 +1,1 @@
+"""Rows of a recording as tables of other libraries."""
