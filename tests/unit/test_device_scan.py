@@ -60,6 +60,13 @@ def test_pauses_are_left_out() -> None:
     assert scan.scan_ms == pytest.approx(50.0, abs=1.0)
 
 
+def test_overlapping_windows_do_not_shorten_the_scan() -> None:
+    commands = commands_of(50.0)
+    scan = device_scan(np.concatenate((commands[:150], commands[50:])))
+    assert scan is not None
+    assert scan.scan_ms == pytest.approx(50.0, abs=1.0)
+
+
 def test_server_role_and_missing_echo_have_no_scan() -> None:
     commands = commands_of(50.0)
     assert device_scan(commands[:10]) is None

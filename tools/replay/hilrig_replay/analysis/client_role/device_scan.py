@@ -50,7 +50,8 @@ def device_scan(commands: Rows) -> DeviceScan | None:
     stale_ns = scans["stale_read_sent_ns"]
     earliest_ns = np.maximum(stale_ns, scans["state_served_ns"])
     interval_ns = np.diff(latest_ns)
-    regular = interval_ns <= MAX_PERIOD_RATIO * np.median(interval_ns)
+    # Windows of a short run overlap.
+    regular = (interval_ns > 0) & (interval_ns <= MAX_PERIOD_RATIO * np.median(interval_ns))
     period_ns = float(interval_ns[regular].mean())
     acknowledged_ns = scans["positions_acknowledged_ns"]
     low_ns, high_ns = np.median(np.maximum(earliest_ns - acknowledged_ns, 0)), np.median(latest_ns - acknowledged_ns)
