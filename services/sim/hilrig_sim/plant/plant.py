@@ -485,12 +485,14 @@ class Plant:
         error[row, rig] = 0.0
         self._events += self._linear_hits(joint, rig, motion.side, motion.speed)
 
-    def _linear_arguments(self, joint: Ints, rig: Ints, effort: Floats) -> tuple[Floats, ...]:
+    def _linear_arguments(
+        self, joint: Ints, rig: Ints, effort: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
         """Return q, v, acceleration, rate, lower and upper stops of joints at the start of the step, (K,) each."""
         row = joint + 2
         start, start_velocity = self._start_position[row, rig], self._start_velocity[row, rig]
-        coefficients = self.dynamics.linear_coefficients(joint, rig, effort)
-        return start, start_velocity, *coefficients, self._lower[row, rig], self._upper[row, rig]
+        acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
+        return start, start_velocity, acceleration, rate, self._lower[row, rig], self._upper[row, rig]
 
     def _linear_hits(self, joint: Ints, rig: Ints, side: Floats, speed: Floats) -> list[PlantEvent]:
         """Return the impacts of joints 3 and 4; `side`: +1 at the upper stop, -1 at the lower stop, 0: no impact."""
