@@ -5,10 +5,11 @@ solved by trying each set of pushing stops.
 """
 
 import itertools
-from typing import Any
+import math
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from hilrig_sim.arm.model import GRAVITY, ArmParameters
 
@@ -39,6 +40,20 @@ class ReferenceArm:
         k2 = -arm.external_torque_z + s * v[0] ** 2 + arm.friction[1] * v[1]
         return effort[:2] - np.array([k1, k2])
 
+    def _accelerations(self, y: list[float], effort: list[float], held: tuple[int, ...]) -> tuple[float, float]:
+        """Accelerations of joints 1 and 2 in the state (q1, q2, v1, v2): plain numbers, for speed."""
+        arm, (_, theta2, v1, v2) = self.arm, y
+        total = arm.masses[1] + arm.masses[2] + self.payload
+        c, s = (total * arm.l2 * arm.l3 * f(theta2) for f in (math.cos, math.sin))
+        a12, a22 = c + total * arm.l3**2, total * arm.l3**2
+        alpha = arm.l2**2 * (arm.masses[0] + total) + c + a12
+        f1 = effort[0] + arm.external_torque_z + s * (2 * v1 * v2 + v2**2) - arm.friction[0] * v1
+        f2 = effort[1] + arm.external_torque_z - s * v1**2 - arm.friction[1] * v2
+        if held:
+            return (0.0, f2 / a22) if held == (0,) else (f1 / alpha, 0.0) if held == (1,) else (0.0, 0.0)
+        determinant = alpha * a22 - a12 * a12
+        return (a22 * f1 - a12 * f2) / determinant, (alpha * f2 - a12 * f1) / determinant
+
     def step(
         self, q: np.ndarray, v: np.ndarray, effort: np.ndarray, duration: float, upper3: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -68,43 +83,32 @@ class ReferenceArm:
             if side and v == 0 and side * c > 0:
                 return q, 0.0
 
-            def rise(_: float, y: np.ndarray) -> float:
-                return float(y[0] - upper)
+            def position(t: float, start: tuple[float, float] = (q, v)) -> float:
+                q, v = start
+                if rate == 0:
+                    return q + v * t + c / 2 * t * t
+                return q + c / rate * t - (v - c / rate) * math.expm1(-rate * t) / rate
 
-            def fall(_: float, y: np.ndarray) -> float:
-                return float(y[0] - lower)
-
-            def turn(_: float, y: np.ndarray) -> float:
-                return float(y[1])
-
-            for event, direction in ((rise, 1), (fall, -1), (turn, 0)):
-                event.terminal, event.direction = True, direction  # type: ignore[attr-defined]
-
-            def solve(duration: float, events: list[Any], start: tuple[float, float] = (q, v)) -> Any:
-                return solve_ivp(
-                    lambda _, y: [y[1], c - rate * y[1]],
-                    (0, duration),
-                    start,
-                    method="DOP853",
-                    rtol=RTOL,
-                    atol=ATOL,
-                    events=events,
-                )
-
-            # Up to a turning point and from it on, the position is monotonic, so no root of an event is missed.
-            duration = float(solve(left, [turn]).t[-1]) if v * c < 0 else left
-            run = solve(duration, [rise, fall])
-            q, v = run.y[:, -1]
-            if run.status == 1:
-                q = upper if run.t_events[0].size else lower
-            elif duration < left:
-                v = 0.0
-            left -= run.t[-1]
+            # Up to a turning point and from it on, the position is monotonic, so no root is missed.
+            turn = (-v / c if rate == 0 else math.log1p(-rate * v / c) / rate) if v * c < 0 else left
+            until = min(turn, left)
+            end = position(until)
+            limit = upper if end > upper else lower if end < lower else None
+            time = until if limit is None else brentq(lambda t, limit=limit: position(t) - limit, 0, until, xtol=1e-15)
+            q = position(time) if limit is None else limit
+            v = (
+                0.0
+                if limit is None and turn < left
+                else c / rate + (v - c / rate) * math.exp(-rate * time)
+                if rate
+                else v + c * time
+            )
+            left -= time
         return q, v
 
     def _plane(self, q: np.ndarray, v: np.ndarray, effort: np.ndarray, left: float) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = np.array(self.arm.lower[:2]), np.array(self.arm.upper[:2])
-        free = [False, False]
+        free, efforts = [False, False], effort.tolist()
         for _ in range(1000):
             # The impacts of two joints in a corner follow each other ever faster: they end with both at rest.
             for limit in (lower, upper):
@@ -122,17 +126,9 @@ class ReferenceArm:
             _, held = self._complementary(self.mass(q[1]), acceleration, resting)
             free = [False, False]
 
-            def acceleration_of(y: np.ndarray, fixed: tuple[int, ...]) -> np.ndarray:
-                m, f = self.mass(y[1]), self.plane_force(y[:2], y[2:], effort)
-                a = np.zeros(2)
-                rest = [joint for joint in (0, 1) if joint not in fixed]
-                if rest:
-                    a[rest] = np.linalg.solve(m[np.ix_(rest, rest)], f[rest])
-                return a
-
             def reaction(y: np.ndarray, joint: int, held: tuple[int, ...] = held) -> float:
                 m, f = self.mass(y[1]), self.plane_force(y[:2], y[2:], effort)
-                return float(f[joint] - (m @ acceleration_of(y, held))[joint])
+                return float(f[joint] - (m @ self._accelerations(y.tolist(), efforts, held))[joint])
 
             events = []
             for joint in (0, 1):
@@ -149,7 +145,7 @@ class ReferenceArm:
             for event, direction, *_ in events:
                 event.terminal, event.direction = True, direction
             run = solve_ivp(
-                lambda _, y, held=held: np.concatenate([y[2:], acceleration_of(y, held)]),
+                lambda _, y, held=held: [*y[2:], *self._accelerations(y.tolist(), efforts, held)],
                 (0, left),
                 np.concatenate([q, v]),
                 method="DOP853",

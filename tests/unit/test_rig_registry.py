@@ -11,6 +11,7 @@ from hilrig_runtime.config.lab import LabConfig, RigSettings, parse_lab
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.mailbox import OwnerThreadExecutor
 from hilrig_schemas import AddRig, ControlRequest, RemoveRig, RigConfig, ServiceInfo, StartSession, topics
+from hilrig_sim.arm.model import PLANT_VERSION
 from hilrig_sim.parameters import rig_parameters
 from hilrig_sim.plant.plant import Plant
 from hilrig_sim.rig_registry import RigRegistry
@@ -126,7 +127,7 @@ def test_start_event_has_the_step_parameters() -> None:
             "step_ns": 20_000_000,
             "substeps": "auto",
             "integrator": "rkf45",
-            "plant_version": 2,
+            "plant_version": PLANT_VERSION,
         }
 
 

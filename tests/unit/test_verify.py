@@ -176,6 +176,64 @@ def test_finds_a_command_that_differs_from_its_state(run: list[TimedMessage], tm
     assert "differing from the recording: effort or magnet of the command (2 states)" in found.sentence()
 
 
+def _change_loop_latency(state: JointState) -> None:
+    state.loop_latency_ns -= 1_000_000
+
+
+def _change_basis_step(state: JointState) -> None:
+    state.basis_step += 1
+
+
+def _change_lateness(state: JointState) -> None:
+    state.lateness_ns += 1
+
+
+def _change_sampling_time(state: JointState) -> None:
+    state.sampled_ns += 1_000_000
+
+
+def _change_missed_steps(state: JointState) -> None:
+    state.missed_steps += 1
+
+
+def _change_safe(state: JointState) -> None:
+    state.safe = True
+
+
+@pytest.mark.parametrize(
+    ("change", "fields"),
+    [
+        (_change_loop_latency, {"loop latency"}),
+        (_change_basis_step, {"loop latency"}),
+        (_change_lateness, {"tick time"}),
+        (_change_sampling_time, {"loop latency", "tick time"}),
+        (_change_missed_steps, {"tick time"}),
+        (_change_safe, {"effort or magnet of the command"}),
+    ],
+)
+def test_finds_a_change_of_the_times(
+    run: list[TimedMessage], tmp_path: Path, change: Callable[[JointState], None], fields: set[str]
+) -> None:
+    changed = copied(based(run))
+    assert verify(write(tmp_path / "run.mcap", changed), tolerance=0.0).same
+    change(next(state for state in states(changed)[300:] if state.loop_latency_ns))
+    found = verify(write(tmp_path / "run.mcap", changed), tolerance=0.0)
+    assert not found.same
+    assert set(found.differing) == fields
+
+
+def based(made: list[TimedMessage]) -> list[TimedMessage]:
+    """Return a run whose new commands are based on the state two steps before."""
+    changed = copied(made)
+    before: list[JointState] = []
+    for state in states(changed):
+        if len(before) > 1 and state.command_seq != before[-1].command_seq:
+            state.basis_step = before[-2].step
+            state.loop_latency_ns = state.sampled_ns - before[-2].sampled_ns
+        before.append(state)
+    return changed
+
+
 def commands_of(made: list[TimedMessage]) -> list[TimedMessage]:
     """Return the commands that act at the states."""
     commands = {}

@@ -27,7 +27,7 @@ LARGEST_NUMBER: Final = 1e10
 MAX_JSON_CHARACTERS: Final = 1 << 20
 """Longest recorded parameters; those of 64 parts have 20,000 characters."""
 
-PLANT_VERSION: Final = 2
+PLANT_VERSION: Final = 3
 """Current rules of the plant; a recording is verified with its own."""
 AUTO: Final = "auto"
 """Value of `StepParameters.substeps`: the number of integration steps is chosen for each rig and step."""
@@ -165,7 +165,8 @@ class StepParameters:
     """Integration steps of a step of the loop: a fixed number, or `AUTO`."""
     integrator: str = _SIM.integrator
     plant_version: int = PLANT_VERSION
-    """Rules of the plant: 1, of recordings without this number: released parts fall from rest."""
+    """Rules of the plant: 1, of recordings without this number: released parts fall from rest; up to 2: automatic
+    sub-steps do not limit the turn of joint 2."""
 
     def __post_init__(self) -> None:
         known = get_args(SimConfig.model_fields["integrator"].annotation)

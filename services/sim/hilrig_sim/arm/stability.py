@@ -12,13 +12,18 @@ import numpy as np
 from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import mass_matrix
 from hilrig_sim.arm.integrators import TABLEAUS
-from hilrig_sim.arm.model import AUTO, ArmParameters, RigParameters, StepParameters
+from hilrig_sim.arm.model import AUTO, LARGEST_REGISTER_FORCE, ArmParameters, RigParameters, StepParameters
 
 STABILITY_MARGIN: Final = 0.2
 """Required safety margin, as a fraction of the limit."""
 
 RESOLVED_DECAY: Final = 1.3
 """Largest λh with which `rkf45` resolves a decaying mode: the error of its speed is below 0.5 % of its amplitude."""
+RESOLVED_TURN: Final = 0.2
+"""Largest turn of joint 2 in an integration step, relative to the range of θ2 in which the inertia changes."""
+SLOW_TURN: Final = 0.3
+"""Turn of an arm against its friction at the largest torque, relative to this range, up to which no turn is limited:
+for the default arm it is 0.26."""
 MAX_SUBSTEPS: Final = 64
 """Largest number of integration steps of a rig in a step of the loop, if it is chosen automatically."""
 ERROR_BOUND: Final = (math.radians(0.1), math.radians(0.1), 0.1e-3, math.radians(0.1))
@@ -49,6 +54,20 @@ def largest_safe_step(arm: ArmParameters, integrator: str) -> float:
 def base_substeps(arm: ArmParameters, sim: StepParameters) -> int:
     """Return the number of integration steps that resolve the fastest mode of the arm in a step of the loop."""
     return max(1, math.ceil(fastest_mode(arm) * sim.step / RESOLVED_DECAY - 1e-9))
+
+
+def longest_turn(arm: ArmParameters, sim: StepParameters) -> float:
+    """Return the largest turn of joint 2 in an integration step that resolves the motion, rad.
+
+    The determinant of the mass matrix is proportional to m1 + (m2 + m3) sin²θ2: the inertia changes where the links are
+    nearly in line. A step that turns through a large part of this range is inaccurate, and its error estimate can
+    be small by chance. Infinity: friction keeps the arm so slow that the decay of its modes limits the step.
+    """
+    m1, m2, m3 = arm.masses
+    width = math.sqrt(m1 / (m1 + m2 + m3))
+    step = sim.step / base_substeps(arm, sim)
+    is_slow = LARGEST_REGISTER_FORCE * step <= SLOW_TURN * width * min(arm.friction[:2])
+    return math.inf if is_slow or sim.plant_version <= 2 else RESOLVED_TURN * width
 
 
 def check_stable(parameters: RigParameters) -> None:

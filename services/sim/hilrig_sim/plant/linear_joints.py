@@ -68,6 +68,16 @@ def move_between_stops(
     return LinearMotion(q, v, hit_side, hit_speed)
 
 
+def first_impact(
+    q: Floats, v: Floats, acceleration: Floats, rate: Floats, lower: Floats, upper: Floats, duration: Floats
+) -> tuple[Floats, Floats]:
+    """Return `side` and `speed` of the first impact, as in `LinearMotion`; arguments as for `move_between_stops`."""
+    q = np.minimum(np.maximum(q, lower), upper)
+    end, velocity, _ = _next_impact(q, v, acceleration, rate, lower, upper, duration)
+    side = (end >= upper).astype(np.float64) - (end <= lower)
+    return np.where(side * velocity > 0, side, 0.0), np.abs(velocity)
+
+
 def _next_impact(
     q: Floats, v: Floats, acceleration: Floats, rate: Floats, lower: Floats, upper: Floats, left: Floats
 ) -> tuple[Floats, Floats, Floats]:

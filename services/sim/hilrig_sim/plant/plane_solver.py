@@ -50,9 +50,30 @@ class PlaneSolver:
     """Integrates joints 1 and 2 of rigs of a plant over a duration."""
 
     def __init__(
-        self, arms: Sequence[ArmParameters], dynamics: ReducedDynamics, tableau: Tableau, lower: Floats, upper: Floats
+        self,
+        arms: Sequence[ArmParameters],
+        dynamics: ReducedDynamics,
+        tableau: Tableau,
+        lower: Floats,
+        upper: Floats,
+        longest_turn: Floats,
+        step: float,
     ) -> None:
-        """Initialize for N rigs with stops `lower` and `upper`, rad, (2, N)."""
+        """Initialize for N rigs.
+
+        Args:
+            arms: of the rigs.
+            dynamics: of the rigs.
+            tableau: of the Runge–Kutta method.
+            lower: lower stops of joints 1 and 2, rad, (2, N).
+            upper: upper stops, (2, N).
+            longest_turn: largest turn of joint 2 in an integration step, rad; infinity: not limited, (N,).
+            step: length of a step of the loop, s.
+        """
+        self._longest_turn = longest_turn
+        # Shorter ones could exceed the largest number of integration steps.
+        self._shortest_with_limit = 2 * step / MAX_SUBSTEPS
+        self._turn_limited = bool(np.isfinite(longest_turn).any())
         self._arm = arms[0]
         self._dynamics = dynamics
         self._tableau = tableau
@@ -108,6 +129,11 @@ class PlaneSolver:
             error = np.abs(error[:2])
             worst = np.maximum(error[0], error[1])
             inaccurate = ~(worst <= STEP_TOLERANCE[0]) & (length > SHORTEST_FRACTION * duration[at])
+            shorter = 0.9 * np.sqrt(np.sqrt(STEP_TOLERANCE[0] / np.maximum(worst, 1e-12)))
+            if self._turn_limited:
+                turn = length * np.maximum(np.abs(v0[1]), np.abs(v1[1])) / self._longest_turn[rigs[at]]
+                inaccurate |= (turn > 1) & (length > self._shortest_with_limit)
+                shorter = np.minimum(shorter, 0.9 / np.maximum(turn, 1.0))
             # An arrival at a stop within the attempt.
             beyond = np.maximum(q1[:2] - high, low - q1[:2])
             reach = q0[:2] + 2 * length * v0[:2]
@@ -142,7 +168,6 @@ class PlaneSolver:
                 loss = np.where(lost, np.minimum(np.maximum(fraction, 0.01), 0.99), np.inf)
                 cut = np.minimum(arrival, loss)
             cut = np.minimum(cut[0], cut[1])
-            shorter = 0.9 * np.sqrt(np.sqrt(STEP_TOLERANCE[0] / np.maximum(worst, 1e-12)))
             shorter = np.minimum(np.maximum(shorter, 0.2), 0.7)
             cut = np.where(inaccurate, np.where(worst < np.inf, shorter, 0.2), cut)
             cut = np.where(last, np.inf, cut)

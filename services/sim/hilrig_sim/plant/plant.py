@@ -15,11 +15,11 @@ from hilrig_runtime.errors import InputError
 from hilrig_sim.arm.dynamics import ReducedDynamics
 from hilrig_sim.arm.integrators import TABLEAUS, Tableau
 from hilrig_sim.arm.model import AUTO, RigParameters
-from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps
+from hilrig_sim.arm.stability import ERROR_BOUND, base_substeps, longest_turn
 from hilrig_sim.arm.stepping import FixedStep
 from hilrig_sim.plant.hard_stops import crossing, first_arrival, hermite, stop_outward
 from hilrig_sim.plant.limits import LimitFlags, PlantEvent, PlantEventKind, any_true
-from hilrig_sim.plant.linear_joints import LinearMotion, move_between_stops
+from hilrig_sim.plant.linear_joints import first_impact, move_between_stops
 from hilrig_sim.plant.plane_solver import STEP_TOLERANCE, PlaneSolver
 from hilrig_sim.plant.static_geometry import CONTACT_TOLERANCE_M
 from hilrig_sim.plant.world import ALL_RIGS, NO_PART, World
@@ -107,7 +107,13 @@ class Plant:
         self._inaccurate = np.zeros((4, count), dtype=np.bool_)
         self._nothing_held = (np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_))
         self._held = self._nothing_held
-        self._plane = PlaneSolver(self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2])
+        turns = np.array([longest_turn(arm, sim) for arm in self._arms])
+        self._largest_speed2 = turns / self._lengths
+        """Speed of joint 2 above which an integration step is divided, rad/s, (N,)."""
+        self._turn_limited = bool(np.isfinite(turns).any())
+        self._plane = PlaneSolver(
+            self._arms, self.dynamics, self._tableau, self._lower[:2], self._stop[:2], turns, sim.step
+        )
         self._events: list[PlantEvent] = []
         self._left: list[PlantEvent] = []
         """Impacts in the last integration step of fixed length."""
@@ -257,7 +263,7 @@ class Plant:
         self._integrator.advance(position, velocity, effort, self.error)
         if held:
             self.dynamics.release()
-        speed34, start_speed34 = velocity[2:], self._start_velocity[2:]
+        speed34, start34, start_speed34 = velocity[2:], self._start_position[2:], self._start_velocity[2:]
         turned34 = start_speed34 * speed34 < 0
         np.greater(position[2], self._free3, self._low)
         turns = any_true(turned34)
@@ -266,9 +272,10 @@ class Plant:
         if any_true(self._low):
             self._find_contact()
         if turns:
-            # While it turns, a joint moves less than with its speed at the start.
-            reach = self._start_position[2:] + self._lengths * start_speed34
+            # Until it turns, a joint moves at most half as far as with its speed at the start: friction only slows it.
+            reach = start34 + 0.5 * self._lengths * start_speed34
             turned34 &= (reach < self._lower[2:]) | (reach > self._upper[2:])
+            turns = any_true(turned34)
         lower, upper = self._at_lower, self._at_upper
         np.less_equal(position, self._lower, lower)
         np.greater_equal(position, self._upper, upper)
@@ -276,10 +283,14 @@ class Plant:
         at_lower, at_upper = lower.tobytes(), upper.tobytes()
         at_limit = _TRUE in at_lower or _TRUE in at_upper
         self._left.clear()
-        moving34 = turned34 | ((lower34 | upper34) & (start_speed34 != 0)) if at_limit else turned34
-        if any_true(moving34):
-            joint, rig = moving34.nonzero()
-            self._left += self._linear_motion(joint, rig, self._lengths[rig], effort)[1]
+        if at_limit:
+            # A joint that was at its stop before has no impact.
+            turned34 |= (lower34 & (start34 > self._lower[2:])) | (upper34 & (start34 < self._upper[2:]))
+            turns = any_true(turned34)
+        if turns:
+            joint, rig = turned34.nonzero()
+            impact = first_impact(*self._linear_arguments(joint, rig, effort), self._lengths[rig])
+            self._left += self._linear_hits(joint, rig, *impact)
         if not at_limit:
             if self._limits.any:
                 self._touching_plane = False
@@ -344,6 +355,8 @@ class Plant:
             leaves = self._limits.any and self._leaves_surface()
         np.absolute(error, error)
         np.less_equal(error, self._tolerance, accurate)
+        if self._turn_limited:
+            accurate[1] &= np.maximum(np.abs(start_velocity[1]), np.abs(velocity[1])) <= self._largest_speed2
         np.greater(position, self._lower, above)
         np.less(position, self._upper, below)
         if leaves or self._touching_plane or _FALSE in regular.tobytes():
@@ -467,26 +480,29 @@ class Plant:
     def _resolve_linear(self, joint: Ints, rig: Ints, length: Floats, error: Floats, effort: Floats) -> None:
         """Move joints 3 and 4, `joint` 0 and 1, of rigs by their closed form for the last `length` of the step, s."""
         row = joint + 2
-        motion, hits = self._linear_motion(joint, rig, length, effort)
+        motion = move_between_stops(*self._linear_arguments(joint, rig, effort), length)
         self.position[row, rig], self.velocity[row, rig] = motion.position, motion.velocity
         error[row, rig] = 0.0
-        self._events += hits
+        self._events += self._linear_hits(joint, rig, motion.side, motion.speed)
 
-    def _linear_motion(
-        self, joint: Ints, rig: Ints, length: Floats, effort: Floats
-    ) -> tuple[LinearMotion, list[PlantEvent]]:
-        """Return the closed-form motion of joints 3 and 4 from the start of the integration step, and the impacts."""
-        row, upper = joint + 2, self._upper[joint + 2, rig]
-        start, lower = self._start_position[row, rig], self._lower[row, rig]
+    def _linear_arguments(
+        self, joint: Ints, rig: Ints, effort: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+        """Return q, v, acceleration, rate, lower and upper stops of joints at the start of the step, (K,) each."""
+        row = joint + 2
+        start, start_velocity = self._start_position[row, rig], self._start_velocity[row, rig]
         acceleration, rate = self.dynamics.linear_coefficients(joint, rig, effort)
-        motion = move_between_stops(start, self._start_velocity[row, rig], acceleration, rate, lower, upper, length)
+        return start, start_velocity, acceleration, rate, self._lower[row, rig], self._upper[row, rig]
+
+    def _linear_hits(self, joint: Ints, rig: Ints, side: Floats, speed: Floats) -> list[PlantEvent]:
+        """Return the impacts of joints 3 and 4; `side`: +1 at the upper stop, -1 at the lower stop, 0: no impact."""
         hits = []
-        for index in np.flatnonzero(motion.side != 0).tolist():
-            number, is_upper = int(rig[index]), bool(motion.side[index] > 0)
-            below = is_upper and joint[index] == 0 and upper[index] < self._stop[2, number]
-            hit = 0 if below else int(row[index]) + 1
-            hits.append(PlantEvent(PlantEventKind.LIMIT_HIT, number, hit, is_upper, motion.speed[index]))
-        return motion, hits
+        for index in np.flatnonzero(side != 0).tolist():
+            number, is_upper = int(rig[index]), bool(side[index] > 0)
+            below = is_upper and joint[index] == 0 and self._upper[2, number] < self._stop[2, number]
+            hit = 0 if below else int(joint[index]) + 3
+            hits.append(PlantEvent(PlantEventKind.LIMIT_HIT, number, hit, is_upper, float(speed[index])))
+        return hits
 
     def _hold_pressed(self, effort: Floats) -> bool:
         """Hold joints 1 and 2 that are pressed against a stop at the start of a step; return whether any is."""

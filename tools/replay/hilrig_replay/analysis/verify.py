@@ -5,7 +5,8 @@ rig: the results of a rig do not depend on the number of rigs. An interval start
 the recorded efforts and the magnet. Its last step must lead to the first state of the next interval, and the last
 interval of a block continues in the next block, so the complete run is re-simulated. An hour takes seconds.
 
-Every published field that the simulation computes is compared, and effort and magnet of each state with its command.
+Every published field that the simulation computes is compared, effort and magnet of each state with its command, and
+the times of its ticks with each other.
 """
 
 from collections import Counter
@@ -42,7 +43,18 @@ BLOCK_STATES: Final = 16_384
 
 COMMAND_WINDOW_ROWS: Final = 1024
 """States and commands of previous blocks that are searched for a match."""
+TIME_WINDOW_ROWS: Final = 8192
+"""States of previous blocks that can be the basis of a loop latency, as many as the simulation remembers."""
 _DRIVE: Final = np.dtype([("key", "<u8"), ("effort", "<f8", (4,)), ("magnet", "?")])
+_TICK_FIELDS: Final = [
+    "incarnation",
+    "step",
+    "sampled_ns",
+    "lateness_ns",
+    "missed_steps",
+    "basis_step",
+    "loop_latency_ns",
+]
 _OPTIONAL_FIELDS: Final = ("integration error", "sub-steps", "velocity of the parts")
 _EFFORT_RANGE: Final = (-LARGEST_EFFORT, LARGEST_EFFORT)
 
@@ -140,6 +152,7 @@ def verify(files: Path | RunFiles, tolerance: float | None = None) -> Verificati
     resimulation = _Resimulation(run, parameters, tolerance)
     for block in run.blocks(frozenset({"state", "command"}), rows=BLOCK_STATES):
         resimulation.check_commands(block.states, block.commands)
+        resimulation.check_times(block.states)
         if len(block.states):
             resimulation.add(block.states, block.parts)
     return resimulation.result(machine)
@@ -187,10 +200,15 @@ class _Resimulation:
         self._recorded: set[str] = set()
         """Optional fields that the recording contains."""
         self._commands = _CommandCheck()
+        self._times = _TimeCheck(parameters.sim.step_ns)
 
     def check_commands(self, states: Rows, commands: Rows) -> None:
         """Compare the next block of commands with the states at which they act."""
         self._differing["effort or magnet of the command"] += self._commands.add(states, commands)
+
+    def check_times(self, states: Rows) -> None:
+        """Compare the tick times and loop latencies of the next block with each other."""
+        self._differing.update(self._times.add(states))
 
     def add(self, states: Rows, parts: Rows) -> None:
         """Re-simulate the next block."""
@@ -349,14 +367,18 @@ class _CommandCheck:
         self._waiting = np.empty(0, _DRIVE)
 
     def add(self, states: Rows, commands: Rows) -> int:
-        """Add a block; return the number of commands that differ from their state. A command may never act."""
+        """Add a block; return the number of commands that differ from their state. A command may never act.
+
+        States with an effort although their commands have timed out count, too.
+        """
         acting = states[(states["command_seq"] > 0) & ~states["safe"]]
+        differing = int(np.count_nonzero(states["safe"] & states["effort"].any(axis=1)))
         applied = np.concatenate((self._applied, _drives(acting, acting["command_seq"])))
         # The first state of each command.
         applied = applied[np.sort(np.unique(applied["key"], return_index=True)[1])]
         waiting = np.concatenate((self._waiting, _drives(commands, commands["seq"])))
         order = np.argsort(applied["key"], kind="stable")
-        differing, found = 0, np.zeros(len(waiting), dtype=np.bool_)
+        found = np.zeros(len(waiting), dtype=np.bool_)
         if len(applied):
             places = np.searchsorted(applied["key"][order], waiting["key"])
             rows = order[np.minimum(places, len(order) - 1)]
@@ -364,10 +386,40 @@ class _CommandCheck:
             sent, acts = waiting[found], applied[rows[found]]
             effort = np.clip(np.nan_to_num(sent["effort"], posinf=np.inf, neginf=-np.inf), *_EFFORT_RANGE)
             differs = (effort != acts["effort"]).any(axis=1) | (sent["magnet"] != acts["magnet"])
-            differing = int(np.count_nonzero(differs))
+            differing += int(np.count_nonzero(differs))
         self._applied = applied[-COMMAND_WINDOW_ROWS:].copy()
         self._waiting = waiting[~found][-COMMAND_WINDOW_ROWS:].copy()
         return differing
+
+
+class _TimeCheck:
+    """Compares each loop latency with the tick of its basis, and the deadline of each tick with the previous one."""
+
+    def __init__(self, step_ns: int) -> None:
+        self._step_ns = step_ns
+        self._recent: Rows | None = None
+
+    def add(self, states: Rows) -> dict[str, int]:
+        """Add a block; return the number of states that differ, by field."""
+        own = states[_TICK_FIELDS]
+        ticks = own if self._recent is None else np.concatenate((self._recent, own))
+        is_new = np.arange(len(ticks)) >= len(ticks) - len(own)
+        self._recent = ticks[-TIME_WINDOW_ROWS:].copy()
+        expected_ns, off_grid = np.where(ticks["basis_step"] > 0, -1, 0), np.zeros(len(ticks), dtype=np.bool_)
+        for incarnation in np.unique(ticks["incarnation"]):
+            rows = np.flatnonzero(ticks["incarnation"] == incarnation)
+            # A step that occurs twice is an error of the file, which other checks report.
+            rows = rows[np.unique(ticks["step"][rows], return_index=True)[1]]
+            step, sampled_ns = ticks["step"][rows].astype(np.int64), ticks["sampled_ns"][rows]
+            basis = ticks["basis_step"][rows].astype(np.int64)
+            place = np.minimum(np.searchsorted(step, basis), len(rows) - 1)
+            known = step[place] == basis
+            expected_ns[rows[known]] = (sampled_ns - sampled_ns[place])[known]
+            deadline_ns = sampled_ns - ticks["lateness_ns"][rows]
+            periods = 1 + ticks["missed_steps"][rows][1:].astype(np.int64)
+            off_grid[rows[1:]] = (np.diff(step) == 1) & (np.diff(deadline_ns) != periods * self._step_ns)
+        wrong = (expected_ns >= 0) & (ticks["loop_latency_ns"] != expected_ns)
+        return {"loop latency": int((wrong & is_new).sum()), "tick time": int((off_grid & is_new).sum())}
 
 
 def _drives(rows: Rows, seq: NDArray[Any]) -> NDArray[np.void]:
