@@ -31,11 +31,10 @@ LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 4.0 if LONG else 2.5
 LIVE_RUNS = 25
 """Runs of each cause in the long test."""
-RIGS = 5
+RIGS = 4
 MISTAKES: dict[str, tuple[str, tuple[float, float]]] = {
     "previous_poll": ("previous poll", (0, 0)),
     "wait_before_write": ("wait before write", (12, 60)),
-    "delayed_acknowledgement": ("two segments", (0, 0)),
     "open_loop": ("read once", (0, 0)),
     "slow_polling": ("slow polling", (30, 120)),
 }
@@ -120,9 +119,10 @@ def test_wait_between_read_and_write_is_found(lab: RunningLab) -> None:
     assert first.gain_ms == pytest.approx(20, abs=3)
 
 
-def test_two_segments_are_one_finding(lab: RunningLab) -> None:
-    first, *others = causes_of(lab, program(lab, "two segments"))
-    assert (first.code, others) == ("delayed_acknowledgement", [])
+@pytest.mark.skipif(sys.platform != "linux", reason="TCP_QUICKACK is an option of Linux")
+def test_two_segments_cost_no_delay(lab: RunningLab) -> None:
+    # The edge acknowledges an incomplete request at once.
+    assert causes_of(lab, program(lab, "two segments")) == []
 
 
 def test_open_loop_after_one_read_is_found(lab: RunningLab) -> None:
