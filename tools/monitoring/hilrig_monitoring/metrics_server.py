@@ -36,6 +36,7 @@ class MetricsServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128
 
     def __init__(self, address: tuple[str, int], text: Callable[[], str]) -> None:
         self._lock = threading.Lock()
