@@ -220,4 +220,4 @@ def _is_number(cell: str) -> bool:
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}".rstrip("0").rstrip(".")
+    return "" if value is None else f"{round(value, 3):g}"
