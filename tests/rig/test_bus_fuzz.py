@@ -78,7 +78,7 @@ class Fuzzer:
     def forge(self) -> None:
         """Send a valid command of a rig that another edge serves, on its key and in a batch of this edge."""
         number = self.rng.randrange(1 << 40)
-        command = TorqueCommand(rig="rig1", incarnation=time.time_ns(), seq=number, effort=(5.0, 0, 0, 0))
+        command = TorqueCommand(rig="rig1", seq=number, effort=(5.0, 0, 0, 0))
         payload = command.SerializeToString()
         self.forged(payload)
         self.commands(RigBatch(source="edge/west", rigs=["rig1"], messages=[payload]).SerializeToString())

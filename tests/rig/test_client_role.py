@@ -146,6 +146,7 @@ def test_nothing_is_written_if_there_are_no_torque_registers() -> None:
             assert lease(rig).session == ""
 
 
+@pytest.mark.alone
 def test_reads_are_scheduled_before_the_tick() -> None:
     with Plc(scan_s=0.002) as plc, client_of(plc, client={"read_lead_ms": 6.0}) as rig:
         eventually(lambda: len(torques(rig)) > 30)

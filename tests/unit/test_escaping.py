@@ -49,18 +49,22 @@ def test_commands_accept_any_file_name(tmp_path: Path, good: Path, name: str) ->
     folder.mkdir()
     path = folder / os.fsdecode(NAMES[name])
     shutil.copy(good, path)
-    for arguments, code in (
-        (["latency", path], 1),
-        (["latency", path, good, "--json"], 1),
+    # Each renderer gets each name; the other commands get the names with control characters, and the longest one.
+    commands = [
         (["latency", path, "--plot", tmp_path / "plot.png"], 1),
         (["runs", folder], 0),
         (["report", path, good, "--out", tmp_path / "report.html"], 0),
-        (["report", path, "--out", folder / (path.name[:-5] + ".html")], 0),
-        (["compare", path, good, "--align", "start"], 0),
-        (["verify", path], 1),
-        (["recover", path], 0),
         (["export", path, "--csv", tmp_path / "csv"], 0),
-    ):
+    ]
+    if name in ("escape", "newline", "255 bytes"):
+        commands += [
+            (["latency", path, good, "--json"], 1),
+            (["report", path, "--out", folder / (path.name[:-5] + ".html")], 0),
+            (["compare", path, good, "--align", "start"], 0),
+            (["verify", path], 1),
+            (["recover", path], 0),
+        ]
+    for arguments, code in commands:
         done = hilrig(*arguments)
         assert "Traceback" not in done.stderr, done.stderr
         assert done.returncode == code, (arguments, done.stderr)
