@@ -47,7 +47,7 @@ test: .venv/bin/python ## run all tests and checks of CI
 AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
 together alone: export OPENBLAS_NUM_THREADS = 1
 together: .venv/dev
-	$(BIN)/pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
+	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
 alone: .venv/dev
 	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
 

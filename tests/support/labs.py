@@ -1,5 +1,6 @@
 """Complete labs for tests: `hilrig up` on free ports in a temporary folder, and `hilrig` commands."""
 
+import contextlib
 import functools
 import json
 import os
@@ -14,7 +15,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from support.waiting import eventually
 
@@ -51,21 +52,44 @@ def hilrig(
         out, err = (Path(folder) / name for name in ("out", "err"))
         for path in (out, err):
             path.touch()
-        server = _command_server()
-        assert server.stdin is not None
-        assert server.stdout is not None
         job = {"arguments": command, "cwd": str(cwd or Path.cwd()), "environ": dict(os.environ)}
-        server.stdin.write(json.dumps({**job, "out": str(out), "err": str(err)}) + "\n")
+        job |= {"out": str(out), "err": str(err)}
+        with _SERVER_LOCK:
+            code = _run_job(job, timeout_s)
+        if code is None:
+            raise subprocess.TimeoutExpired(command, timeout_s, out.read_text(), err.read_text())
+        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+
+
+_SERVER_LOCK = threading.Lock()
+"""Held during a job: the server does one at a time, and its replies have no names."""
+
+
+def _run_job(job: dict[str, Any], timeout_s: float) -> int | None:
+    """Exit code of a job of the command server; None: it was killed after its time-out."""
+    server, pid = _command_server(), 0
+    assert server.stdin is not None
+    assert server.stdout is not None
+    try:
+        server.stdin.write(json.dumps(job) + "\n")
         server.stdin.flush()
         pid = int(server.stdout.readline())
         killer = threading.Timer(timeout_s, os.kill, (pid, signal.SIGKILL))
         killer.start()
-        code = int(server.stdout.readline())
-        late = not killer.is_alive()
-        killer.cancel()
-        if late:
-            raise subprocess.TimeoutExpired(command, timeout_s, out.read_text(), err.read_text())
-        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+        try:
+            code = int(server.stdout.readline())
+        finally:
+            late = not killer.is_alive()
+            killer.cancel()
+    except BaseException:
+        # The test was interrupted: the next job must not get the replies of this one.
+        _command_server.cache_clear()
+        server.kill()
+        if pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        raise
+    return None if late else code
 
 
 @functools.cache
