@@ -1,6 +1,7 @@
 """Labs whose controllers are Modbus servers: the example programs, and every evaluation of their recordings."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -79,6 +80,9 @@ def test_recordings_of_the_client_role_are_evaluated(result: Result, tmp_path: P
     assert [report.device_scan is None for report in reports] == [False, True]
     assert hilrig("compare", first, second).returncode == 0
     assert hilrig("report", first, "--out", tmp_path / "report.html").returncode == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    [values] = re.findall(r'id="run-1-data">(.*?)</script>', page)
+    assert [stage["title"] for stage in json.loads(values)["stages"]] == [stage.title for stage in CLIENT_STAGES]
     rrd = hilrig("replay", first, "--save", tmp_path / "run.rrd")
     assert rrd.returncode == 0, rrd.stderr
     latency = json.loads(hilrig("latency", first, "--json").stdout)

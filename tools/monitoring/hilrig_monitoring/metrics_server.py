@@ -92,8 +92,6 @@ def _end(connection: socket.socket) -> None:
 
 def _handler(text: Callable[[], str]) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        timeout = REQUEST_TIMEOUT_S
-
         def do_GET(self) -> None:
             """Answer one request."""
             if self.path.partition("?")[0] != "/metrics":

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hilrig_replay.analysis.latency import LatencyReport
-from hilrig_replay.analysis.stages import LOOP_STAGES
 from hilrig_replay.analysis.summary import under_command
 from hilrig_replay.geometry.arm_picture import AT_STOP, HOLDS_PART, MAGNET_ON, scene_of
 from hilrig_replay.grading.grade import Grade
@@ -88,7 +87,7 @@ def timeline(
             {"symbol": symbol, "effort": effort, "color": color}
             for symbol, effort, color in zip(JOINT_SYMBOLS, EFFORT_SYMBOLS, JOINT_COLORS, strict=True)
         ],
-        "stages": [{"title": stage.title, "color": stage.color} for stage in LOOP_STAGES],
+        "stages": [{"title": stage.title, "color": stage.color} for stage in latency.stages],
         "colors": {"age": AGE_COLOR},
         "flags": {"magnet": MAGNET_ON, "holds": HOLDS_PART, "stop": AT_STOP},
         "every": every,
@@ -133,7 +132,7 @@ def _ages(run: Run, latency: LatencyReport, time_s: NDArray[np.float64]) -> NDAr
 def _samples(run: Run, latency: LatencyReport, max_rows: int) -> dict[str, Any]:
     """Latency samples; of each bin of samples the slowest one."""
     every = -(-max(latency.samples, 1) // max_rows)
-    names = ("loop", *(stage.key for stage in LOOP_STAGES))
+    names = ("loop", *(stage.key for stage in latency.stages))
     kept: list[Rows] = []
     held: Rows | None = None
     for rows in latency.table.blocks(*names, "sampled_ns", "incarnation"):
@@ -151,7 +150,7 @@ def _samples(run: Run, latency: LatencyReport, max_rows: int) -> dict[str, Any]:
         "every": every,
         "time": _encoded(run.time_s(table)),
         "loop": _encoded(table["loop"] / 1e6),
-        "stages": [_encoded(table[stage.key] / 1e6) for stage in LOOP_STAGES],
+        "stages": [_encoded(table[stage.key] / 1e6) for stage in latency.stages],
     }
 
 
