@@ -191,9 +191,18 @@ def _canvas_title(title: str, header: Sequence[str]) -> str:
     for name in header:
         if re.fullmatch(re.escape(title) + r"\s*\(\d+\)", name.strip()):
             return name
+    check_title(title)
+    return title
+
+
+def check_title(title: str) -> None:
+    """Check that a title can be a column of the gradebooks.
+
+    Raises:
+        InputError: Canvas drops columns with such a title.
+    """
     if _CANVAS_RESERVED.search(title):
         raise InputError(f"title {title!r}: Canvas drops columns with such a name; choose another title")
-    return title
 
 
 def _column(header: list[str], name: str) -> int:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_cli.local.local_lab import POLL_S, bind_error, running_lab
+from hilrig_cli.local.local_lab import POLL_S, free_ports, running_lab
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
@@ -165,13 +165,6 @@ def controller_path() -> Path:
         if (path := Path(folder) / CONTROLLER).exists():
             return path
     raise OperationError(f"the example controller {CONTROLLER} is not part of this installation")
-
-
-def free_ports(first: int, count: int = 1) -> int:
-    """Find `count` consecutive free ports on loopback, starting at `first`; return the lowest."""
-    while any(bind_error("127.0.0.1", port) for port in range(first, first + count)):
-        first += count
-    return first
 
 
 @dataclass(frozen=True, slots=True)
