@@ -1,4 +1,4 @@
-"""Solution of "Pick one part": moves over the part, down, and to the tray, with the weight of the part on the way."""
+"""Solution of "Pick one part": moves over the part, down, and to the tray, with the weight of the held part."""
 
 from control import Arm, joints_for
 

@@ -14,7 +14,6 @@ from hilrig_classroom.assignment import (
     load_assignment,
 )
 from hilrig_classroom.gradebook import check_title
-from hilrig_replay.grading.feasibility import task_mistakes
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError
@@ -29,8 +28,11 @@ def check_assignment(folder: Path) -> tuple[Assignment, LabConfig]:
     """
     assignment = load_assignment(folder)
     lab = load_lab(assignment.lab_file)
-    parameters = lab_parameters(lab, str(assignment.lab_file))[lab.rigs[0].name]
-    mistakes = [f"{assignment.lab_file}: {text}" for text in task_mistakes(assignment.task, parameters)]
+    mistakes = []
+    try:
+        lab_parameters(lab, str(assignment.lab_file))
+    except InputError as error:
+        mistakes.append(str(error))
     mistakes += [f"{folder / SETTINGS_FILE}: {text}" for text in _settings_mistakes(assignment.config)]
     mistakes += _file_mistakes(folder)
     if mistakes:

@@ -23,6 +23,8 @@ _CANVAS_FIRST: Final = "Student"
 _CANVAS_KEYS: Final = ("SIS User ID", "SIS Login ID", "ID")
 _CANVAS_RESERVED: Final = re.compile(r"\b(Current|Final|Override) (Score|Grade|Points)\b")
 """Canvas drops columns with such headers."""
+MAX_SIMILAR: Final = 5
+"""Number of similar students that a cell of `grades.csv` names."""
 _MOODLE_KEYS: Final = ("ID number", "Username", "Email address", "Identifier")
 
 
@@ -70,7 +72,7 @@ def grades_csv(document: dict[str, Any], roster: Roster) -> str:
                 str(len(row["attempts"])),
                 *("" if goal not in reached else "yes" if reached[goal] else "no" for goal in goals),
                 attempt.get("data_quality", ""),
-                "; ".join(row["similar"]),
+                similar_text(row),
             ]
         )
     return _as_csv(rows, ",")
@@ -149,6 +151,18 @@ def feedback(row: dict[str, Any], document: dict[str, Any]) -> str:
     if row["override"] is not None:
         parts.append(f"set manually: {row['override']['reason'] or 'no reason given'}")
     return "; ".join(parts)
+
+
+def similar_text(row: dict[str, Any]) -> str:
+    """Other students with the same torques, the most similar ones first; empty: none."""
+    runs = sorted(row["similar"], key=lambda run: (not run["same_recording"], -run["share"]))
+    texts = [f"{run['student']} ({similarity(run)})" for run in runs[:MAX_SIMILAR]]
+    return ", ".join(texts) + (f" and {len(runs) - MAX_SIMILAR} more" if len(runs) > MAX_SIMILAR else "")
+
+
+def similarity(run: dict[str, Any]) -> str:
+    """Similarity of two runs as text."""
+    return "the same recording" if run["same_recording"] else f"{int(100 * run['share'])} % same torques"
 
 
 def used_attempt(row: dict[str, Any]) -> dict[str, Any] | None:

@@ -4,7 +4,7 @@ The result depends on the files only: the same files give the same bytes.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,7 @@ from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.process_pool import process_pool
 
-FORMAT: Final = "hilrig-grades-1"
+FORMAT: Final = "hilrig-grades-2"
 """Version of `grades.json`."""
 
 
@@ -36,6 +36,20 @@ class Override:
 
 
 @dataclass(frozen=True, slots=True)
+class SimilarRun:
+    """A run of another student with the same torques as one of this student."""
+
+    file: str
+    student: str
+    """Id of the other student."""
+    other_file: str
+    share: float
+    """Share of identical torques, 0 to 1."""
+    same_recording: bool
+    """Whether both files are recordings of the same session."""
+
+
+@dataclass(frozen=True, slots=True)
 class StudentGrade:
     """Grade of one student."""
 
@@ -44,8 +58,8 @@ class StudentGrade:
     """In the order of their start."""
     used: Attempt | None
     """The attempt that counts; None: no attempt counts."""
-    similar: tuple[str, ...] = ()
-    """Other students' runs with the same torques: to be compared by a person."""
+    similar: tuple[SimilarRun, ...] = ()
+    """Other students' runs with the same torques, at most one of each student: to be compared by a person."""
     override: Override | None = None
 
     @property
@@ -83,7 +97,7 @@ class ClassGrades:
                     if grade.override is None
                     else {"points": grade.override.points, "reason": grade.override.reason},
                     "used": None if grade.used is None else grade.used.file,
-                    "similar": list(grade.similar),
+                    "similar": [asdict(run) for run in grade.similar],
                     "attempts": [attempt.as_dict() for attempt in grade.attempts],
                 }
                 for grade in self.grades
@@ -225,15 +239,23 @@ def _grade(
 
 
 def _with_similar(grades: Sequence[StudentGrade]) -> list[StudentGrade]:
-    """Mark runs of different students with the same torques; members of a group hand in the same run."""
+    """Mark runs of different students with the same torques; members of a group hand in the same run.
+
+    Of each pair of students, only the two runs that are most similar are stored.
+    """
     owned = [(number, attempt) for number, grade in enumerate(grades) for attempt in grade.attempts]
-    similar: dict[int, list[str]] = {}
+    similar: dict[int, dict[int, SimilarRun]] = {}
     for one, other, share in find_similar([attempt.torques for _, attempt in owned]):
         (first, mine), (second, theirs) = owned[one], owned[other]
         groups = {grades[first].student.group, grades[second].student.group}
         if first == second or (len(groups) == 1 and "" not in groups):
             continue
         for number, own, friend, foreign in ((first, mine, second, theirs), (second, theirs, first, mine)):
-            same = "the same recording" if own.session == foreign.session else f"{int(100 * share)} % same torques"
-            similar.setdefault(number, []).append(f"{own.file}: {same} as {grades[friend].student.id}/{foreign.file}")
-    return [replace(grade, similar=tuple(sorted(similar.get(number, ())))) for number, grade in enumerate(grades)]
+            same = bool(own.session) and own.session == foreign.session
+            run = SimilarRun(own.file, grades[friend].student.id, foreign.file, 1.0 if same else share, same)
+            known = similar.setdefault(number, {})
+            known[friend] = max(known.get(friend, run), run, key=lambda each: (each.same_recording, each.share))
+    return [
+        replace(grade, similar=tuple(runs for _, runs in sorted(similar.get(number, {}).items())))
+        for number, grade in enumerate(grades)
+    ]

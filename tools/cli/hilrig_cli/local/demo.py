@@ -1,6 +1,5 @@
 """The demo: runs a lab with the example controller; measures, verifies and plots the recording."""
 
-import importlib.util
 import json
 import shutil
 import subprocess
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_cli.local.local_lab import POLL_S, free_ports, running_lab
+from hilrig_cli.local.packaged_files import packaged_file
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
@@ -157,14 +157,7 @@ def controller_path() -> Path:
     Raises:
         OperationError: the installation does not contain it.
     """
-    in_checkout = Path(__file__).parents[4] / "examples" / CONTROLLER
-    if in_checkout.exists():
-        return in_checkout
-    spec = importlib.util.find_spec("hilrig_examples")
-    for folder in (spec.submodule_search_locations or []) if spec is not None else []:
-        if (path := Path(folder) / CONTROLLER).exists():
-            return path
-    raise OperationError(f"the example controller {CONTROLLER} is not part of this installation")
+    return packaged_file("examples", CONTROLLER)
 
 
 @dataclass(frozen=True, slots=True)

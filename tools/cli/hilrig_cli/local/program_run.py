@@ -15,8 +15,10 @@ from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.config.template import toml_value
 from hilrig_runtime.errors import InputError, OperationError
 
-RECORDED_TIMEOUT_S: Final = 15.0
-"""Time for the recorder to finish the file after the program has ended."""
+FILE_TIMEOUT_S: Final = 2.0
+"""Time until the recorder has a file of the session after the program has ended."""
+FINISH_TIMEOUT_S: Final = 15.0
+"""Time for the recorder to finish that file."""
 _MAX_OUTPUT: Final = 2000
 
 
@@ -55,8 +57,11 @@ def record_program(
         command += [str(program.resolve()), "--host", local.host_of(local.rigs[0]), "--port", str(local.ports[rig])]
         output = _run(command, time_limit_s, supervisor.poll, on_progress)
         recordings = folder / local.name / rig
-        deadline_s = time.monotonic() + RECORDED_TIMEOUT_S
-        while not (found := sorted(recordings.glob(MCAP_PATTERN))) and time.monotonic() < deadline_s:
+        ended_s = time.monotonic()
+        while not (found := sorted(recordings.glob(MCAP_PATTERN))):
+            elapsed_s = time.monotonic() - ended_s
+            if elapsed_s > (FINISH_TIMEOUT_S if any(recordings.glob("*")) else FILE_TIMEOUT_S):
+                break
             supervisor.poll()
             time.sleep(POLL_S)
     # The recorder finishes a file that is still open when it stops.

@@ -16,7 +16,7 @@ from hilrig_replay.grading.path_goal import PathGoal, PathResult
 from hilrig_replay.grading.placement import PlacementReport
 from hilrig_replay.grading.pose_goal import PoseGoals, PoseResult
 from hilrig_runtime.config.task import PlaceConfig, TaskConfig
-from hilrig_sim.arm.model import RigParameters, SceneParameters
+from hilrig_sim.arm.model import RigParameters
 
 Floats = NDArray[np.float64]
 
@@ -101,11 +101,6 @@ class Grade:
         return {**asdict(self), "error_mm": self.error_mm}
 
 
-def required_parts(place: PlaceConfig, scene: SceneParameters) -> tuple[str, ...]:
-    """Names of the parts that must be placed."""
-    return place.parts or tuple(part.name for part in scene.parts if part.ferromagnetic)
-
-
 class Grader:
     """Grades a run that is added block by block; its memory does not depend on the length of the run."""
 
@@ -176,8 +171,9 @@ class Grader:
 
     def _part_results(self, place: PlaceConfig, placement: PlacementReport | None) -> tuple[PlaceResult, ...]:
         found = {} if placement is None else {part.part: part.error_mm for part in placement.parts}
+        required = place.parts or tuple(part.name for part in self._parameters.scene.parts if part.ferromagnetic)
         results = []
-        for name in required_parts(place, self._parameters.scene):
+        for name in required:
             error_mm, dropped_s = found.get(name), self._dropped_s.get(name)
             at_s = None if dropped_s is None or self._began_s is None else dropped_s - self._began_s
             # Parts that were released too late, or that were on a place from the start, do not count.
