@@ -14,6 +14,7 @@ from hilrig_sim.validation.paper_figures import compute, draw
 
 
 def main() -> int:
+    """Plot the figures and print the checks; return the exit code."""
     parser = argparse.ArgumentParser(description="Repeat experiment (44) of the paper and plot figures 4, 5 and 6.")
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the figures")
     parser.add_argument("--step-ms", type=float, default=20.0, help="step of the fixed-step methods, ms")

@@ -26,10 +26,9 @@ def _command() -> None:
         if error.name is None or error.name.startswith(_OWN_PACKAGE_PREFIX):
             raise
         command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
-        raise OperationError(
-            f"`hilrig {command}` needs {error.name.partition('.')[0]!r}, which is not installed: run in hilrig's folder: "
-            f"{install_command(smallest_extra(command))}"
-        ) from error
+        missing = error.name.partition(".")[0]
+        fix = f"run in hilrig's folder: {install_command(smallest_extra(command))}"
+        raise OperationError(f"`hilrig {command}` needs {missing!r}, which is not installed: {fix}") from error
 
 
 if __name__ == "__main__":

@@ -50,7 +50,23 @@ app = typer.Typer(
 )
 
 PANELS = {
-    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs, example),
+    "Run a lab": (
+        up,
+        demo,
+        live,
+        console,
+        top,
+        metrics,
+        check,
+        doctor,
+        lease,
+        impair,
+        jitter,
+        registers,
+        ik,
+        certs,
+        example,
+    ),
     "Run a single service": (sim, edge, recorder, router),
     "Analyze recordings": (
         runs,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hilrig_cli.examples import example_path
-from hilrig_cli.local.local_lab import POLL_S, bind_error, running_lab
+from hilrig_cli.local.local_lab import POLL_S, free_ports, running_lab
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
@@ -149,13 +149,6 @@ def _run_controller(
         return {}
     # Exit code 1: the controller ran, but did not place every part.
     return result if isinstance(result, dict) and process.returncode in (0, 1) else {}
-
-
-def free_ports(first: int, count: int = 1) -> int:
-    """Find `count` consecutive free ports on loopback, starting at `first`; return the lowest."""
-    while any(bind_error("127.0.0.1", port) for port in range(first, first + count)):
-        first += count
-    return first
 
 
 @dataclass(frozen=True, slots=True)
