@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes minutes: make test-long"),
 ]
 STARTED = {"rig": ("up", "rig1"), "console": ("console", "http://")}
-"""Command of an extra that runs until it is stopped, and a part of what it prints when it has started."""
+"""Command of an extra that runs until it is stopped, and a part of its output after the start."""
 
 
 def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 MCAP_SUFFIX: Final = ".mcap"
-MAGIC: Final = b"\x89MCAP0\r\n"
+MAGIC: Final[bytes] = b"\x89MCAP0\r\n"
 """First and last bytes of an MCAP file."""
 RECOVERED_SUFFIX: Final = ".recovered"
 PART_SUFFIX: Final = ".part"
