@@ -145,7 +145,7 @@ class RigServer:
         """Return whether a connection gives way to a new one, and close it.
 
         Anybody can open connections and send nothing. So the oldest one without a valid request gives way, of the host
-        with most of them. If there is none, the longest idle one gives way, if that is the idle timeout.
+        with most of them. Without one, the longest idle one gives way, if that is the idle timeout.
 
         Args:
             host: only connections of this host; empty: of all hosts.
