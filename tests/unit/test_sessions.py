@@ -436,7 +436,7 @@ def test_loss_of_an_outage_of_an_hour_is_counted() -> None:
     assert bench.store.sources == [("edge/1", 1), ("sim/1", 1)]
 
 
-def test_service_that_restarted_in_a_long_outage_lost_its_first_messages() -> None:
+def test_restart_within_a_long_outage_loses_first_messages() -> None:
     bench = TrackerBench()
     bench.states(2)
     bench.start()
