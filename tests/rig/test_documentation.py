@@ -28,6 +28,7 @@ RUNS_UNTIL_STOPPED = ("hilrig live",)
 OPENS_A_VIEWER = ("hilrig replay", "hilrig live")
 """Commands that are run with --save, because there is no display."""
 TESTED_ELSEWHERE: dict[str, str] = {
+    "docker compose run --rm demo": "tests/hosts/test_compose.py",
     "docker compose up": "tests/hosts/test_compose.py",
     "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",

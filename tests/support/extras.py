@@ -31,7 +31,7 @@ COMMANDS = {
     ),
     "console": (),
 }
-"""Command lines of each extra that end by themselves, for a copy of the recordings; the exit code is 0, or 1 for a run that is not fit."""
+"""Command lines of each extra that end by themselves with exit code 0, or 1 for a run that is not fit."""
 MODULES = {
     "rig": "hilrig_sim.service hilrig_modbus_edge.service hilrig_recorder.service hilrig_monitoring.metrics_server "
     "hilrig_cli.local.local_lab",
