@@ -351,7 +351,7 @@ def test_setup_runs_on_empty_folders_as_the_user_of_services(volumes: Volumes) -
 
 @pytest.mark.hosts
 @pytest.mark.timeout(300)
-def test_services_run_in_the_order_of_the_file_and_the_demo_records(volumes: Volumes) -> None:
+def test_services_run_in_their_order_and_the_demo_records(volumes: Volumes) -> None:
     require_namespaces()
     services = PLAIN["services"]
     done = subprocess.run(
