@@ -16,7 +16,7 @@ import pytest
 
 from hilrig_classroom.assignment import load_assignment
 from hilrig_classroom.output import GradeFolder
-from hilrig_classroom.roster import read_roster
+from hilrig_runtime.config.roster import read_roster
 from support.class_of_30 import CLASS, DEADLINE, NAMES, record_class, write_lists
 from support.labs import hilrig
 
@@ -50,12 +50,12 @@ def slot(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if arguments[0] == "up":
             # The slot in simulated time, with the lab file of the command.
             assert hilrig("check", folder / arguments[-1]).returncode == 0
-            record_class(folder / "week1", folder / "recordings")
+            record_class(folder / "1-hold-joint-1", folder / "recordings")
             continue
         done = hilrig(*arguments, cwd=folder, timeout_s=300)
         assert done.returncode == 0, f"{command}: {done.stderr}"
-        if arguments[:2] == ["assign", "new"]:
-            path = folder / "week1/assignment.toml"
+        if arguments[0] == "example":
+            path = folder / "1-hold-joint-1/assignment.toml"
             deadline = f"deadline = {DEADLINE.isoformat()}\n"
             assert settings.startswith("deadline = ")
             text = re.sub(r"^# deadline.*\n", deadline + settings.partition("\n")[2], path.read_text(), flags=re.MULTILINE)
@@ -63,7 +63,7 @@ def slot(tmp_path_factory: pytest.TempPathFactory) -> Path:
             head, _, late = text.partition("[late]")
             late, _, rest = late.partition('attempts = "best"\n')
             path.write_text(f'{head}attempts = "best"\n\n[late]{late}{rest}')
-            path = folder / "week1/lab.toml"
+            path = folder / "1-hold-joint-1/lab.toml"
             path.write_text(path.read_text() + lab)
     return folder
 
@@ -123,7 +123,7 @@ def test_failed_goals_are_explained(slot: Path) -> None:
 
 
 def graded(slot: Path, out: Path, recordings: Path, workers: int) -> dict[str, Any]:
-    roster, assignment = read_roster(slot / "roster.csv"), load_assignment(slot / "week1")
+    roster, assignment = read_roster(slot / "roster.csv"), load_assignment(slot / "1-hold-joint-1")
     return GradeFolder(out, recordings, assignment, roster, workers=workers).grade()
 
 
@@ -152,7 +152,7 @@ def test_ninety_attempts_are_graded_within_a_minute(slot: Path, tmp_path: Path) 
             count += 1
     begin_s = time.process_time(), time.monotonic()
     done = hilrig(
-        "grade", recordings, "-a", slot / "week1", "-r", slot / "roster.csv", "-o", tmp_path / "out", "--json", timeout_s=300
+        "grade", recordings, "-a", slot / "1-hold-joint-1", "-r", slot / "roster.csv", "-o", tmp_path / "out", "--json", timeout_s=300
     )
     elapsed_s = time.monotonic() - begin_s[1]
     assert done.returncode == 0, done.stderr

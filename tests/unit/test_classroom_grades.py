@@ -14,7 +14,7 @@ from hilrig_classroom.assignment import Assignment, AssignmentConfig, Measure, l
 from hilrig_classroom.gradebook import fill_export, grades_csv, similar_text
 from hilrig_classroom.output import GradeFolder
 from hilrig_classroom.pages import similar_groups
-from hilrig_classroom.roster import Roster, read_roster
+from hilrig_runtime.config.roster import Roster, read_roster
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from support.labs import hilrig

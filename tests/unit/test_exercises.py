@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hilrig_classroom.check import check_assignment
+from hilrig_cli.examples import example_names
 from hilrig_replay.analysis.summary import summarize
 from hilrig_replay.grading.grade import Grade
 from hilrig_replay.io.run import open_run
@@ -38,7 +39,7 @@ def graded(exercise: Path, program: Path, folder: Path, seconds: float) -> tuple
 def test_there_are_eight_exercises_with_solutions() -> None:
     assert [exercise.name[0] for exercise in EXERCISES] == list("12345678")
     names = {"assignment.toml", "handout.md", "lab.toml", "starter.py"}
-    assert all({path.name for path in exercise.iterdir()} == names for exercise in EXERCISES)
+    assert all({path.name for path in exercise.glob("*.*")} == names for exercise in EXERCISES)
     assert all(solution_of(exercise).is_file() for exercise in EXERCISES)
 
 
@@ -66,4 +67,7 @@ def test_handouts_fit_on_a_page_and_say_what_to_submit() -> None:
 
 def test_exercises_are_part_of_the_package() -> None:
     build = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]
-    assert build["targets"]["wheel"]["force-include"]["exercises"] == "hilrig_exercises"
+    assert build["targets"]["wheel"]["force-include"]["exercises"] == "hilrig_examples/exercises"
+    names = example_names()
+    for exercise in EXERCISES:
+        assert {f"exercises/{exercise.name}/{path.name}" for path in exercise.glob("*.*")} <= set(names)

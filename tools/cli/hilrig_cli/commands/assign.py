@@ -1,4 +1,4 @@
-"""`hilrig assign new FOLDER`, `hilrig assign check FOLDER`: assignments of a class, also with a reference solution."""
+"""`hilrig assign check FOLDER`: validates an assignment of a class, also with a reference solution."""
 
 import json
 import sys
@@ -20,31 +20,9 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Prepare the assignments of a class.", no_args_is_help=True)
 
 
-@app.command()
-def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to be created.", show_default=False)],
-    exercise: Annotated[
-        str, typer.Option(metavar="NAME", help="Exercise that is copied: its name, or the number at its beginning.")
-    ] = "1",
-) -> None:
-    """Make the folder of an assignment from one of the exercises: settings, lab file, hand-out and starter program."""
-    import shutil
-
-    from hilrig_cli.local.packaged_files import packaged_file
-    from hilrig_runtime.errors import InputError, OperationError
-
-    source = packaged_file("exercises", "")
-    names = sorted(path.parent.name for path in source.glob("*/assignment.toml"))
-    found = [name for name in names if exercise in (name, name.partition("-")[0])]
-    if not found:
-        raise InputError(f"--exercise: unknown exercise {exercise!r}; expected one of {', '.join(names)}")
-    if folder.exists():
-        raise InputError(f"{folder}: exists already and is not overwritten: choose another name")
-    try:
-        shutil.copytree(source / found[0], folder, ignore=shutil.ignore_patterns("__pycache__"))
-    except OSError as error:
-        raise OperationError(f"{folder}: can't be written: {error.strerror}") from error
-    print(f"{folder}: copy of the exercise {found[0]}; set the deadline in assignment.toml")
+@app.callback()
+def _group() -> None:
+    pass
 
 
 @app.command()

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from hilrig_cli.examples import example_path
 from hilrig_cli.local.local_lab import POLL_S, free_ports, running_lab
-from hilrig_cli.local.packaged_files import packaged_file
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
@@ -127,7 +127,7 @@ def _run_controller(
     on_progress: Callable[[float], None],
 ) -> dict[str, Any]:
     duration_s, overtime_s = (DURATION_S, OVERTIME_S) if requested_s is None else (requested_s, 0.0)
-    command = [sys.executable, str(controller_path()), "--host", lab.edge.host, "--port", str(_port(lab))]
+    command = [sys.executable, str(example_path(CONTROLLER)), "--host", lab.edge.host, "--port", str(_port(lab))]
     command += ["--duration", str(duration_s), "--overtime", str(overtime_s), "--scene", str(config), "--json"]
     start_s = time.monotonic()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **own_process_group()) as process:
@@ -149,15 +149,6 @@ def _run_controller(
         return {}
     # Exit code 1: the controller ran, but did not place every part.
     return result if isinstance(result, dict) and process.returncode in (0, 1) else {}
-
-
-def controller_path() -> Path:
-    """Path of the example controller: in this checkout, or as installed with the package.
-
-    Raises:
-        OperationError: the installation does not contain it.
-    """
-    return packaged_file("examples", CONTROLLER)
 
 
 @dataclass(frozen=True, slots=True)
