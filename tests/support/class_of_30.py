@@ -84,18 +84,18 @@ class _Run:
 
 def _runs() -> Iterator[_Run]:
     for one in CLASS:
-        start, kp = SLOT + timedelta(minutes=one.number), 0.18 + 0.005 * one.number
+        start, kp, slow = SLOT + timedelta(minutes=one.number), 0.18 + 0.005 * one.number, 0.01 + 1e-4 * one.number
         match one.kind:
             case "honest":
                 yield _Run(one, start, kp)
             case "late":
                 yield _Run(one, DEADLINE + timedelta(hours=5), kp)
             case "slow":
-                yield _Run(one, start, 0.01)
+                yield _Run(one, start, slow)
             case "dead":
                 yield _Run(one, start, kp, "if now > 1.0:\n            time.sleep(1000.0)\n        ")
             case "two":
-                yield _Run(one, start, 0.01)
+                yield _Run(one, start, slow)
                 yield _Run(one, start + timedelta(minutes=40), kp)
 
 
@@ -103,7 +103,7 @@ def _record(run: _Run, assignment: Path, recordings: Path) -> None:
     program = (assignment / "starter.py").read_text(encoding="utf-8")
     for name, value in (("KP", run.kp), ("KD", 0.04)):
         assert f"{name} = (0.0," in program
-        program = program.replace(f"{name} = (0.0,", f"{name} = ({value:.3f},")
+        program = program.replace(f"{name} = (0.0,", f"{name} = ({value:.4f},")
     program = program.replace("        # 1. Read", f"        {run.mistake}# 1. Read")
     lab = load_lab(assignment / "lab.toml")
     source = lab.source

@@ -28,7 +28,6 @@ COMMANDS = {
         "export {data}/limit-cycle.mcap --csv {out}/csv --parquet {out}/parquet --foxglove {out}/foxglove.mcap",
         "replay {data}/limit-cycle.mcap --save {out}/run.rrd",
         "recover {data}/limit-cycle.mcap",
-        "assign check {root}/exercises/1-hold-joint-1",
     ),
     "console": (),
 }

@@ -1,4 +1,4 @@
-"""The tutorial of a lab slot with a class of thirty simulated students: each of its commands, and what it writes."""
+"""The tutorial of a lab slot with a class of thirty simulated students: each of its commands, and the results."""
 
 import csv
 import io
@@ -58,7 +58,9 @@ def slot(tmp_path_factory: pytest.TempPathFactory) -> Path:
             path = folder / "1-hold-joint-1/assignment.toml"
             deadline = f"deadline = {DEADLINE.isoformat()}\n"
             assert settings.startswith("deadline = ")
-            text = re.sub(r"^# deadline.*\n", deadline + settings.partition("\n")[2], path.read_text(), flags=re.MULTILINE)
+            text = re.sub(
+                r"^# deadline.*\n", deadline + settings.partition("\n")[2], path.read_text(), flags=re.MULTILINE
+            )
             # Tables follow the other settings.
             head, _, late = text.partition("[late]")
             late, _, rest = late.partition('attempts = "best"\n')
@@ -152,7 +154,16 @@ def test_ninety_attempts_are_graded_within_a_minute(slot: Path, tmp_path: Path) 
             count += 1
     begin_s = time.process_time(), time.monotonic()
     done = hilrig(
-        "grade", recordings, "-a", slot / "1-hold-joint-1", "-r", slot / "roster.csv", "-o", tmp_path / "out", "--json", timeout_s=300
+        "grade",
+        recordings,
+        "-a",
+        slot / "1-hold-joint-1",
+        "-r",
+        slot / "roster.csv",
+        "-o",
+        tmp_path / "out",
+        "--json",
+        timeout_s=300,
     )
     elapsed_s = time.monotonic() - begin_s[1]
     assert done.returncode == 0, done.stderr

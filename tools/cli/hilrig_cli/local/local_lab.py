@@ -100,13 +100,6 @@ def bind_error(host: str, port: int) -> OSError | None:
     return None
 
 
-def free_ports(first: int, count: int = 1) -> int:
-    """Find `count` consecutive free ports on loopback, starting at `first`; return the lowest."""
-    while any(bind_error("127.0.0.1", port) for port in range(first, first + count)):
-        first += count
-    return first
-
-
 def _wait_until_ready(
     lab: LabConfig, processes: Sequence[ProcessSpec], supervisor: Supervisor, stopping: threading.Event
 ) -> None:
