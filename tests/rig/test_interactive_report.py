@@ -148,8 +148,6 @@ def test_ten_minutes_are_small_and_scrubbed_smoothly(tmp_path: Path, browser: Br
     rows = browser.run(f"{PLAYER}.run.time.length")
     # Every state is shown.
     assert 30_000 <= rows <= MAX_ROWS
-    reply = browser._call(
-        "Runtime.evaluate", expression=SCRUB % PLAYER, awaitPromise=True, returnByValue=True
-    )
+    reply = browser._call("Runtime.evaluate", expression=SCRUB % PLAYER, awaitPromise=True, returnByValue=True)
     assert reply["result"]["value"] >= 30.0
     assert browser.errors == []

@@ -32,9 +32,9 @@ def event_title(kind: str) -> str:
     return kind.replace("_", " ").lower()
 
 
-def legend_in_words(names: Sequence[str], colors: Sequence[str], separator: str = ", ") -> str:
+def legend_in_words(names: Sequence[str], colors: Sequence[str]) -> str:
     """Legend of curves as text: "θ1 blue, θ2 orange"; a box would cover a part of the curves."""
-    return separator.join(f"{name} {COLOR_NAMES[color]}" for name, color in zip(names, colors, strict=True))
+    return ", ".join(f"{name} {COLOR_NAMES[color]}" for name, color in zip(names, colors, strict=True))
 
 
 def severity_color(severity: str) -> str:

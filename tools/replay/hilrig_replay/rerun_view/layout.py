@@ -22,7 +22,7 @@ LIVE_WINDOW_S: Final = 20.0
 """Time range of the plots of a running rig, s."""
 _JOINTS: Final = legend_in_words(JOINT_SYMBOLS, JOINT_COLORS)
 _EFFORTS: Final = legend_in_words(EFFORT_SYMBOLS, JOINT_COLORS)
-_STAGES: Final = legend_in_words([one.title for one in LOOP_STAGES], [one.color for one in LOOP_STAGES], " + ")
+_STAGES: Final = legend_in_words([one.title for one in LOOP_STAGES], [one.color for one in LOOP_STAGES])
 _CAMERA_POSITION: Final = (0.80, -0.72, 0.50)
 _CAMERA_TARGET: Final = (0.14, 0.02, 0.02)
 _BACKGROUND: Final = (24, 28, 33)
@@ -88,18 +88,18 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         plot(f"Positions: {_JOINTS if single else 'θ'} (°; d3 mm)", paths.POSITION, legend=not single),
         plot("Velocities (°/s; d3 mm/s) and events", paths.VELOCITY, paths.EVENT_MARKERS),
         plot(f"Efforts: {_EFFORTS if single else 'τ'} (N·m; τ3 N; thin: commanded)", paths.EFFORT),
+        plot(f"Latency, ms: {_STAGES}", paths.LATENCY_STAGES)
+        if single
+        else plot("Loop latency, ms", paths.LOOP_LATENCY),
         rrb.Tabs(
-            plot(f"Latency, ms: {_STAGES}", paths.LATENCY_STAGES)
-            if single
-            else plot("Loop latency, ms", paths.LOOP_LATENCY),
-            plot("Age, ms", paths.LOOP_AGE),
-            plot("Tick lateness, ms", paths.TICK_LATENESS, paths.EVENT_MARKERS),
-            plot("Requests per second", paths.MODBUS, legend=True),
+            plot("Age of the acting torque, ms", paths.LOOP_AGE),
+            plot("Tick lateness, ms, and events", paths.TICK_LATENESS, paths.EVENT_MARKERS),
+            plot("Modbus requests per second", paths.MODBUS, legend=True),
         ),
-        row_shares=[1.0, 1.0, 1.0, 1.2],
+        row_shares=[1.1, 0.9, 1.0, 1.5, 0.9],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), plots, column_shares=[1.15, 1.0]),
+        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), plots, column_shares=[1.0, 1.0]),
         rrb.TimePanel(
             timeline=SIM_TIME,
             state="collapsed",
