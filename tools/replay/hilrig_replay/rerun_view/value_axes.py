@@ -1,6 +1,7 @@
 """Ranges of the value axes: the viewer labels multiples of a power of ten, and few if these are not within the data.
 
-A range is extended to the next label, so that each axis has two numbers at least. Their similar width aligns the time axes.
+A range is extended to the next label, so that each axis has two numbers at least. Similar widths of the numbers align the
+time axes.
 """
 
 import math
