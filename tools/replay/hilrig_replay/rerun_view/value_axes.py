@@ -1,6 +1,6 @@
 """Ranges of the value axes: the viewer labels multiples of a power of ten, and few if these are not within the data.
 
-A range is extended to the next label, so that each axis has two numbers at least. Similar widths of the numbers align the
+A range is extended to the next label, so that each axis has two numbers at least. Numbers of similar width align the
 time axes.
 """
 
