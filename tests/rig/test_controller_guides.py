@@ -167,9 +167,11 @@ def test_openplc_holds_the_arm_in_both_roles(lab: RunningLab, tmp_path: Path) ->
     assert start_rig == "hilrig up --controller 127.0.0.1:5502"
     run(as_server, tmp_path)
     (tmp_path / "rig").mkdir()
+    config = write_lab(tmp_path / "rig")
+    config.write_text(f'{config.read_text(encoding="utf-8")}controller = "127.0.0.1:{port}"\n', encoding="utf-8")
     with started(start_server, tmp_path):
         eventually(lambda: shell([start_modbus.replace("5502", str(port))], tmp_path).returncode == 0)
-        with RunningLab(write_lab(tmp_path / "rig"), "--controller", f"127.0.0.1:{port}") as rig:
+        with RunningLab(config) as rig:
             eventually(lambda: is_at_goal(rig.port), timeout_s=20)
 
 
