@@ -32,8 +32,8 @@ CASES = {
     "second half of function 23": ("17 0000 0009 0000 0001 02 0000", "only 1-8 exist (exception 02): reduce the count"),
     "write of function 23": (
         "17 0004 0004 0004 0001 02 0000",
-        "wrote holding register 5 and read holding registers 5-8, only 1-4, 101-102, 301-302 are writable (exception 02): "
-        "choose one of them; number n has address n - 1\n",
+        "wrote holding register 5 and read holding registers 5-8, only 1-4, 101-102, 301-302 are writable "
+        "(exception 02): choose one of them; number n has address n - 1\n",
     ),
     "coil value": ("05 0000 0001", "wrote coil 1, the value is 0001 (exception 03): use FF00 for on and 0000 for off"),
     "quantity 0": ("03 0000 0000", "the quantity is 0 (exception 03): use 1 to 125"),
