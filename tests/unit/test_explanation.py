@@ -54,7 +54,7 @@ def test_each_mistake_is_explained(name: str) -> None:
     pdu = bytes.fromhex(request)
     reply = execute(bench.device, bench.connect(), pdu, 0)
     assert reply[0] == pdu[0] | 0x80
-    # The newline of an example stands for the end of the text.
+    # A newline in an example is the end of the text.
     assert expected in f"{explain(1, 1, pdu, reply[1])}\n"
 
 

@@ -115,7 +115,8 @@ def check_health(address: ListenAddress, tls: TlsFiles | None) -> None:
     Raises:
         OperationError: no console answers.
     """
-    url = f"{'http' if tls is None else 'https'}://{format_address(address.local_host, address.port)}"
+    scheme = "http" if tls is None else "https"
+    url = f"{scheme}://{format_address(address.local_host, address.port)}"
     context = None
     if tls is not None:
         # The certificate is for a host name, not for a local address; the server is on this host.
