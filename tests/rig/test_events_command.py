@@ -43,7 +43,7 @@ def test_invalid_filters_are_refused(arguments: tuple[str, ...], message: str) -
 
 
 def test_live_events_and_commands_for_several_rigs(tmp_path: Path) -> None:
-    config = write_lab(tmp_path, extra="rigs.count = 3")
+    config = write_lab(tmp_path, rigs=3)
     with RunningLab(config) as lab:
         follower = subprocess.Popen(
             [*HILRIG, "events", "--json", "--rig", "rig2", "--config", lab.config],
@@ -61,8 +61,13 @@ def test_live_events_and_commands_for_several_rigs(tmp_path: Path) -> None:
             done = hilrig("impair", *options, "--json", "--config", config)
             assert done.returncode == 0, done.stderr
             rows = json.loads(done.stdout)
-            assert [row["rig"] for row in rows] == (["rig1", "rig3"] if "rig1" in options else ["rig1", "rig2", "rig3"])
-        assert "0.01" in json.dumps(json.loads(hilrig("impair", "rig1", "--loss", "0.01", "--json", "-c", config).stdout))
+            assert [row["rig"] for row in rows] == (
+                ["rig1", "rig2", "rig3"] if "--all" in options else ["rig1", "rig3"]
+            )
+            assert ("0.01" in json.dumps(rows[0]["ways"])) == ("--loss" in options)
+        assert "0.01" in json.dumps(
+            json.loads(hilrig("impair", "rig1", "--loss", "0.01", "--json", "-c", config).stdout)
+        )
         reset = hilrig("rig", "reset", "--all", "--config", config)
         assert len(reset.stdout.splitlines()) == 3, reset.stderr
         released = hilrig("lease", "--all", "--release", "--json", "--config", config)
