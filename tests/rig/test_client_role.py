@@ -440,7 +440,7 @@ def test_late_response_is_recognized() -> None:
     with Plc() as plc:
 
         def answer(transaction: int, response: bytes) -> bytes:
-            time.sleep(0.2)
+            time.sleep(0.2)  # longer than the response time-out of 150 ms
             return frame(transaction, response)
 
         plc.fault = on_reads(plc, answer)

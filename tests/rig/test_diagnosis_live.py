@@ -85,14 +85,14 @@ def causes_of(lab: RunningLab, command: list[str]) -> list[Finding]:
 
 def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
     """Stop a process several times."""
-    time.sleep(1.0)
+    time.sleep(1.0)  # the programs connect and move the arm before they are disturbed
     for _ in range(count):
         os.kill(pid, signal.SIGSTOP)
         try:
-            time.sleep(stop_s)
+            time.sleep(stop_s)  # the duration of the stop is under test
         finally:
             os.kill(pid, signal.SIGCONT)
-        time.sleep(0.8)
+        time.sleep(0.8)  # undisturbed time between two stops
         yield
 
 

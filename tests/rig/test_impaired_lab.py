@@ -106,7 +106,7 @@ def write_for_each_state(port: int) -> None:
             if step != last:
                 last = step
                 client.write(0, step[1] & 0xFF, 0, 0, 0)
-            time.sleep(0.001)
+            time.sleep(0.001)  # polls for the next state
 
 
 @pytest.fixture(scope="module")

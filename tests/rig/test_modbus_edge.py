@@ -113,7 +113,7 @@ def test_request_log_has_tcp_figures_once_a_second() -> None:
             sent_ns = now_ns()
             client.read(4, 4)
             round_trips_us.append((now_ns() - sent_ns) // 1000)
-            time.sleep(0.02)
+            time.sleep(0.02)  # the period of a controller
         figures = [figures for traffic in rig.traffic for figures in traffic.connections]
         assert 2 <= len(figures) <= 4
         for one in figures:
@@ -264,7 +264,7 @@ def test_torque_is_zero_within_the_timeout(how: str) -> None:
             if how == "reads on":
                 client.read(4, 4)
             else:
-                time.sleep(0.001)
+                time.sleep(0.001)  # polls for the event without a request to the rig
         safe = rig.commands[-1]
         silent_ms = (safe.sent_ns - write.write_arrived_ns) / 1e6
         assert timeout_ms <= silent_ms < timeout_ms + 20

@@ -57,7 +57,7 @@ def test_mbpoll_moves_joint_1_and_friction_stops_it(lab: RunningLab) -> None:
 
     def is_at_rest() -> bool:
         first = mbpoll_read(lab.port, 5, 4)[0]
-        time.sleep(0.1)
+        time.sleep(0.1)  # the arm would move between the two readings
         return mbpoll_read(lab.port, 5, 4)[0] == first >= turned[0]
 
     eventually(is_at_rest)

@@ -182,7 +182,7 @@ async def connect() -> tuple[SocketTransport, Protocol, socket.socket]:
 async def until(is_true: object) -> None:
     async with asyncio.timeout(10):
         while not is_true():  # type: ignore[operator]
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(0.001)  # polls
 
 
 def test_internal_error_closes_one_connection_only(caplog: pytest.LogCaptureFixture) -> None:
@@ -229,7 +229,7 @@ def test_paused_reading_leaves_bytes_in_the_socket() -> None:
         with peer:
             transport.pause_reading()
             await loop.sock_sendall(peer, b"later")
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.01)  # the loop would read the socket in this time
             assert protocol.received == b""
             transport.resume_reading()
             await until(lambda: protocol.received == b"later")
@@ -254,7 +254,7 @@ def test_kernel_timestamp_precedes_a_stall_of_the_loop() -> None:
                 sent_ns = time.monotonic_ns()
                 peer.sendall(b"hello")
                 received_ns = time.monotonic_ns()
-                time.sleep(0.05)
+                time.sleep(0.05)  # the stall of the event loop
                 await until(lambda: protocol.received == b"hello")
                 now_ns = time.monotonic_ns()
                 stamp_ns = transport.received_ns(sent_ns, now_ns)

@@ -31,8 +31,8 @@ class Counter:
         now_ns = time.monotonic_ns()
         to_tick_ns = STEP_NS - (now_ns - self.start_ns) % STEP_NS
         if 6_000_000 < to_tick_ns < 9_000_000:
-            # The request is sent long before a tick and answered after it.
             self._delayed += 1
+            # The request is sent long before a tick and answered after it.
             time.sleep((to_tick_ns + 100_000) * 1e-9)
         return 0 if self._stopped else (time.monotonic_ns() - self.start_ns) // STEP_NS
 
