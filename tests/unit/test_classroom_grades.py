@@ -13,7 +13,7 @@ import pytest
 from hilrig_classroom.assignment import Assignment, AssignmentConfig, Measure, load_assignment
 from hilrig_classroom.gradebook import fill_export, grades_csv
 from hilrig_classroom.output import GradeFolder
-from hilrig_classroom.roster import Roster, read_roster
+from hilrig_runtime.config.roster import Roster, read_roster
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from support.labs import hilrig

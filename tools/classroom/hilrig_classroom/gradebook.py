@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_classroom.roster import Roster, delimiter_of
+from hilrig_runtime.config.roster import Roster, delimiter_of
 from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.escaping import csv_text

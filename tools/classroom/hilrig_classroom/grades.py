@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.attempts import owner_of
-from hilrig_classroom.roster import Roster, Student, read_table
 from hilrig_replay.analysis.similarity import TorqueSketch, find_similar
 from hilrig_replay.analysis.summary import summarize
 from hilrig_replay.grading.overlap import Span, overlapping
@@ -20,6 +19,7 @@ from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import find_runs
 from hilrig_replay.io.run import open_run
 from hilrig_replay.io.segments import RunFiles
+from hilrig_runtime.config.roster import Roster, Student, read_table
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.process_pool import process_pool

@@ -10,8 +10,8 @@ from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.gradebook import FilledExport, fill_export, grades_csv
 from hilrig_classroom.grades import FORMAT, grade_class, read_overrides
 from hilrig_classroom.pages import class_page, write_student_pages
-from hilrig_classroom.roster import Roster, Student
 from hilrig_replay.io.output_file import output_file
+from hilrig_runtime.config.roster import Roster, Student
 from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError, OperationError
 

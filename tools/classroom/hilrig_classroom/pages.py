@@ -7,10 +7,10 @@ from typing import Any
 
 from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.gradebook import feedback, used_attempt
-from hilrig_classroom.roster import Roster, Student
 from hilrig_replay.io.segments import RunFiles
 from hilrig_replay.report import assets
 from hilrig_replay.report.report import build_report
+from hilrig_runtime.config.roster import Roster, Student
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError
 from hilrig_runtime.escaping import as_html
