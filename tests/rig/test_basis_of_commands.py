@@ -21,7 +21,7 @@ from hilrig_schemas import Event, TorqueCommand, topics
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 ROOT = Path(__file__).parents[2]
 HOLD = ROOT / "examples/hold_position.py"

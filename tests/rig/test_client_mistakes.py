@@ -150,16 +150,12 @@ def test_request_in_two_segments_is_not_delayed(split: int) -> None:
     with running_edge() as rig, rig.client() as client:
         client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0)
         frame = client.frame(b"\x03\x00\x04\x00\x04")
-
-        def cycle() -> float:
-            begin = time.monotonic()
+        begin = time.monotonic()
+        for _ in range(50):
             client.send(frame[:split])
             client.send(frame[split:])
             client.receive()
-            return time.monotonic() - begin
-
-        times = sorted(cycle() for _ in range(40))
-        assert times[20] < 0.02
+        assert time.monotonic() - begin < 1, "delayed requests take two seconds"
 
 
 # -- idle connections

@@ -23,7 +23,7 @@ from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 PROGRAM = Path(__file__).parents[1] / "support/student_program.py"
 EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"

@@ -31,8 +31,7 @@ def test_measures_with_and_without_load_and_stops_its_processes() -> None:
     assert (result["step_ms"], result["fit"]) == (10.0, False)
     assert [condition["loaded"] for condition in result["conditions"]] == [False, True]
     for condition in result["conditions"]:
-        # Missed steps are made up for: the number of ticks does not depend on the load.
-        assert condition["ticks"] >= 100
+        assert 100 <= condition["ticks"] + condition["missed_steps"] < 500
         assert condition["step_ms"] == 10.0
         # A measurement that is too short is never suitable.
         assert any(reason.endswith("measure longer") for reason in condition["reasons"])

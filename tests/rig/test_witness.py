@@ -28,7 +28,7 @@ from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 CONTROLLER = Path(__file__).parents[1] / "support/witness_controller.py"
 LONG = bool(os.environ.get("HILRIG_LONG"))
