@@ -64,7 +64,7 @@ test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet
 	HILRIG_FUZZ_FRAMES=200000 $(BIN)/pytest tests/rig/test_modbus_fuzz.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_doctor.py tests/rig/test_console.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py tests/rig/test_diagnosis_live.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_pick_and_place.py tests/rig/test_demo_slow_network.py tests/rig/test_study_live.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py tests/rig/test_installation.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
 	$(BIN)/python tests/chaos.py
 
