@@ -97,7 +97,7 @@ def test_torque_is_zero_after_controller_failure(tmp_path: Path) -> None:
         finally:
             for process in processes.values():
                 process.kill()
-                process.wait()
+                process.communicate()
         assert lab.stop() == 0
         for rig, (_, _, cause) in FAULTS.items():
             [recording] = [path for path in lab.recordings if path.parent.name == rig]
@@ -123,7 +123,7 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
             eventually(lambda: hilrig("lease", "rig1", "--config", config).returncode == 0)
         finally:
             process.kill()
-            process.wait()
+            process.communicate()
         assert lab.stop() == 0
         [recording] = lab.recordings[:1]
         commands = [c for c in messages(recording, "/command", TorqueCommand) if c.controller]

@@ -171,10 +171,9 @@ def test_random_frames_do_not_affect_other_clients(tmp_path: Path) -> None:
             healthy = json.loads(out)
             assert looping.poll() is None, "the controller of the other rig was disturbed"
         finally:
-            reader.kill()
-            looping.kill()
-            reader.wait()
-            looping.wait()
+            for process in (reader, looping):
+                process.kill()
+                process.communicate()
         assert lab.service_pid("edge") == edge
         assert before_mib is not None
         grown_mib = resident_mib(edge) - before_mib
