@@ -1,6 +1,7 @@
 """The extras of the distribution: each command has one, and each extra has the dependencies of its commands."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from test_command_imports import registered
 
 from hilrig_cli import extras
-from support.extras import COMMANDS, DATA, MODULES, PROJECT, ROOT, RUN, distributions_of, modules_without
+from support.extras import COMMANDS, DATA, MODULES, PROJECT, ROOT, distributions_of, modules_without
 
 OLD_NAMES = {"router", "sim", "edge", "recorder", "replay"}
 """Extras of version 0.1, which remain as aliases."""
@@ -51,7 +52,7 @@ def test_old_names_of_extras_are_aliases() -> None:
 
 @pytest.mark.parametrize("extra", ["", "rig", "review", "console"])
 def test_commands_of_an_extra_need_no_other_packages(extra: str, tmp_path: Path) -> None:
-    places = {"root": ROOT, "data": DATA, "run": RUN, "out": tmp_path}
+    places = {"root": ROOT, "data": shutil.copytree(DATA, tmp_path / "data"), "out": tmp_path}
     commands = [command.format_map(places) for command in COMMANDS[extra]]
     job = json.dumps((sorted(modules_without(extra)), MODULES.get(extra, "").split(), commands))
     process = [sys.executable, "-c", CODE, job]

@@ -1,6 +1,7 @@
 """Installations: hilrig with one extra alone, in a new environment, runs the commands of that extra."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from support.extras import COMMANDS, DATA, ROOT, RUN
+from support.extras import COMMANDS, DATA, ROOT
 from support.labs import free_ports, write_lab
 from support.waiting import LONG_TIMEOUT_S, eventually
 
@@ -34,7 +35,7 @@ def test_extra_alone_runs_its_commands(extra: str, tmp_path: Path) -> None:
     assert installed.returncode == 0, installed.stderr
     hilrig = tmp_path / "venv/bin/hilrig"
     (tmp_path / "out").mkdir()
-    places = {"root": ROOT, "data": DATA, "run": RUN, "out": tmp_path / "out"}
+    places = {"root": ROOT, "data": shutil.copytree(DATA, tmp_path / "data"), "out": tmp_path / "out"}
     for command in COMMANDS[extra]:
         done = run(hilrig, *command.format_map(places).split(), cwd=tmp_path)
         assert done.returncode in (0, 1), f"hilrig {command}: {done.stderr}"

@@ -9,7 +9,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DATA = ROOT / "tests/data"
-RUN = str(DATA / "limit-cycle.mcap")
 COMMANDS = {
     "": (
         "check --template",
@@ -22,17 +21,17 @@ COMMANDS = {
     "rig": (),
     "review": (
         "runs {data}",
-        "latency {run} --plot {out}/latency.png",
-        "report {run} --out {out}/report.html",
-        "verify {run}",
-        "compare {run} {data}/wall-clock-steps.mcap",
-        "export {run} --csv {out}/csv --parquet {out}/parquet --foxglove {out}/foxglove.mcap",
-        "replay {run} --save {out}/run.rrd",
-        "recover {run}",
+        "latency {data}/limit-cycle.mcap --plot {out}/latency.png",
+        "report {data}/limit-cycle.mcap --out {out}/report.html",
+        "verify {data}/limit-cycle.mcap",
+        "compare {data}/limit-cycle.mcap {data}/wall-clock-steps.mcap",
+        "export {data}/limit-cycle.mcap --csv {out}/csv --parquet {out}/parquet --foxglove {out}/foxglove.mcap",
+        "replay {data}/limit-cycle.mcap --save {out}/run.rrd",
+        "recover {data}/limit-cycle.mcap",
     ),
     "console": (),
 }
-"""Command lines of each extra that end by themselves; the exit code is 0, or 1 for a run that is not fit."""
+"""Command lines of each extra that end by themselves with exit code 0, or 1 for a run that is not fit."""
 MODULES = {
     "rig": "hilrig_sim.service hilrig_modbus_edge.service hilrig_recorder.service hilrig_monitoring.metrics_server "
     "hilrig_cli.local.local_lab",
