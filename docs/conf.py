@@ -46,7 +46,7 @@ def _link(match: re.Match[str]) -> str:
     return f"]({path}#{anchor})" if anchor else f"]({path})"
 
 
-def _read_root_page(app: Any, name: str, source: list[str]) -> None:
+def _read_root_page(_: Any, name: str, source: list[str]) -> None:
     folder, _, page = name.partition("/")
     if folder == "project":
         text = (ROOT / f"{page.upper()}.md").read_text(encoding="utf-8")
