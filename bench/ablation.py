@@ -16,6 +16,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from scale import run_lab
 from steal import StealMonitor
 
 sys.path.append(str(HERE / "variants"))
-from variants import VARIANTS
+from variants import VARIANTS  # type: ignore[attr-defined]  # a folder of the same name is found by mypy
 
 from hilrig_cli.local.local_lab import running_lab
 
@@ -117,11 +118,11 @@ def main() -> int:
     fast, equal = build_c("loop_client.c"), build_c("modbus_client.c")
     jobs: list[Callable[[], Figures]] = []
     if "rigs" in what:
-        jobs += [lambda count=count: rigs(load, count, options.seconds) for count in counts]
+        jobs += [partial(rigs, load, count, options.seconds) for count in counts]
     if "loop" in what:
-        jobs += [lambda step_ms=step_ms: loop(fast, step_ms, options.seconds) for step_ms in STEPS_MS]
+        jobs += [partial(loop, fast, step_ms, options.seconds) for step_ms in STEPS_MS]
     if "reads" in what:
-        jobs += [lambda rate=rate: reads(equal, rate, options.seconds) for rate in RATES]
+        jobs += [partial(reads, equal, rate, options.seconds) for rate in RATES]
     found: dict[str, dict[str, list[float]]] = {}
 
     def note(name: str, figures: Figures) -> None:

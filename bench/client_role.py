@@ -207,7 +207,8 @@ def basis_errors(device: Plc, commands: Rows) -> NDArray[np.float64]:
     basis = np.searchsorted(writes, commands["state_served_ns"])
     used = np.searchsorted(writes, begins[np.maximum(scan, 0)]) - 1
     known = (scan >= 0) & (read < commands["write_arrived_ns"]) & (basis < len(writes)) & (used >= 0)
-    return (writes[basis[known]] - writes[used[known]]) / 1e6
+    errors_ms: NDArray[np.float64] = (writes[basis[known]] - writes[used[known]]) / 1e6
+    return errors_ms
 
 
 def log(line: str) -> None:

@@ -120,7 +120,7 @@ def rig_run(client: Path, step_ms: float, seconds: float) -> RigRun:
     undisturbed = steal.undisturbed(found.table["wall_ns"])
     edge_us = 1e6 * edge_s / (figures["cycles_per_s"] * seconds)
     return RigRun(
-        found.table, undisturbed, found.lost.transport + found.lost.recorder, figures, steal.mean_cpus, edge_us
+        found.table[:], undisturbed, found.lost.transport + found.lost.recorder, figures, steal.mean_cpus, edge_us
     )
 
 
@@ -148,7 +148,7 @@ def add_loop(report: Report, step_ms: float, runs: list[RigRun]) -> None:
 
 
 def median(runs: list[dict[str, Any]], group: str, key: str) -> float:
-    return statistics.median(run[group][key] for run in runs)
+    return float(statistics.median(run[group][key] for run in runs))
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,13 +85,13 @@ def measure(report: Report, quick: bool) -> None:
                 progress(f"{name}, {connections} connections, run {number + 1} of {runs}")
                 figures = run_with_least_steal(partial(run_once, start, client, connections, seconds))
                 measured.setdefault((name, connections), []).append(figures)
-    for (name, connections), figures in measured.items():
+    for (name, connections), found in measured.items():
         case = f"{name}, {connections} connection{'s' if connections > 1 else ''}"
-        report.add(case, "cycles", median_of(figures, "cycles_per_s"), "1/s")
-        report.add(case, "read p50", median_of(figures, "read_us", "p50"), "µs")
-        report.add(case, "read p99", median_of(figures, "read_us", "p99"), "µs")
-        report.add(case, "CPU time per cycle", median_of(figures, "cpu_us"), "µs")
-        report.add(case, "CPU steal", median_of(figures, "steal"), "CPUs")
+        report.add(case, "cycles", median_of(found, "cycles_per_s"), "1/s")
+        report.add(case, "read p50", median_of(found, "read_us", "p50"), "µs")
+        report.add(case, "read p99", median_of(found, "read_us", "p99"), "µs")
+        report.add(case, "CPU time per cycle", median_of(found, "cpu_us"), "µs")
+        report.add(case, "CPU steal", median_of(found, "steal"), "CPUs")
     cpu = {name: median_of(measured[name, 2], "cpu_us") for name in servers}
     for peer, name, bound in ((LIBMODBUS, "libmodbus", 1.7), (PYMODBUS, "pymodbus", 0.4)):
         ratio = cpu[PROTOCOL_ONLY] / cpu[peer]
@@ -141,7 +141,7 @@ def measure_at_equal_rates(report: Report, client: Path, servers: dict[str, Call
                     with servers[name](2) as (port, step, _), StealMonitor() as steal:
                         run_modbus_client(client, port, step, 2, seconds, rate, samples)
                     end_wall_ns, read_ns = np.fromfile(samples, np.int64).reshape(-1, 2).T
-                    undisturbed = read_ns[steal.undisturbed(end_wall_ns)] * 1e-3
+                    undisturbed = (read_ns[steal.undisturbed(end_wall_ns)] * 1e-3).astype(np.float64)
                     reads.setdefault((name, rate), []).append(undisturbed)
     p99: dict[tuple[str, int], float] = {}
     for (name, rate), parts in reads.items():
@@ -237,7 +237,7 @@ def run_modbus_client(
     samples: Path | None = None,
 ) -> Figures:
     """Run the client in C and return its figures; it writes the time of each read into `samples`."""
-    command = [client, *map(str, (port, step, connections, seconds, rate)), *([samples] if samples else [])]
+    command = [*map(str, (client, port, step, connections, seconds, rate)), *([str(samples)] if samples else [])]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=seconds + 30)
     figures: Figures = json.loads(done.stdout)
     return figures

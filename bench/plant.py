@@ -140,7 +140,7 @@ def accuracy(report: Report, rig: RigParameters, once: RigParameters, steps: int
         q0, v0 = automatic.position.copy(), automatic.velocity.copy()
         with np.errstate(all="ignore"):
             for index in range(count):
-                single.set_state(index, q0[:, index], v0[:, index])
+                single.set_state(index, q0[:, index].tolist(), v0[:, index].tolist())
             single.step(efforts, magnet)
             automatic.step(efforts, magnet)
         substeps.append(automatic.substeps.mean())

@@ -188,7 +188,8 @@ def evaluate_recordings(
         run = open_run(path)
         result = latency_of(run)
         recordings.add(result.rig)
-        table = result.table[result.table["wall_ns"] >= begin_ns]
+        table = result.table[:]
+        table = table[table["wall_ns"] >= begin_ns]
         steps.append(table["step"].astype(np.int64) - table["basis_step"].astype(np.int64))
         loops.append(table["loop"] / 1e6)
         longest_hold = max(longest_hold, int(np.diff(table["step"].astype(np.int64)).max(initial=0)))

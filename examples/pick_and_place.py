@@ -23,6 +23,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pymodbus.client import ModbusTcpClient
@@ -112,7 +113,7 @@ DEFAULT_SCENE = {
 }
 
 
-def task_of(scene: dict) -> Task:
+def task_of(scene: dict[str, Any]) -> Task:
     """Read the task from the `[scene]` of a lab's file; missing keys have hilrig's defaults."""
     table = scene.get("table", {}).get("height_mm", -60.0) / 1000
     parts = []
@@ -415,7 +416,7 @@ def registers_of(efforts: np.ndarray) -> list[int]:
 
 def control(
     rig: Rig, controller: Controller, duration_s: float, overtime_s: float = 0.0, *, once: bool = False
-) -> dict:
+) -> dict[str, Any]:
     """Close the loop every `PERIOD_S`, or as often as the network allows, for `duration_s`; return the result.
 
     If the task is not finished by then, it may take `overtime_s` more. With `once`, return as soon as it is finished.
@@ -467,7 +468,7 @@ def control(
     }
 
 
-def sentence(result: dict) -> str:
+def sentence(result: dict[str, Any]) -> str:
     """Describe the result in one line."""
     text = f"{result['placed']} of {result['parts']} parts placed"
     if result["done_s"] is not None:

@@ -1,6 +1,5 @@
-"""Example for a first own program: picks the red part and puts it down in the tray.
+"""Example for a first own program: picks the red part and puts it down in the tray. It needs pymodbus 3.16 or newer.
 
-    pip install "pymodbus>=3.16"
     python pick_one_part.py --host 127.0.0.1 --port 5020
 
 PART is the position of the part. Each run begins with a reset, which moves arm and parts back to their start.
@@ -12,6 +11,7 @@ import sys
 import time
 
 from pymodbus.client import ModbusTcpClient
+from pymodbus.pdu import ModbusPDU
 
 # Positions in mm from the foot of the arm; z is up. The tip has to be 2 mm above the top of the part.
 PART = (376.0, 137.0, -28.0)
@@ -85,7 +85,7 @@ class Arm:
         self.weight = QUILL + (PART_WEIGHT if on else 0.0)
 
 
-def checked(answer):
+def checked(answer: ModbusPDU) -> ModbusPDU:
     """Return the response of the rig, or raise its exception: 02 no such register, 06 another controller writes."""
     if answer.isError():
         raise RuntimeError(f"the rig refuses a request: {answer}")
