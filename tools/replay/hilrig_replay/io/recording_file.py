@@ -232,7 +232,8 @@ def _read_summary(reader: RecordReader) -> _FileContents | None:
     index: list[MetadataIndex | AttachmentIndex] = []
     for item in reader.summary_items(summary):
         if isinstance(item, ChunkIndex):
-            contents.chunks.append(item.first_ns, item.last_ns, item.offset, item.length, _bits(item.channels))
+            row = item.first_ns, item.last_ns, item.offset, item.length, _bits(item.channels)
+            contents.chunks.add(contents.chunks.pack(*row))
         elif isinstance(item, Schema | Channel):
             contents.add(item)
         elif isinstance(item, Statistics):

@@ -96,7 +96,7 @@ class Follower:
             topic, payload, arrived_ns = self._pending.popleft()
             try:
                 RECORDED[topic].decode(payload)
-                self._decoder.add(topic, payload, 0, arrived_ns)
+                self._decoder.decoders[topic](payload, 0, arrived_ns)
             except DecodeError:
                 self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
         records = self._decoder.drain()
