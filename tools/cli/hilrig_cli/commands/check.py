@@ -37,7 +37,8 @@ def check(
     lab = load_lab(file)
     rigs = lab_parameters(lab, str(file or "defaults"))
     if as_json:
-        print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
+        found = {"ports": lab.ports, "tls_ports": lab.tls_ports, "warnings": list(accuracy_warnings(rigs))}
+        print(json.dumps(lab.model_dump(mode="json") | found))
         return
     addresses = lab.addresses()
     is_restricted = any(rig.allow for rig in lab.rigs)
