@@ -32,6 +32,8 @@ from hilrig_schemas.topics import RECORDED
 
 SCHEMA_PACKAGE: Final = "hilrig.v1"
 """Package of the message schemas that this version reads."""
+MAX_CHANNELS: Final = 1000
+"""Largest number of channels of a recording; those of hilrig have one a topic."""
 CHUNK_DTYPE: Final = np.dtype(
     [("first_ns", "<i8"), ("last_ns", "<i8"), ("offset", "<u8"), ("length", "<u8"), ("channels", "<u8")]
 )
@@ -170,6 +172,8 @@ class _FileContents:
             self.schemas[record.id] = record
         elif isinstance(record, Channel):
             self.channels[record.id] = record
+            if len(self.channels) > MAX_CHANNELS:
+                raise DamagedError(f"more than {MAX_CHANNELS} channels")
         elif isinstance(record, Metadata):
             add_metadata(self.metadata, record, offset)
         elif isinstance(record, Attachment):
