@@ -53,7 +53,9 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
         if reply.error:
             raise OperationError(f"rig {rig!r}: the edge refused: {reply.error}")
     if not replies:
-        raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
+        raise OperationError(
+            f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml? See hilrig doctor"
+        )
     positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
     try:
         by_rig = {parse_rig_key(reply.key).rig: topic.decode_from(reply.key, reply.payload) for reply in replies}
@@ -71,7 +73,7 @@ def check_permission(lab: LabConfig, topic: Topic[Any]) -> None:
     role = "operator" if lab.bus.tls is None else own_identity(lab.bus.tls, "tool")
     if role not in RULES[topic.name].subscribers:
         raise OperationError(
-            f"this host has only the {role} certificate; a {topic.name} request needs operator: copy operator.pem and "
+            f"this host has only the {role} certificate; {topic.name} requests need operator: copy operator.pem and "
             f"operator.key into bus.tls.folder, or run the command on a host that has them"
         )
 

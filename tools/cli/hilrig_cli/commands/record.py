@@ -50,7 +50,8 @@ def _request(config: "Path | None", rig: str, request: "ControlRequest") -> str:
         recorders = [one for one in discover_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
             raise OperationError(
-                f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
+                f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml? "
+                "See hilrig doctor"
             )
         # Rigs that were added at run time belong to the recorder of the first rig in the lab's file.
         owner = next((one for one in recorders if rig in one.rigs), None)
