@@ -265,6 +265,9 @@ def test_running_process_of_this_host_is_not_to_be_restarted(is_alive: bool) -> 
     [error] = [one for one in services.check_services(parse_lab(ROUTED), found, local) if one.level is Level.ERROR]
     assert "4711" in error.text + error.fix
     assert "do not restart it" in error.fix
+    secured = parse_lab("[bus.tls]\n")
+    [error] = [one for one in services.check_services(secured, snapshot("edge/1", "recorder/1"), local) if one.fix]
+    assert error.fix.endswith("check the certificates below"), "only a valid certificate is answered in a mesh"
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,7 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
         if reply.error:
             raise OperationError(f"rig {rig!r}: the edge refused: {reply.error}")
     if not replies:
-        raise OperationError(
-            f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml? See hilrig doctor"
-        )
+        raise OperationError(f"no edge answers for lab {lab.name!r}: {lab.bus.no_answer_hint}")
     positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
     try:
         by_rig = {parse_rig_key(reply.key).rig: topic.decode_from(reply.key, reply.payload) for reply in replies}

@@ -46,9 +46,7 @@ class LabWatch(Handle):
             time.sleep(0.1)
         with self.lock:
             if not self.view.services():
-                raise OperationError(
-                    f"no service of lab {self.lab.name!r} found: is it running (hilrig up), with this lab.toml?"
-                )
+                raise OperationError(f"no service of lab {self.lab.name!r} found: {self.lab.bus.no_answer_hint}")
 
     def _on_health(self, key: str, payload: bytes) -> None:
         try:

@@ -49,10 +49,7 @@ def _request(config: "Path | None", rig: str, request: "ControlRequest") -> str:
     with ZenohBus(lab.bus, "tool") as bus:
         recorders = [one for one in discover_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
-            raise OperationError(
-                f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml? "
-                "See hilrig doctor"
-            )
+            raise OperationError(f"no recorder answers for lab {lab.name!r}: {lab.bus.no_answer_hint}")
         # Rigs that were added at run time belong to the recorder of the first rig in the lab's file.
         owner = next((one for one in recorders if rig in one.rigs), None)
         owner = owner or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])

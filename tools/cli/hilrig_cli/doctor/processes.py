@@ -38,7 +38,7 @@ class LocalProcess:
 class RouterState(Enum):
     """Result of a TCP connection to the router."""
 
-    ACCEPTS = "accepts connections"
+    ACCEPTS = "its port accepts connections, but it does not answer"
     REFUSES = "its host answers, but no program listens on the port"
     UNREACHABLE = "its host does not answer"
 

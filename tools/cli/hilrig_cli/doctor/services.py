@@ -166,7 +166,11 @@ def check_services(
     """
     if not snapshot.services & set(SERVICES) and not any(one.service in SERVICES for one in processes):
         text = f"no service of lab {lab.name!r} is running"
-        yield CheckResult.warning("services", text, "start the lab: hilrig up, or each service")
+        yield CheckResult.warning(
+            "services",
+            text,
+            "start the lab: hilrig up, or each service. If it runs, compare name and [bus] in the lab.toml of both",
+        )
         return
     missing = [service for service in SERVICES if service not in snapshot.services]
     for service in missing:
@@ -218,7 +222,10 @@ def _explain_missing(
     what = f"{service} of {list_names(rigs)}" if rigs else service
     if local:
         text = f"{what} runs on this host (process {local[0].pid}), but is not on the bus"
-        return CheckResult.error("services", text, "see its log: it starts, or waits for the bus; do not restart it")
+        # In a mesh, a command without a valid certificate joins, but nobody answers.
+        certificates = "; check the certificates below" if lab.bus.tls is not None else ""
+        fix = f"see its log: it starts, or waits for the bus; do not restart it{certificates}"
+        return CheckResult.error("services", text, fix)
     known = sorted({peer.service for peer in snapshot.peers() if peer.service.startswith(f"{service}/")})
     known = [name for name in known if name not in snapshot.alive]
     observations = "".join(f"; {_observations(name, snapshot)}" for name in known)
