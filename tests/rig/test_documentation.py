@@ -30,10 +30,11 @@ OPENS_A_VIEWER = ("hilrig replay", "hilrig live")
 TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose run --rm demo": "tests/hosts/test_compose.py",
     "docker compose up": "tests/hosts/test_compose.py",
+    "hilrig assign": "tests/unit/test_class_of_30.py",
     "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
-    "hilrig grade": "tests/unit/test_classroom_grades.py",
+    "hilrig grade": "tests/unit/test_class_of_30.py",
     "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig join": "tests/unit/test_join.py",
     "hilrig play": "tests/rig/test_recorder_play.py",

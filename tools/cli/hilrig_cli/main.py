@@ -8,7 +8,7 @@ import inspect
 
 import typer
 
-from hilrig_cli.commands import record, rig
+from hilrig_cli.commands import assign, record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
 from hilrig_cli.commands.compare import compare
@@ -92,6 +92,7 @@ for _panel, _commands in PANELS.items():
         app.command(rich_help_panel=_panel, context_settings=_settings)(_command)
 app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
 app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
+app.add_typer(assign.app, name="assign", rich_help_panel="Analyze recordings")
 
 
 def _unwrap_help(group: typer.Typer) -> None:
@@ -101,7 +102,7 @@ def _unwrap_help(group: typer.Typer) -> None:
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-for _group in (app, rig.app, record.app):
+for _group in (app, rig.app, record.app, assign.app):
     _unwrap_help(_group)
 
 

@@ -42,9 +42,10 @@ def console(
     import secrets
 
     from hilrig_console.auth import AccessPolicy, normalize_host_names
-    from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
+    from hilrig_console.serving import ConsoleServer, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.listen_address import ListenAddress
     from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import force_exit_after, stop_on_signals, wait_for
     from hilrig_runtime.timing.realtime import lower_priority
@@ -69,7 +70,7 @@ def console(
     stopping = stop_on_signals()
     force_exit_after(stopping, 8.0)
     with server:
-        say(f"console of lab {lab.name}: {server.url}")
+        say(f"console of lab {lab.name}: {server.urls}")
         if generated:
             say(f"password: {password} (any user name)")
         if tls is None and not address.is_loopback:
