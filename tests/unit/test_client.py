@@ -98,4 +98,4 @@ def test_unanswered_command_names_the_certificates(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(client, "check_permission", lambda *_: None)
     for text, expected in (("", "with this lab.toml?"), ("[bus.tls]\n", "valid certificates in .*bus?")):
         with pytest.raises(OperationError, match=f"no edge answers .*{expected}.* See hilrig doctor"):
-            client.query_edges(parse_lab(text), LEASE, "", LeaseRequest())
+            client.query_edges(parse_lab(text), LEASE, [], LeaseRequest())
