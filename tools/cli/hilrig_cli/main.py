@@ -11,6 +11,7 @@ import typer
 from hilrig_cli.commands import record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
+from hilrig_cli.commands.claim import claim
 from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
@@ -50,7 +51,23 @@ app = typer.Typer(
 )
 
 PANELS = {
-    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs),
+    "Run a lab": (
+        up,
+        demo,
+        live,
+        console,
+        top,
+        metrics,
+        check,
+        doctor,
+        claim,
+        lease,
+        impair,
+        jitter,
+        registers,
+        ik,
+        certs,
+    ),
     "Run a single service": (sim, edge, recorder, router),
     "Analyze recordings": (
         runs,

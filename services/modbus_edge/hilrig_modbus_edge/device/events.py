@@ -49,13 +49,19 @@ class EventEmitter:
         certificate: str = "",
         reason: str = "",
         holder: str = "",
+        student: str = "",
     ) -> None:
-        """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
+        """Publish an event about a controller, "host:port".
+
+        `holder`: the lease holder, if that is another client; `student`: the owner of the rig, if the event is about
+        that.
+        """
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
         event.controller_data.certificate = certificate
         event.controller_data.reason = reason
         event.controller_data.holder = holder
+        event.controller_data.student = student
         self.emit(event)
 
     def emit_state_outage(self, outage: Outage, wall_offset_ns: int) -> None:
@@ -80,6 +86,8 @@ class Refusal(NamedTuple):
     code: ExcCodes
     holder: str = ""
     """Address of the connection for which it is refused; empty: none."""
+    student: str = ""
+    """Owner of the rig, if it is refused for the owner; empty: for another reason, or there is none."""
 
 
 class LeaseEventReporter:
@@ -149,6 +157,7 @@ class LeaseEventReporter:
             certificate=client.certificate,
             reason=refusal.reason,
             holder=refusal.holder,
+            student=refusal.student,
         )
 
     def _emit_acquired(self, client: Client, count: int = 1) -> None:
