@@ -56,8 +56,8 @@ test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet
 	HILRIG_BUS_FUZZ_MESSAGES=100000 $(BIN)/pytest tests/rig/test_bus_fuzz.py
 	HILRIG_RANDOM_ARMS=100 $(BIN)/pytest tests/unit/test_automatic_substeps.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_doctor.py tests/rig/test_console.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py tests/rig/test_diagnosis_live.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py tests/rig/test_installation.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
 	$(BIN)/python tests/chaos.py
 
 check: .venv/dev ## check format, lint rules, types and layers

@@ -6,6 +6,7 @@ import struct
 import sys
 import threading
 import time
+from contextlib import ExitStack
 
 import pytest
 
@@ -314,6 +315,42 @@ def test_connections_of_one_host_are_limited() -> None:
         with rig.client() as two:
             assert two.closed()
         assert "max_connections_per_host" in rig.event(Event.CONNECTION_REFUSED).text
+
+
+def connect_from(rig: EdgeRig, source: str) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", rig.port), timeout=5, source_address=(source, 0))
+
+
+def test_silent_connections_of_many_hosts_take_no_place() -> None:
+    """A hundred hosts send nothing, or reset their connection: neither a new nor a connected client notices."""
+    with running_edge(max_connections=8, idle_timeout_s=0) as rig, rig.client() as owner, ExitStack() as closing:
+        owner.write(0, 100)
+        for number in range(100):
+            silent = closing.enter_context(connect_from(rig, f"127.0.9.{number + 1}"))
+            if number % 3 == 0:
+                silent.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                silent.close()
+        for _ in range(3):
+            with rig.client() as new:
+                assert new.read(4, 4) == counts()
+        owner.write(0, 200)
+        eventually(lambda: rig.service.counters.connections <= 8)
+        assert not [event for event in rig.events if event.kind == Event.LEASE_LOST]
+        refusals = [event for event in rig.events if event.kind == Event.CONNECTION_REFUSED]
+        assert "no request before its place was needed" in refusals[0].text
+        assert len(refusals) <= 40
+
+
+def test_silent_connection_of_the_most_crowded_host_gives_way() -> None:
+    with running_edge(max_connections=4) as rig, ExitStack() as closing:
+        patient = closing.enter_context(connect_from(rig, "127.0.0.2"))
+        crowd = [closing.enter_context(connect_from(rig, "127.0.0.3")) for _ in range(3)]
+        eventually(lambda: rig.service.counters.connections == 4)
+        with rig.client() as new:
+            assert new.read(0, 1) == [0]
+            patient.sendall(new.frame(b"\x03\x00\x00\x00\x01"))
+            assert patient.recv(64)
+        assert [one.recv(64) for one in crowd[:1]] == [b""]
 
 
 def test_only_allowed_networks_may_connect() -> None:

@@ -47,6 +47,8 @@ class Attempt:
     rig: str
     started: str
     """Start of the recording, UTC; empty: not recorded."""
+    recorded: tuple[str, ...] = ()
+    """Ids of the students who owned the rig; empty: the lab had no roster."""
     goals: tuple[Goal, ...] = ()
     score: float = 0.0
     """Share of the goals that were reached, 0 to 1."""
@@ -198,7 +200,7 @@ def grade_class(
             on_progress(done / len(runs))
     for attempt in _without_second_recordings(attempts):
         if attempt is not None:
-            owner = owner_of(Path(attempt.file), attempt.rig, roster)
+            owner = owner_of(Path(attempt.file), attempt.rig, roster, attempt.recorded)
             if owner.student is None:
                 unassigned.append((attempt.file, attempt.problem or owner.problem))
             elif not only or owner.student.id == only:
@@ -265,23 +267,26 @@ def _attempt(files: RunFiles, folder: Path, task: TaskConfig, roster: Roster, on
     path = files[0]
     names = tuple(each.relative_to(folder).as_posix() for each in files)
     rig = session = started = ""
+    recorded: tuple[str, ...] = ()
     try:
         with isolated(path):
             run = open_run(files)
             rig, session, started = run.rig, run.session, run.started
-            owner = owner_of(Path(names[0]), rig, roster).student
+            recorded = run.students
+            owner = owner_of(Path(names[0]), rig, roster, recorded).student
             if owner is None or (only and owner.id != only):
-                return Attempt(names, session, rig, started) if owner is None else None
+                return Attempt(names, session, rig, started, recorded) if owner is None else None
             summary = summarize(run, task)
     except HilrigError as error:
         text = str(error).removeprefix(f"{path}: ")
-        return Attempt(names, session, rig, started, problem=text, data_quality=text)
+        return Attempt(names, session, rig, started, recorded, problem=text, data_quality=text)
     grade, latency = summary.grade, summary.latency
     return Attempt(
         files=names,
         session=session,
         rig=rig,
         started=started,
+        recorded=recorded,
         goals=() if grade is None else tuple(Goal(*line) for line in grade.lines()),
         score=0.0 if grade is None else grade.score,
         latency_ms=latency.age_ms.p95 if latency.fit and latency.age_ms is not None else None,

@@ -16,8 +16,8 @@ from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.example import example
 from hilrig_cli.commands.export import export
-from hilrig_cli.commands.figures import figures
 from hilrig_cli.commands.grade import grade
 from hilrig_cli.commands.ik import ik
 from hilrig_cli.commands.impair import impair
@@ -67,6 +67,7 @@ PANELS = {
         registers,
         ik,
         certs,
+        example,
     ),
     "Run a single service": (sim, edge, recorder, router),
     "Analyze recordings": (
@@ -78,7 +79,6 @@ PANELS = {
         report,
         grade,
         verify,
-        figures,
         recover,
         join,
         play,

@@ -17,6 +17,7 @@ from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording, RecordingStore
 from hilrig_recorder.ingest.sources import (
     MAX_GAP,
+    PUBLISHER_TIMEOUT_NS,
     SETTLE_TIME_NS,
     WALL_CLOCK_STEP_THRESHOLD_NS,
     KeyStream,
@@ -385,7 +386,7 @@ class SessionTracker:
         for session, until_ns in list(self._blocked_until.items()):
             if now_ns > until_ns:
                 del self._blocked_until[session]
-        for publisher in self._publishers.evict_silent(now_ns):
+        for publisher in self._publishers.evict_superseded(now_ns):
             for rig in self._rigs.values():
                 if rig.publishers.get(publisher.name) is publisher:
                     del rig.publishers[publisher.name]
@@ -424,9 +425,11 @@ class SessionTracker:
             return True
         end_wall_ns = recording.end_wall_ns or 0
         # A stream is in order. It has passed the end when its publish times have. A publisher without messages has
-        # passed the end when one of its batches arrived well after the end.
+        # passed the end when one of its batches arrived well after the end. Nothing is expected of one that is dead.
         return draining_ns >= DRAIN_MIN_NS and all(
-            publisher.passed_ns >= end_wall_ns or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            publisher.passed_ns >= end_wall_ns
+            or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            or now_ns - publisher.last_ns > PUBLISHER_TIMEOUT_NS
             for publisher in self._rigs[recording.rig].publishers.values()
             if recording.rig in publisher.continuous_rigs
         )
