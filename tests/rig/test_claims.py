@@ -50,13 +50,17 @@ def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
         assert f"s1002,'=1+1,A,rig2,{codes['s1002']}," in (tmp_path / "codes.csv").read_text()
         ports = lab.lab.ports
 
+        def lease(rig: str, *options: str) -> dict[str, str]:
+            found: dict[str, str] = json.loads(hilrig("lease", rig, *options, "-c", config, "--json").stdout)
+            return found
+
         # Not claimed: nobody writes, in either role; everybody reads.
         assert [ask(host, ports["rig1"], WRITE) for host in ("127.0.0.1", "127.0.0.2")] == [DENIED] * 2
         assert ask("127.0.0.2", ports["rig1"], READ)[:2] == b"\x03\x08"
         server = [sys.executable, str(EXAMPLES / "server_controller.py"), "--port", str(plc), "--duration", "60"]
         with subprocess.Popen(server, stdout=subprocess.DEVNULL) as program:
             try:
-                eventually(lambda: "rig2 is not claimed: claim it with your code" in lab.output())
+                eventually(lambda: "rig2 is not claimed: claim it" in lease("rig2")["controller_fault"])
                 wrong = hilrig("claim", codes["s1002"], f"127.0.0.1:{ports['rig1']}")
                 assert (wrong.returncode, "is not valid for this rig" in wrong.stdout) == (1, True)
                 for number, code in enumerate(codes.values(), start=1):
@@ -81,7 +85,7 @@ def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
         os.kill(lab.service_pid("edge"), signal.SIGKILL)
         eventually(lambda: ask("127.0.0.2", ports["rig1"], WRITE) == DENIED)
         assert ask("127.0.0.1", ports["rig1"], WRITE) == WRITTEN
-        status = json.loads(hilrig("lease", "rig1", "--end-claim", "-c", config, "--json").stdout)
+        status = lease("rig1", "--end-claim")
         assert (status["claim_ended"], status["holder"], status["session"]) == ("s1001", "", "")
         assert ask("127.0.0.1", ports["rig1"], WRITE) == DENIED
         assert hilrig("lease", "rig1", "--end-claim", "-c", config).returncode == 1

@@ -1,7 +1,7 @@
 """Attempts: assigns the recordings of a folder to the students of a roster.
 
-A recording belongs to the student whose id it contains. Without one it belongs to that whose id is its file name, the beginning of its file name up to a separator, or the
-name of its folder; else to the only student of its rig.
+A recording belongs to the student whose id it contains. Without one it belongs to that whose id is its file name, the
+beginning of its file name up to a separator, or the name of its folder; else to the only student of its rig.
 """
 
 from collections.abc import Sequence

@@ -36,7 +36,7 @@ class Claim(BaseModel):
 
     @property
     def machine(self) -> str:
-        """What it is bound to: a certificate or an address."""
+        """Certificate or address to which it is bound."""
         return f"CN={self.certificate}" if self.certificate else self.host
 
     def is_made_by(self, client: Client) -> bool:
@@ -54,7 +54,7 @@ class CodeBook:
         self._read_if_changed()
 
     def find(self, code: str) -> ClaimCode | None:
-        """Return what a typed code is for; None: it is unknown."""
+        """Return the entry of a typed code; None: it is unknown."""
         self._read_if_changed()
         return self._codes.get(digest_of(code))
 

@@ -107,7 +107,7 @@ class ClaimedRig:
         return None if self._claim is None else self._claim.ends_wall_ns
 
     def denial(self, client: Client, *, reserved: bool) -> str:
-        """See `Ownership.denial`. The controller that the edge connects to is that of lab.toml, whoever claims."""
+        """See `Ownership.denial`. The controller that the edge connects to is that of lab.toml, for any student."""
         claim = self._claim
         if claim is None:
             return f"{self._rig} {NOT_CLAIMED}"

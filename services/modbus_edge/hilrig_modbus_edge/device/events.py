@@ -87,7 +87,7 @@ class Refusal(NamedTuple):
     holder: str = ""
     """Address of the connection for which it is refused; empty: none."""
     student: str = ""
-    """Owner of the rig, if it is refused for the owner; empty: for another reason, or there is none."""
+    """Owner of the rig, if it is refused for the owner; empty: otherwise."""
 
 
 class LeaseEventReporter:

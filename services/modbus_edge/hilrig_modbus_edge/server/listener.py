@@ -52,7 +52,7 @@ class RigServer:
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters, self._make_room)
         self._malformed: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
-        self._not_owned: RepeatReporter[str, str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
+        self._not_owned: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
         self.exceptions = ExceptionLog(self._warn)
         self._alert = ("", 0)
         """The last log message, and its time, ns."""
@@ -109,7 +109,8 @@ class RigServer:
         if code == ExcCodes.DEVICE_BUSY or (code == ExcCodes.ILLEGAL_FUNCTION and request[0] in WRITES):
             self.counters.refused += 1
             if denial := self.device.owner_denial(client):
-                self._not_owned.record(client.host, f"{client.label}: write denied: {denial}", self.monotonic_ns())
+                text = f"{client.label}: write denied: {denial}"
+                self._not_owned.record((client.host, denial), text, self.monotonic_ns())
         self.exceptions.record(client, transaction, unit, request, code, self.monotonic_ns())
 
     def alert(self) -> str:

@@ -17,9 +17,7 @@ def lease(
         typer.Argument(metavar="RIG", help="Name of the rig; default: all. Required with --release and --end-claim."),
     ] = "",
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
-    end_claim: Annotated[
-        bool, typer.Option("--end-claim", help="End the claim of the student who has claimed the rig.")
-    ] = False,
+    end_claim: Annotated[bool, typer.Option("--end-claim", help="End the claim of the rig by a student.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
