@@ -791,6 +791,18 @@ def test_rigs_and_sessions_of_another_certificate_are_dropped() -> None:
     assert [file.recording.session for file in bench.store.files] == ["own"]
 
 
+def test_messages_of_another_kind_of_service_are_dropped() -> None:
+    bench = TrackerBench()
+    bench.start()
+    forged = bench.edge.state("rig1", bench.wall)
+    event = bench.edge.put(EVENT, "sim", Event(kind=Event.OVERRUN, source="sim/1"), bench.wall)
+    bench.edge.put(EVENT, "edge", Event(kind=Event.OVERRUN, source="edge/1"), bench.wall)
+    bench.accept(bench.edge.batch())
+    assert not {forged.payload, event.payload} & set(bench.file.payloads)
+    assert bench.store.rejected == [f"edge/1: key {one.key} is of another service" for one in (forged, event)]
+    assert bench.tracker.has_received("edge")
+
+
 def test_session_is_ended_by_its_owner_only() -> None:
     bench = TrackerBench()
     bench.start()

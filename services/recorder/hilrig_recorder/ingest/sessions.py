@@ -27,6 +27,7 @@ from hilrig_recorder.ingest.sources import (
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import encode_message
+from hilrig_runtime.bus.acl import RULES
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.outage import OutageDetector, describe_outage
@@ -208,6 +209,10 @@ class SessionTracker:
         channel_id = CHANNEL_OF_TOPIC.get(parsed.topic.name)
         if channel_id is None or parsed.lab != self._lab or not is_name(parsed.rig):
             self._reject(f"{publisher.name}: key {key} is not a recorded topic of lab {self._lab}")
+            return None
+        service = publisher.name.partition("/")[0]
+        if service not in RULES[parsed.topic.name].publishers or parsed.rig in set(SERVICES) - {service}:
+            self._reject(f"{publisher.name}: key {key} is of another service")
             return None
         if not self._may_serve(publisher.name, parsed.rig) and parsed.rig not in SERVICES:
             self._reject(f"{publisher.name}: its certificate excludes rig {parsed.rig!r}")
