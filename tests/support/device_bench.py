@@ -9,7 +9,7 @@ from typing import Any
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.ownership import Ownership
+from hilrig_modbus_edge.device.ports import Ownership
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_runtime.config.impairment import ImpairmentConfig

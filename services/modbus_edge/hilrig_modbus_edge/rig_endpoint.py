@@ -10,7 +10,7 @@ from hilrig_modbus_edge.client.exchange import Exchange, ExchangeSettings
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
-from hilrig_modbus_edge.device.ownership import Ownership
+from hilrig_modbus_edge.device.ports import Ownership
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
 from hilrig_modbus_edge.server.admission import Limits
@@ -71,7 +71,7 @@ class RigEndpoint:
         states: LatestValueCache,
         scheduler: CommandScheduler,
         sessions_changed: Callable[[], None],
-        ownership: Ownership,
+        ownership: Ownership | None = None,
     ) -> None:
         lab = service.lab
         self._clock = service.clock

@@ -13,8 +13,7 @@ from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.classroom.claim_files import Claim, ClaimFiles, CodeBook
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.events import Refusal
-from hilrig_modbus_edge.device.ownership import NoOwner, Ownership
+from hilrig_modbus_edge.device.ports import NoOwner, Ownership, Refusal
 from hilrig_runtime.config.classroom import ClassroomConfig
 from hilrig_runtime.config.roster import Roster
 from hilrig_runtime.timing.guess_throttle import GuessThrottle

@@ -22,8 +22,7 @@ from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import STATE_TIMEOUT_NS, EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
-from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.device.ownership import NoOwner, Ownership
+from hilrig_modbus_edge.device.ports import DeviceOutput, NoOwner, Ownership
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.state_reader import StateReader

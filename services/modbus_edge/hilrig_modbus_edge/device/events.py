@@ -1,11 +1,9 @@
 """Events of a rig: each has the session and the simulation step; those that may occur in bursts are rate-limited."""
 
-from typing import Final, NamedTuple
-
-from pymodbus.constants import ExcCodes
+from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput, Refusal
 from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
@@ -74,20 +72,6 @@ class EventEmitter:
             event = self.event(Event.STATE_LOST, Event.WARNING, text)
         event.watchdog_data.silent_ns, event.watchdog_data.timeout_ns = outage.silent_ns, STATE_TIMEOUT_NS
         self.emit(event)
-
-
-class Refusal(NamedTuple):
-    """A write that is refused."""
-
-    cause: str
-    """Name of the cause: the reasons of one cause differ in times and addresses only."""
-    reason: str
-    """Human-readable."""
-    code: ExcCodes
-    holder: str = ""
-    """Address of the connection for which it is refused; empty: none."""
-    student: str = ""
-    """Owner of the rig, if it is refused for the owner; empty: otherwise."""
 
 
 class LeaseEventReporter:

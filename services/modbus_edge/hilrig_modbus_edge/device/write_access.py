@@ -15,10 +15,9 @@ from pymodbus.constants import ExcCodes
 from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client, ConnectedController
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, Refusal, StallReporter
+from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, StallReporter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
-from hilrig_modbus_edge.device.output import DeviceOutput
-from hilrig_modbus_edge.device.ownership import Ownership
+from hilrig_modbus_edge.device.ports import DeviceOutput, Ownership, Refusal
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog

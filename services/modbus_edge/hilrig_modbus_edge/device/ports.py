@@ -1,9 +1,44 @@
-"""The owner of a rig, as its device knows it: the student whose machine may write, if the lab has a class."""
+"""The ports of a device: events and timers that its edge provides, and the owner of its rig."""
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
+from pymodbus.constants import ExcCodes
+
+from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.events import Refusal
+from hilrig_runtime.messaging.latest_value_cache import TimestampedPayload
+from hilrig_schemas import Event
+
+
+class DeviceOutput(Protocol):
+    """Everything that a device needs beside its commands and states."""
+
+    def emit(self, event: Event) -> None:
+        """Publish an event."""
+
+    def sessions_changed(self) -> None:
+        """Report that a session started or ended."""
+
+    def call_at(self, deadline_ns: int, callback: Callable[[], None]) -> TimerHandle:
+        """Call `callback` at a time of the monotonic clock, ns."""
+
+    def follow_states(self, arrive: Callable[[TimestampedPayload], None] | None) -> None:
+        """Call `arrive` with every received state, on any thread; None: stop calling it."""
+
+
+class Refusal(NamedTuple):
+    """A write that is refused."""
+
+    cause: str
+    """Name of the cause: the reasons of one cause differ in times and addresses only."""
+    reason: str
+    """Human-readable."""
+    code: ExcCodes
+    holder: str = ""
+    """Address of the connection for which it is refused; empty: none."""
+    student: str = ""
+    """Owner of the rig, if it is refused for the owner; empty: otherwise."""
 
 
 class Ownership(Protocol):
