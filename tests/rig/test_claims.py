@@ -37,7 +37,12 @@ def ask(host: str, port: int, request: bytes) -> bytes:
 
 
 def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
-    config = write_lab(tmp_path, rigs=2, extra="edge.session_grace_ms = 300\nedge.lease_timeout_ms = 1000")
+    certs = tmp_path / "certs"
+    assert hilrig("certs", certs, "--client", "pc7=operator").returncode == 0
+    files = {"certificate": "edge.pem", "key": "edge.key", "authority": "ca.pem"}
+    extra = "\n".join(f"edge.tls.{key} = '{certs / file}'" for key, file in files.items())
+    extra += f"\nedge.tls.first_port = {free_ports(2)}\nedge.session_grace_ms = 300"
+    config = write_lab(tmp_path, rigs=2, extra=extra)
     plc = free_ports(1)
     rows = "".join(f"{one},{name},A,rig{number}\n" for number, (one, name) in enumerate(NAMES.items(), start=1))
     (tmp_path / "roster.csv").write_text(f"id,name,group,rig\n{rows}", encoding="utf-8-sig")
@@ -89,6 +94,12 @@ def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
         assert (status["claim_ended"], status["holder"], status["session"]) == ("s1001", "", "")
         assert ask("127.0.0.1", ports["rig1"], WRITE) == DENIED
         assert hilrig("lease", "rig1", "--end-claim", "-c", config).returncode == 1
+
+        # With a certificate, the address does not count.
+        own = ("--certificate", certs / "pc7.pem", "--key", certs / "pc7.key", "--authority", certs / "ca.pem")
+        assert hilrig("claim", codes["s1001"], "rig1", *own, "-c", config).returncode == 0
+        assert lease("rig1")["claimed_from"] == "CN=pc7"
+        assert ask("127.0.0.1", ports["rig1"], WRITE) == DENIED
         eventually(lambda: {path.parent.name for path in lab.recordings} == {"rig1", "rig2"})
         log = lab.output()
 
@@ -98,3 +109,32 @@ def test_rigs_are_written_by_those_who_claimed_them(tmp_path: Path) -> None:
     everything = log.encode() + b"".join(content_of(path) for path in lab.recordings)
     assert not [name for name in NAMES.values() if name.encode() in everything]
     assert not [code for code in codes.values() if code.replace("-", "").encode() in everything]
+
+
+@pytest.mark.parametrize("command", ["check", "edge", "rig codes --until 23:59"])
+def test_mistakes_of_the_roster_are_named(tmp_path: Path, command: str) -> None:
+    config, roster = write_lab(tmp_path), tmp_path / "roster.csv"
+    roster.write_text("id,name,rig\na,Ann,rig1\nA,Amy,rig1\n", encoding="utf-8")
+    config.write_text(f"{config.read_text()}[classroom]\nroster = '{roster}'\nclaims = '{tmp_path}'\n")
+    options = [config] if command == "check" else ["--config", config]
+    done = hilrig(*command.split(), *options)
+    assert (done.returncode, f"{roster}: line 3: id 'A' occurs twice, first in line 2" in done.stderr) == (2, True)
+    roster.write_text("id,name,rig\na,Ann,rig7\nb,Bob,rig8\n", encoding="utf-8")
+    done = hilrig(*command.split(), *options)
+    assert done.returncode == 2
+    assert "line 2: unknown rig 'rig7' of a; the lab has rig1" in done.stderr
+    assert "line 3: unknown rig 'rig8' of b" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["ABC"], 2, "'ABC' is no code: expected 10 letters and digits"),
+        (["AAAAA-22222", "a b"], 2, "'a b' is no address of a rig"),
+        (["AAAAA-22222", "--key", "x"], 2, "--certificate, --key and --authority belong together"),
+        (["AAAAA-22222", "127.0.0.1:1"], 3, "127.0.0.1:1 does not answer: Connection refused"),
+    ],
+)
+def test_wrong_claims_are_explained(arguments: list[str], code: int, message: str) -> None:
+    done = hilrig("claim", *arguments)
+    assert (done.returncode, message in done.stderr) == (code, True), done.stderr
