@@ -4,10 +4,10 @@ from typing import Final
 
 COMMANDS: Final = {
     "": "certs check claim example ik registers",
-    "rig": "doctor edge impair lease metrics record recorder rig router sim top up",
+    "rig": "doctor edge events impair lease metrics record recorder rig router sim top up",
     "review": "compare export grade join latency live play recover replay report runs verify",
     "console": "console",
-    "study": "demo jitter study",
+    "study": "assign demo jitter study",
 }
 """Names of the commands, by the smallest extra that has all they need; the base installation has the extra `""`."""
 

@@ -8,7 +8,7 @@ import inspect
 
 import typer
 
-from hilrig_cli.commands import record, rig
+from hilrig_cli.commands import assign, record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
 from hilrig_cli.commands.claim import claim
@@ -16,6 +16,7 @@ from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.events import events
 from hilrig_cli.commands.example import example
 from hilrig_cli.commands.export import export
 from hilrig_cli.commands.grade import grade
@@ -62,6 +63,7 @@ PANELS = {
         doctor,
         claim,
         lease,
+        events,
         impair,
         jitter,
         registers,
@@ -94,6 +96,7 @@ for _panel, _commands in PANELS.items():
         app.command(rich_help_panel=_panel, context_settings=_settings)(_command)
 app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
 app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
+app.add_typer(assign.app, name="assign", rich_help_panel="Analyze recordings")
 
 
 def _unwrap_help(group: typer.Typer) -> None:
@@ -103,7 +106,7 @@ def _unwrap_help(group: typer.Typer) -> None:
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-for _group in (app, rig.app, record.app):
+for _group in (app, rig.app, record.app, assign.app):
     _unwrap_help(_group)
 
 

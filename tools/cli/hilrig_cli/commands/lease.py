@@ -5,43 +5,42 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AllRigs, AsJson, Config, check_rigs
 
 if TYPE_CHECKING:
     from hilrig_schemas import LeaseStatus
 
 
 def lease(
-    rig: Annotated[
-        str,
-        typer.Argument(metavar="RIG", help="Name of the rig; default: all. Required with --release and --end-claim."),
-    ] = "",
+    rigs: Annotated[
+        list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs; default: all rigs of the lab.")
+    ] = None,
+    every: AllRigs = False,
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
     end_claim: Annotated[bool, typer.Option("--end-claim", help="End the claim of the rig by a student.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the lease holder and the student of a rig, or revoke lease or claim.
+    """Show the lease holder and the student of each rig, or revoke leases or claims.
 
-    After --release the next other controller that writes acquires the lease. After --end-claim the rig must be claimed
-    again, with this or another code. Exit code 1: the rig had no lease holder, or was not claimed.
+    After --release the next other controller that writes acquires the rig. After --end-claim it must be claimed again,
+    with this or another code. Exit code 1: a rig had no lease holder, or was not claimed.
     """
     from hilrig_cli.client import query_edges
     from hilrig_runtime.config.lab import load_lab
-    from hilrig_runtime.errors import InputError
     from hilrig_schemas import LeaseRequest, topics
 
-    if (release or end_claim) and not rig:
-        option = "--release" if release else "--end-claim"
-        raise InputError(f"{option} requires a rig: hilrig lease RIG {option}")
+    if release or end_claim:
+        check_rigs(rigs, every, f"hilrig lease {'--release' if release else '--end-claim'}")
     request = LeaseRequest(release=release, end_claim=end_claim)
-    statuses = query_edges(load_lab(config), topics.LEASE, rig, request)
+    statuses = query_edges(load_lab(config), topics.LEASE, rigs or [], request)
     if as_json:
         rows = [_row(status) for status in statuses]
-        print(json.dumps(rows[0] if rig else rows))
+        print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
     else:
         _print_table(statuses, release, end_claim)
-    if (release and not statuses[0].released) or (end_claim and not statuses[0].claim_ended):
+    done = [(not release or status.released) and (not end_claim or status.claim_ended) for status in statuses]
+    if not all(done):
         raise typer.Exit(1)
 
 
@@ -67,23 +66,15 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) 
     from hilrig_cli.terminal import TerminalConsole
 
     table = Table()
-    has_students = any(status.student for status in statuses)
-    for column in (
-        "rig",
-        *(["student"] if has_students else []),
-        "lease holder",
-        "last request",
-        "session",
-        "connections",
-        "watchdog",
-    ):
+    student = ["student"] if any(status.student for status in statuses) else []
+    for column in ("rig", *student, "lease holder", "last request", "session", "connections", "watchdog"):
         table.add_column(column, no_wrap=column == "rig", overflow="fold")
     for status in statuses:
         timeout = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
         holder = f"client of {status.client_of}" if status.client_of else status.holder or "none"
         table.add_row(
             status.rig,
-            *([_student(status)] if has_students else []),
+            *([_student(status)] if student else []),
             f"{holder}: {status.controller_fault}" if status.controller_fault else holder,
             f"{status.silent_ns / 1e9:.1f} s ago" if status.holder else "",
             status.session,
@@ -97,8 +88,9 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) 
         text = f"lease of {former} revoked: the next other controller that writes acquires it"
         console.print(text if former else "the rig had no lease holder")
     if end_claim:
-        ended = statuses[0].claim_ended
-        console.print(f"claim of {ended} ended: the rig must be claimed again" if ended else "the rig was not claimed")
+        for status in statuses:
+            ended = f"claim of {status.claim_ended} ended: it must be claimed again"
+            console.print(f"{status.rig}: {ended if status.claim_ended else 'it was not claimed'}")
 
 
 def _student(status: "LeaseStatus") -> str:
