@@ -220,7 +220,8 @@ def test_aborted_handshake_is_reported(
     assert "closed the connection during the handshake" in rig.event(Event.CONNECTION_REFUSED).text
     assert talk(rig, lab.client("operator"), READ)
     gc.collect()
-    assert not caplog.records
+    # The states of the test may be late.
+    assert not [record for record in caplog.records if not record.name.endswith(".outage")]
 
 
 class Handshake:
@@ -276,7 +277,7 @@ def test_mutated_handshakes_have_no_effect_on_others(
     assert rig.service.counters.refused
     gc.collect()
     # The test publishes no states meanwhile.
-    expected = {"hilrig_modbus_edge.server.listener", "hilrig_runtime.process.outage"}
+    expected = {"hilrig_modbus_edge.server.listener", "hilrig_runtime.process.event_log"}
     assert {record.name for record in caplog.records} <= expected
 
 

@@ -11,10 +11,12 @@ import typer
 from hilrig_cli.commands import assign, record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
+from hilrig_cli.commands.claim import claim
 from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.events import events
 from hilrig_cli.commands.example import example
 from hilrig_cli.commands.export import export
 from hilrig_cli.commands.grade import grade
@@ -59,7 +61,9 @@ PANELS = {
         metrics,
         check,
         doctor,
+        claim,
         lease,
+        events,
         impair,
         jitter,
         registers,

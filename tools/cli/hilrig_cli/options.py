@@ -1,6 +1,9 @@
 """Options and texts that several commands share."""
 
+import logging
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +19,8 @@ Config = Annotated[
         help="Configuration file of the lab; default: one rig with default settings.",
     ),
 ]
+Rigs = Annotated[list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs.")]
+AllRigs = Annotated[bool, typer.Option("--all", help="All rigs of the running lab.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
 
 
@@ -25,9 +30,27 @@ def config_for_commands(context: typer.Context, config: Config = None) -> None:
         context.default_map = {name: {"config": str(config)} for name in context.command.commands}
 
 
+def check_rigs(rigs: list[str] | None, every: bool, command: str) -> None:
+    """Check that a command that changes rigs names them.
+
+    Raises:
+        InputError: neither rigs nor `--all`, or both.
+    """
+    from hilrig_runtime.errors import InputError
+
+    if bool(rigs) == every:
+        found = "both rigs and --all" if rigs else "no rig"
+        raise InputError(f"{command}: {found} given; expected names of rigs, or --all")
+
+
 def log(line: str) -> None:
     """Print a message of a running command on standard error."""
     print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+
+def announcer(log_format: str) -> Callable[[str], None]:
+    """Return the function with which a command announces its address: it prints text, or logs one JSON object."""
+    return partial(print, flush=True) if log_format == "text" else logging.getLogger(__name__).info
 
 
 def format_size(size: float) -> str:
