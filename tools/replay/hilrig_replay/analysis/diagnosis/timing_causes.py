@@ -275,7 +275,7 @@ def retransmissions(evidence: Evidence) -> Finding | None:
 def edge_stall(evidence: Evidence) -> Finding | None:
     """Stalls of the Modbus edge."""
     stalls = evidence.edge_stalls
-    if not stalls.count:
+    if not stalls.count or stalls.starved:
         return None
     longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return _cause(
@@ -293,7 +293,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
 def simulation_stall(evidence: Evidence) -> Finding | None:
     """Ticks that were more than one step late."""
     stalls = evidence.stalls
-    if not stalls.count:
+    if not stalls.count or stalls.starved:
         return None
     longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return _cause(
@@ -306,6 +306,29 @@ def simulation_stall(evidence: Evidence) -> Finding | None:
         stalls=float(stalls.count),
         longest_ms=longest_ms,
         at_s=at_s,
+    )
+
+
+def cpu_steal(evidence: Evidence) -> Finding | None:
+    """Stalls in which a service was ready to run, and the host gave its processors to other programs."""
+    services = (("simulation", evidence.stalls), ("Modbus edge", evidence.edge_stalls))
+    starved = [(name, stalls) for name, stalls in services if stalls.starved]
+    if not starved:
+        return None
+    name, longest = max(starved, key=lambda one: one[1].longest_ns)
+    count, names = sum(stalls.count for _, stalls in starved), " and ".join(f"the {name}" for name, _ in starved)
+    longest_ms, waited_ms = longest.longest_ns / MS, min(longest.run_delay_ns, longest.longest_ns) / MS
+    return _cause(
+        evidence,
+        "cpu_steal",
+        f"other programs of the host took the processor of {names} {_times(count)}: the {name} was ready to run for "
+        f"{waited_ms:.0f} of the {longest_ms:.0f} ms of its longest stall",
+        "end the other programs, or run the services with real-time priority (hilrig doctor)",
+        _per_time(evidence, sum(stalls.area_ns2 for _, stalls in starved)),
+        stalls=float(count),
+        longest_ms=longest_ms,
+        run_delay_ms=waited_ms,
+        at_s=longest.at_ns / 1e9,
     )
 
 
@@ -412,6 +435,7 @@ RULES: Final[tuple[Rule, ...]] = (
     retransmissions,
     edge_stall,
     simulation_stall,
+    cpu_steal,
     injected_delay,
     beating,
     watchdog_gaps,
@@ -421,7 +445,7 @@ OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
     {previous_poll, delayed_acknowledgement, wait_before_write, slow_polling, computing_time, beating}
 )
 """Rules about a program that polls the rig; in the client role the edge itself polls."""
-RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "watchdog_gaps"})
+RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "cpu_steal", "watchdog_gaps"})
 SUPPRESSED: Final = {
     "open_loop": frozenset(rule.__name__ for rule in RULES[1:]),
     "delayed_acknowledgement": frozenset({"wait_before_write", "slow_polling", "computing_time", "network", "beating"}),
@@ -431,6 +455,7 @@ SUPPRESSED: Final = {
     "network": frozenset({"beating"}),
     "edge_stall": frozenset({"watchdog_gaps"}),
     "simulation_stall": frozenset({"watchdog_gaps"}),
+    "cpu_steal": frozenset({"watchdog_gaps"}),
     "retransmissions": frozenset({"watchdog_gaps"}),
 }
 """By cause: the generic causes that it explains."""
