@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_replay.analysis.diagnosis.evidence import MS, PROGRAM_NS, Evidence, Finding, Floats
+from hilrig_replay.analysis.diagnosis.evidence import MS, NO_PAUSE_NS, PROGRAM_NS, Evidence, Finding, Floats
 from hilrig_replay.analysis.stages import CONTROLLER, INJECTED, REGISTER_WAIT, TICK_WAIT
 from hilrig_replay.io.columns import Rows
 
@@ -34,12 +34,12 @@ MAX_ROUND_WAIT_SPREAD: Final = 0.06
 ROUND_NS: Final = 5 * MS
 MAX_OVERSLEPT_NS: Final = 1.2 * MS
 """Largest time by which a wait is longer than requested, with the time of the requests."""
-NO_PAUSE_NS: Final = 3 * MS
-"""Time between a write and the next read of a program that does not wait there."""
 ACK_DELAYS_NS: Final = ((39 * MS, 46 * MS), (195 * MS, 215 * MS))
 """Ranges of TCP's delayed-acknowledgment timeout: 40 ms on Linux, 200 ms on Windows."""
 MIN_RTT_NS: Final = 1 * MS
 """Smallest round-trip time of a network that is a cause."""
+MAX_ANSWER_SHARE: Final = 0.5
+"""Mean time in which reads are answered, as a share of that between reading and writing, below which writes repeat."""
 PAUSE_RATIO: Final = 2.5
 """Ratio to the median cycle from which a cycle is a pause."""
 RETRANSMISSION_WINDOW_NS: Final = 1.5e9
@@ -174,12 +174,19 @@ def _computing_ns(evidence: Evidence, rows: Rows) -> Floats:
     return np.where(spent_ns > MIN_DELAY_NS, spent_ns - PROGRAM_NS, 0.0)
 
 
+def _writes_without_reading(evidence: Evidence, cycles: Rows) -> bool:
+    """Whether the torques are older than the time in which a read is answered: most writes follow no read."""
+    if not len(cycles) or not len(evidence.samples):
+        return False
+    spent_ns = sum(float(values.sum()) for values in evidence.samples.column(CONTROLLER.key)()) / len(evidence.samples)
+    return bool(cycles["held_ns"].mean() < MAX_ANSWER_SHARE * spent_ns)
+
+
 def computing_time(evidence: Evidence) -> Finding | None:
     """A long time between reading and writing."""
-    gain_ns = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows))
-    if not gain_ns:
+    gain_ns, cycles = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows)), evidence.cycles()
+    if not gain_ns or _writes_without_reading(evidence, cycles):
         return None
-    cycles = evidence.cycles()
     spent_ns = (cycles["held_ns"] if len(cycles) else evidence.samples[CONTROLLER.key]) - evidence.min_rtt_ns
     spent_ns = spent_ns[spent_ns > MIN_DELAY_NS]
     if not len(spent_ns):
@@ -209,10 +216,11 @@ def slow_polling(evidence: Evidence) -> Finding | None:
     # A torque is held for a cycle: on average it is half of the additional steps older.
     gain_ns = (cycle_ns - max(cycle_ns - pause_ns, step_ns)) / 2
     age = f", the mean age {evidence.mean_age_ns / MS:.0f} ms" if evidence.age else ""
+    repeats = ", and writes again without reading" if _writes_without_reading(evidence, cycles) else ""
     return _cause(
         evidence,
         "slow_polling",
-        f"the program polls every {cycle_ns / MS:.0f} ms; the step is {step_ns / MS:g} ms{age}",
+        f"the program polls every {cycle_ns / MS:.0f} ms{repeats}; the step is {step_ns / MS:g} ms{age}",
         f"poll at least every {step_ns / MS:g} ms",
         gain_ns,
         cycle_ms=cycle_ns / MS,
