@@ -29,7 +29,7 @@ from support.virtual_loop import Law, Program, virtual_runs
 Random = np.random.Generator
 UNDISTURBED: Final = "undisturbed"
 WEIGHT: Final = np.array([0.0, 0.0, -4.905, 0.0])
-RUNS: Final = 40
+RUNS: Final = 30
 """Runs of each cause in the complete corpus; of undisturbed runs there are three times as many."""
 
 
@@ -88,6 +88,7 @@ PARTS: Final = {
             "error": (8, 12),
             "limit": (0.4, 1.2),
             "starved": (0.85, 0.95),
+            "pause": (160, 200),
         },
     ),
     "revision": Part(
@@ -111,6 +112,7 @@ PARTS: Final = {
             "error": (13, 60),
             "limit": (0.4, 1.2),
             "starved": (0.75, 0.84),
+            "pause": (210, 320),
         },
     ),
     "judged": Part(
@@ -134,6 +136,7 @@ PARTS: Final = {
             "error": (62, 85),
             "limit": (1.3, 2.5),
             "starved": ((0.55, 0.74), (0.96, 1.0)),
+            "pause": ((100, 150), (330, 450)),
         },
     ),
 }
@@ -301,6 +304,8 @@ def case_of(code: str, part: str, number: int) -> Case:
             return Case(code, program(step_ms * within("beating")))
         case "watchdog_gaps":
             return Case(code, program(step_ms, 0.6, pauses={float(t): within("gap") for t in times[:3]}))
+        case "controller_pauses":
+            return Case(code, program(step_ms, 0.6, pauses={float(t): within("pause") for t in times}))
         case "saturation":
             limit = within("limit")
             limited = program(step_ms, within("saturating") * 0.4, 4.0, kind=of.laws[0])
@@ -366,6 +371,7 @@ TIMING: Final = (
     "injected_delay",
     "beating",
     "watchdog_gaps",
+    "controller_pauses",
 )
 CONTROL: Final = (
     "saturation",

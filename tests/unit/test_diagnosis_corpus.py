@@ -22,9 +22,10 @@ def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
 
 
 def test_a_sample_of_forty_runs_is_diagnosed() -> None:
-    # Two runs of each cause, and six undisturbed ones.
-    results = list(diagnosed(corpus("judged", 2)))
-    assert len(results) == 40
+    # Two runs of each cause, and two undisturbed ones.
+    cases = corpus("judged", 2)[4:]
+    assert len(cases) == 42
+    results = list(diagnosed(cases))
     missed = [(one.case.code, one.timing, one.control) for one in results if not one.found or one.wrong]
     assert len(missed) <= 1, missed
 

@@ -12,7 +12,7 @@ from hilrig_replay.analysis.age import LoopAge
 from hilrig_replay.analysis.distribution import Statistics, median
 from hilrig_replay.analysis.stages import ALL_STAGES
 from hilrig_replay.io.columns import Rows
-from hilrig_replay.io.disk_table import DiskTable
+from hilrig_replay.io.disk_table import Blocks, DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Losses, Run
 from hilrig_replay.io.sequence_order import Repairs
@@ -276,9 +276,10 @@ class DataQuality:
             starved_area_ns2=float(areas_ns2[starved].sum()),
         )
 
-    def lateness(self) -> Statistics:
-        """Statistics of the lateness of all ticks."""
-        return Statistics.of(self._ticks.column("lateness_ns"))
+    @property
+    def latenesses_ns(self) -> Blocks:
+        """Lateness of all ticks, ns."""
+        return self._ticks.column("lateness_ns")
 
     def cycle_ns(self) -> float:
         """Median time between two writes of a controller at the edge, ns; 0: fewer than two writes."""

@@ -77,6 +77,8 @@ class Evidence:
     duration_s: float
     client_role: bool = False
     """Whether the edge was the client of the controller."""
+    other_connection: bool = False
+    """Whether positions are read on another connection than torques are written."""
     age: LoopAge | None = None
     """None: no command that is based on a state took effect."""
     stalls: Stalls = NO_STALLS

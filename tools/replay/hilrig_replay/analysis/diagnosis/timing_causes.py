@@ -31,6 +31,12 @@ MAX_WAIT_SPREAD: Final = 0.02
 """Largest interquartile range of a wait, as a share of it: computations vary more."""
 MAX_ROUND_WAIT_SPREAD: Final = 0.06
 """The same for a wait of a multiple of `ROUND_NS`, as programs contain it."""
+MAX_TIMER_SPREAD: Final = 0.2
+"""The same if the cycle is kept with absolute deadlines."""
+MAX_TIMER_ERROR_NS: Final = 0.05 * MS
+MIN_DRIFT_SHARE: Final = 0.2
+"""Smallest interquartile range of the time between reading and writing, as a share of the cycle, that is no constant
+phase."""
 ROUND_NS: Final = 5 * MS
 MAX_OVERSLEPT_NS: Final = 1.2 * MS
 """Largest time by which a wait is longer than requested, with the time of the requests."""
@@ -136,6 +142,18 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
 def wait_before_write(evidence: Evidence) -> Finding | None:
     """A program that reads, waits, and then writes."""
     cycles = evidence.cycles()
+    if _reads_unsynchronized(evidence, cycles):
+        held_ns = float(cycles["held_ns"].mean())
+        return _cause(
+            evidence,
+            "wait_before_write",
+            f"positions wait {held_ns / MS:.0f} ms on average before the torques are written: they are read on another "
+            "connection, and the times of reading and writing are not related",
+            "read, compute and write in one thread, then wait",
+            evidence.saved_ns(lambda rows: _computing_ns(evidence, rows)),
+            wait_ms=held_ns / MS,
+            cycle_ms=_median(cycles["cycle_ns"]) / MS,
+        )
     if not _waits_before_writing(evidence, cycles):
         return None
     held_ns = _median(cycles["held_ns"]) - evidence.min_rtt_ns
@@ -161,7 +179,22 @@ def _waits_before_writing(evidence: Evidence, cycles: Rows) -> bool:
     if held < MIN_DELAY_NS or _median(cycles["pause_ns"]) - evidence.min_rtt_ns > max(NO_PAUSE_NS, 0.1 * held):
         return False
     spread = (high - low) / held
+    if _is_timer(_median(cycles["cycle_ns"])):
+        return bool(spread < MAX_TIMER_SPREAD)
     return bool(spread < (MAX_ROUND_WAIT_SPREAD if _is_round(held) else MAX_WAIT_SPREAD))
+
+
+def _is_timer(cycle_ns: float) -> bool:
+    """Whether a cycle is kept with absolute deadlines: its median is a multiple of `ROUND_NS`."""
+    return abs(cycle_ns - round(cycle_ns / ROUND_NS) * ROUND_NS) < MAX_TIMER_ERROR_NS
+
+
+def _reads_unsynchronized(evidence: Evidence, cycles: Rows) -> bool:
+    """Whether one thread reads and another one writes, so that the time between them drifts."""
+    if not evidence.other_connection or len(cycles) < 10:
+        return False
+    low, high = np.percentile(cycles["held_ns"], (25, 75))
+    return bool(high - low >= MIN_DRIFT_SHARE * _median(cycles["cycle_ns"]))
 
 
 def _is_round(wait_ns: float) -> bool:
@@ -416,6 +449,25 @@ def watchdog_gaps(evidence: Evidence) -> Finding | None:
     return Finding("timing", "watchdog_gaps", text, remedy, None, values)
 
 
+def controller_pauses(evidence: Evidence) -> Finding | None:
+    """Times without a write that are much longer than the cycle."""
+    cycles = evidence.cycles()["cycle_ns"]
+    paused = cycles[cycles > max(PAUSE_RATIO * _median(cycles), PAUSE_RATIO * evidence.step_ns)]
+    if not len(paused):
+        return None
+    longest_ms = float(paused.max()) / MS
+    return _cause(
+        evidence,
+        "controller_pauses",
+        f"the controller did not write for up to {longest_ms:.0f} ms: {len(paused)} of {len(cycles)} cycles were more "
+        f"than {PAUSE_RATIO:g} times as long as usual",
+        "write in each cycle; without waiting for other connections, files or the garbage collection",
+        float((paused**2).sum()) / 2 / float(cycles.sum()),
+        pauses=float(len(paused)),
+        longest_ms=longest_ms,
+    )
+
+
 def competing_clients(evidence: Evidence) -> Finding | None:
     """Writes that are refused because another client writes the same."""
     refused = total = clients = 0
@@ -447,10 +499,19 @@ RULES: Final[tuple[Rule, ...]] = (
     injected_delay,
     beating,
     watchdog_gaps,
+    controller_pauses,
     competing_clients,
 )
 OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
-    {previous_poll, delayed_acknowledgement, wait_before_write, slow_polling, computing_time, beating}
+    {
+        previous_poll,
+        delayed_acknowledgement,
+        wait_before_write,
+        slow_polling,
+        computing_time,
+        beating,
+        controller_pauses,
+    }
 )
 """Rules about a program that polls the rig; in the client role the edge itself polls."""
 RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "cpu_steal", "watchdog_gaps"})
@@ -461,10 +522,12 @@ SUPPRESSED: Final = {
     "computing_time": frozenset({"beating"}),
     "slow_polling": frozenset({"beating"}),
     "network": frozenset({"beating"}),
-    "edge_stall": frozenset({"watchdog_gaps"}),
-    "simulation_stall": frozenset({"watchdog_gaps"}),
-    "cpu_steal": frozenset({"watchdog_gaps"}),
-    "retransmissions": frozenset({"watchdog_gaps"}),
+    **dict.fromkeys(
+        ("edge_stall", "simulation_stall", "cpu_steal", "retransmissions"),
+        frozenset({"watchdog_gaps", "controller_pauses"}),
+    ),
+    "watchdog_gaps": frozenset({"controller_pauses"}),
+    "competing_clients": frozenset({"controller_pauses"}),
 }
 """By cause: the generic causes that it explains."""
 
