@@ -1,6 +1,7 @@
 """Publishers and caches of a service: published bytes are recorded unchanged, and only the newest value is cached."""
 
 import platform
+from itertools import chain, repeat
 from types import SimpleNamespace
 
 import pytest
@@ -97,7 +98,7 @@ def test_health_report_is_published_once_a_second(monkeypatch: pytest.MonkeyPatc
         service.counters.requests = 3
         service.counters.published = 500
         service.counters.latenesses_ns += range(101)
-        delays_ns = iter((70, 30, 5, 0))
+        delays_ns = chain((70, 30, 5), repeat(0))
         monkeypatch.setattr(service.health, "_run_delay", SimpleNamespace(take=lambda: next(delays_ns)))
         # A late tick in the first second.
         assert service.health.take_run_delay() == 70

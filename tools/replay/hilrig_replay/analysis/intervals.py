@@ -14,7 +14,8 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta, binom
+from scipy.special import betaincinv
+from scipy.stats import binom
 
 from hilrig_replay.analysis.distribution import Floats, Statistics, percentiles
 from hilrig_replay.io.disk_table import Blocks
@@ -102,8 +103,8 @@ def share_interval(share: float, effective: float) -> Interval:
     """Clopper–Pearson interval of a share, 0 to 1, that was found in an effective number of values."""
     below, above = share * effective, (1 - share) * effective
     tail = (1 - CONFIDENCE) / 2
-    low = float(beta.ppf(tail, below, above + 1)) if below > 0 else 0.0
-    high = float(beta.ppf(1 - tail, below + 1, above)) if above > 0 else 1.0
+    low = float(betaincinv(below, above + 1, tail)) if below > 0 else 0.0
+    high = float(betaincinv(below + 1, above, 1 - tail)) if above > 0 else 1.0
     return low, high
 
 
