@@ -12,7 +12,7 @@ LONG = bool(os.environ.get("HILRIG_LONG"))
 
 def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
     judged = PARTS["judged"]
-    for other in (PARTS["tuning"], PARTS["revision"]):
+    for other in (part for name, part in PARTS.items() if name != "judged"):
         assert not set(other.laws) & set(judged.laws)
         assert not set(other.goals) & set(judged.goals)
         assert other.ranges.keys() == judged.ranges.keys()

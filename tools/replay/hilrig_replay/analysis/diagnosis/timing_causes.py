@@ -33,7 +33,8 @@ MAX_ROUND_WAIT_SPREAD: Final = 0.06
 """The same for a wait of a multiple of `ROUND_NS`, as programs contain it."""
 MAX_TIMER_SPREAD: Final = 0.2
 """The same if the cycle is kept with absolute deadlines."""
-MAX_TIMER_ERROR_NS: Final = 0.05 * MS
+MIN_CORRECTION: Final = 0.2
+"""Smallest negative correlation of consecutive cycles with absolute deadlines, for which −0.5 is expected."""
 MIN_DRIFT_SHARE: Final = 0.2
 """Smallest interquartile range of the time between reading and writing, as a share of the cycle, that is no constant
 phase."""
@@ -179,14 +180,16 @@ def _waits_before_writing(evidence: Evidence, cycles: Rows) -> bool:
     if held < MIN_DELAY_NS or _median(cycles["pause_ns"]) - evidence.min_rtt_ns > max(NO_PAUSE_NS, 0.1 * held):
         return False
     spread = (high - low) / held
-    if _is_timer(_median(cycles["cycle_ns"])):
+    if _keeps_deadlines(cycles["cycle_ns"]):
         return bool(spread < MAX_TIMER_SPREAD)
     return bool(spread < (MAX_ROUND_WAIT_SPREAD if _is_round(held) else MAX_WAIT_SPREAD))
 
 
-def _is_timer(cycle_ns: float) -> bool:
-    """Whether a cycle is kept with absolute deadlines: its median is a multiple of `ROUND_NS`."""
-    return abs(cycle_ns - round(cycle_ns / ROUND_NS) * ROUND_NS) < MAX_TIMER_ERROR_NS
+def _keeps_deadlines(cycle_ns: Floats) -> bool:
+    """Whether cycles are kept with absolute deadlines: after a long one, the next is shorter."""
+    moved = np.minimum(cycle_ns, PAUSE_RATIO * _median(cycle_ns))
+    moved = moved - moved.mean()
+    return bool((moved[1:] * moved[:-1]).sum() < -MIN_CORRECTION * (moved**2).sum())
 
 
 def _reads_unsynchronized(evidence: Evidence, cycles: Rows) -> bool:
