@@ -150,7 +150,7 @@ PARTS: Final = {
             "injected": ((36, 39), (145, 200)),
             "beating": ((0.88, 0.915), (1.132, 1.145)),
             "stall": ((132, 138), (720, 1000)),
-            "behind": ((11, 14), (86, 95)),
+            "behind": ((11, 14), (60.3, 61.8)),
             "phase": ((2.6, 2.9), (14.1, 14.9)),
             "gap": ((860, 890), (4600, 6000)),
             "saturating": (46, 60),
@@ -364,7 +364,7 @@ def case_of(code: str, part: str, number: int) -> Case:
             delays = {"injected_state_ms": share * delay_ms, "injected_command_ms": (1 - share) * delay_ms}
             return Case(code, program(fast, 0.5, **delays))
         case "beating":
-            return Case(code, program(step_ms * within("beating"), compute_ms=3.0))
+            return Case(code, program(step_ms * within("beating"), compute_ms=2.0))
         case "watchdog_gaps":
             # Faster than the step: the phase after a pause does not matter.
             return Case(code, program(fast, 0.6, pauses={float(t): within("gap") for t in times[:3]}))
