@@ -24,7 +24,13 @@ def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
 def test_a_sample_of_forty_runs_is_diagnosed() -> None:
     # Two runs of each cause, and two undisturbed ones.
     cases = corpus("judged", 2)[4:]
-    assert len(cases) == 42
+    assert len(cases) == 40
+    for case in cases:
+        if case.code in ("open_loop", "joint_on_stop", "limit_cycle"):
+            # Stops are slow to simulate, also for the other runs of the same duration.
+            case.program.seconds = 8.0
+        elif case.program.seconds > 20.0:
+            case.program.seconds = 30.0
     results = list(diagnosed(cases))
     missed = [(one.case.code, one.timing, one.control) for one in results if not one.found or one.wrong]
     assert len(missed) <= 1, missed
