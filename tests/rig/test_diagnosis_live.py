@@ -25,7 +25,7 @@ from support.forwarder import Forwarder
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 PROGRAM = Path(__file__).parents[1] / "support/student_program.py"
 EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"
@@ -103,20 +103,20 @@ def diagnosed(lab: RunningLab, commands: Sequence[list[str]], during: Iterable[N
 
 def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
     """Stop a process several times."""
-    time.sleep(1.0)
+    time.sleep(1.0)  # the programs connect and move the arm before they are disturbed
     for _ in range(count):
         os.kill(pid, signal.SIGSTOP)
         try:
-            time.sleep(stop_s)
+            time.sleep(stop_s)  # the duration of the stop is under test
         finally:
             os.kill(pid, signal.SIGCONT)
-        time.sleep(0.5)
+        time.sleep(0.5)  # undisturbed time between two stops
         yield
 
 
 def takes_processor(pid: int, count: int, busy_s: float) -> Iterator[None]:
     """Occupy the core of a process several times, with a higher priority; the process may use no other one."""
-    time.sleep(1.0)
+    time.sleep(1.0)  # the programs connect and move the arm before they are disturbed
     threads, cores = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()], os.sched_getaffinity(pid)
     for thread in threads:
         os.sched_setaffinity(thread, {max(cores)})

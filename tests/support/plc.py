@@ -157,7 +157,7 @@ class Plc:
                 transaction, _, length, unit = HEADER.unpack(_exactly(connected, 7))
                 pdu = _exactly(connected, length - 1)
                 if self._delay_s:
-                    time.sleep(self._delay_s)
+                    time.sleep(self._delay_s)  # a slow network
                 self.requests.append((time.monotonic_ns(), pdu))
                 reply: bytes | None
                 if self.fault is not None:
@@ -168,7 +168,7 @@ class Plc:
                 if reply is None:
                     break
                 if self._delay_s:
-                    time.sleep(self._delay_s)
+                    time.sleep(self._delay_s)  # a slow network
                 connected.sendall(reply)
         except OSError:
             pass

@@ -64,7 +64,7 @@ def _shares_its_core(connection: Connection) -> None:
     shared_ns = delay.take()
     os.waitpid(child, 0)
     delay.take()
-    time.sleep(0.02)
+    time.sleep(0.02)  # no time without a processor
     connection.send((shared_ns, delay.take()))
 
 

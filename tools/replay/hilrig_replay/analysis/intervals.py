@@ -14,8 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv
-from scipy.stats import binom
+from scipy.special import bdtr, betaincinv
 
 from hilrig_replay.analysis.distribution import Floats, Statistics, percentiles
 from hilrig_replay.io.disk_table import Blocks
@@ -115,8 +114,9 @@ def median_over_runs(values: Sequence[float]) -> tuple[float, Interval | None]:
     """
     ordered, count = np.sort(np.asarray(values, np.float64)), len(values)
     median = float(np.median(ordered))
-    below = int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5))
-    if not below or 2 * binom.cdf(below - 1, count, 0.5) > 1 - CONFIDENCE:
+    # A quantile of the binomial distribution.
+    below = int(np.searchsorted(bdtr(np.arange(count), count, 0.5), (1 - CONFIDENCE) / 2))
+    if not below:
         return median, None
     return median, (float(ordered[below - 1]), float(ordered[count - below]))
 
