@@ -54,6 +54,7 @@ class Part:
     goals: Sequence[str]
     ranges: dict[str, Range | tuple[Range, ...]]
     """`kp`: gain of joint 1, N·m per degree; times in ms."""
+    seed: int = 0
 
     def intervals(self, name: str) -> tuple[Range, ...]:
         """The ranges of a parameter."""
@@ -143,12 +144,12 @@ PARTS: Final = {
         ("slope", "feedforward", "coupled", "smoothed torque", "soft band"),
         ("trapezoid", "growing sine", "smooth noise", "alternate"),
         {
-            "kp": ((0.185, 0.197), (0.325, 0.38)),
+            "kp": ((0.185, 0.197), (0.252, 0.258)),
             "wait": ((16.2, 17.8), (125, 180)),
             "slow": ((86, 89), (185, 240)),
             "slow_computing": ((90.5, 94.5), (145, 190)),
             "injected": ((36, 39), (145, 200)),
-            "beating": ((0.88, 0.915), (1.132, 1.145)),
+            "beating": ((1.061, 1.064), (1.132, 1.145)),
             "stall": ((132, 138), (720, 1000)),
             "behind": ((11, 14), (60.3, 61.8)),
             "phase": ((2.6, 2.9), (14.1, 14.9)),
@@ -156,12 +157,14 @@ PARTS: Final = {
             "saturating": (46, 60),
             "cycling": (1.9, 2.4),
             "noise": (0.14, 0.195),
-            "overshooting": ((0.405, 0.415), (1.21, 1.24)),
+            "overshooting": ((0.405, 0.415), (0.481, 0.495)),
             "error": (86, 95),
             "limit": (2.6, 3.5),
             "starved": ((0.51, 0.54), (0.951, 0.959)),
             "pause": ((152, 158), (455, 480)),
         },
+        # Of the first draw, some runs really oscillated (`kp`, `overshooting`), or were hardly delayed (`beating`).
+        seed=2,
     ),
 }
 
@@ -311,8 +314,8 @@ def _task(position: np.ndarray) -> str:
 
 def case_of(code: str, part: str, number: int) -> Case:
     """The case of a cause with a number; equal arguments give the same case."""
-    random = np.random.default_rng([sum(map(ord, code)), list(PARTS).index(part), number])
     of = PARTS[part]
+    random = np.random.default_rng([sum(map(ord, code)), list(PARTS).index(part) + 10 * of.seed, number])
     law, goal = of.laws[number % len(of.laws)], goal_of(of.goals[number // 2 % len(of.goals)], random)
     kp = of.draw("kp", random)
     step_ms = 20.0
