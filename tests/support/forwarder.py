@@ -1,4 +1,4 @@
-"""A TCP forwarder with an ordinary socket towards the client, as of a gateway: it delays its acknowledgments."""
+"""A TCP forwarder with an ordinary socket to the client, as of a gateway: it delays its acknowledgments."""
 
 import socket
 import threading

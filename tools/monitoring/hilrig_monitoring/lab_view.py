@@ -59,6 +59,8 @@ class RigStatus:
     """Ticks of the simulation that began more than a step late, since its start."""
     exceptions: dict[tuple[str, int, int], int] = field(default_factory=dict)
     """By host, function (0: unsupported) and code: number of Modbus exception responses since the edge's start."""
+    student: str = ""
+    """Id of the student who owns the rig, several ones with commas."""
     alert: str = ""
     """The newest refused request or foreign protocol, with the fix; empty: none recently."""
     loops_us: list[int] = field(default_factory=list)
@@ -163,7 +165,7 @@ class LabView:
                     status.controller, status.session = report.controller, report.session
                     status.connections, status.watchdog_tripped = report.connections, report.watchdog_tripped
                     status.exceptions = {(row.host, row.function, row.code): row.count for row in report.exceptions}
-                    status.alert = report.alert
+                    status.alert, status.student = report.alert, report.student
                 else:
                     status.recording = status.recording or report.recording
         for rig, loops in self._loops.items():
@@ -233,6 +235,7 @@ def _rig_row(rig: RigStatus) -> dict[str, Any]:
         "state": rig.state,
         "simulated": rig.simulated,
         "served": rig.served,
+        **({"student": rig.student} if rig.student else {}),
         "controller": rig.controller,
         "session": rig.session,
         "connections": rig.connections,
