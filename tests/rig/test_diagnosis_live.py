@@ -195,7 +195,7 @@ def test_refused_writes_of_a_second_program_are_found(causes: dict[str, list[Fin
     assert "competing_clients" in {one.code for one in causes["competitor"]}
 
 
-def test_program_that_takes_the_processor_of_the_edge_is_found(lab: RunningLab) -> None:
+def test_program_that_takes_the_edges_processor_is_found(lab: RunningLab) -> None:
     require_real_time()
     [[first, *others]] = diagnosed(lab, [program(lab, "none")], takes_processor(lab.service_pid("edge"), 2, 0.25))
     assert (first.code, others) == ("cpu_steal", [])

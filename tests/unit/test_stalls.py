@@ -56,7 +56,7 @@ def test_stalls_of_a_second_are_reported_together(bench: Bench) -> None:
     assert len(reported(bench)) == 2
 
 
-def test_event_has_the_time_without_a_processor_of_the_longest_stall(bench: Bench) -> None:
+def test_event_has_the_run_delay_of_the_longest_stall(bench: Bench) -> None:
     bench.write(bench.connect(), 0, 1)
     stall(bench, 60)
     for ms, run_delay_ms in ((70, 65), (190, 170), (80, 80)):
