@@ -1,4 +1,4 @@
-"""Diagnosis of recordings of real programs with one mistake each, and of the recordings of cases from use.
+"""Diagnosis of recordings of real programs with one mistake each, and of services that were disturbed.
 
 With HILRIG_LONG in the environment for more runs of each cause: the live part of the table in docs/timing.md.
 """
@@ -9,17 +9,19 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from diagnosis_corpus import interval
+from diagnosis_corpus import UNDISTURBED, interval
 from hilrig_replay.analysis.diagnosis.evidence import Finding
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.io.run import open_run
 from support.delay_line import NEAR, DelayLine, require_delay_line
+from support.forwarder import Forwarder
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
@@ -30,15 +32,29 @@ EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"
 LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 4.0 if LONG else 2.5
 LIVE_RUNS = 25
-"""Runs of each cause in the long test."""
-RIGS = 4
+"""Runs of each cause in the long test, at least."""
+RIGS = 6
 MISTAKES: dict[str, tuple[str, tuple[float, float]]] = {
     "previous_poll": ("previous poll", (0, 0)),
     "wait_before_write": ("wait before write", (12, 60)),
     "open_loop": ("read once", (0, 0)),
     "slow_polling": ("slow polling", (30, 120)),
+    "delayed_acknowledgement": ("two segments", (0, 0)),
+    "competing_clients": ("competitor", (0, 0)),
 }
 """By cause: mistake of the program and range of its value, ms."""
+FIFO_LOAD = """
+import os, sys, time
+core, count, busy_s = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+os.sched_setaffinity(0, {core})
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+for _ in range(count):
+    end = time.monotonic() + busy_s
+    while time.monotonic() < end:
+        pass
+    time.sleep(0.5)
+"""
+"""A program with a higher real-time priority than the services."""
 
 
 @pytest.fixture(scope="module")
@@ -56,31 +72,33 @@ def program(
     *,
     rig: int = 0,
     host: str = "127.0.0.1",
+    port: int | None = None,
 ) -> list[str]:
-    port = lab.lab.ports[lab.lab.rigs[rig].name]
+    """Command line of a program; `port`: another one than that of the rig."""
+    port = port or lab.lab.ports[lab.lab.rigs[rig].name]
     return [sys.executable, str(PROGRAM), host, str(port), str(seconds), mistake, str(value_ms)]
 
 
-def diagnosed(lab: RunningLab, commands: list[list[str]], during: Iterable[None] = ()) -> dict[str, list[Finding]]:
-    """Timing causes by rig of programs, one a rig, that run at the same time; `during` acts meanwhile."""
+def diagnosed(lab: RunningLab, commands: Sequence[list[str]], during: Iterable[None] = ()) -> list[list[Finding]]:
+    """Timing causes of the programs of the first rigs, which run at the same time; `during` acts meanwhile.
+
+    Of several programs of a rig, the causes of its first recording.
+    """
     known = set(lab.recordings)
     processes = [subprocess.Popen(command) for command in commands]
     for _ in during:
         pass
     for process in processes:
         process.wait(60)
+    rigs = [rig.name for rig in lab.lab.rigs]
 
-    def new() -> list[Path] | None:
-        found = [path for path in lab.recordings if path not in known]
-        return found if len(found) >= len(commands) else None
+    def new() -> dict[str, Path] | None:
+        found = {path.parent.name: path for path in reversed(lab.recordings) if path not in known}
+        return found if len(found) >= min(len(commands), RIGS) else None
 
-    runs = [open_run(path) for path in eventually(new)]
-    return {run.rig: [one for one in measure(run).findings if one.list == "timing"] for run in runs}
-
-
-def causes_of(lab: RunningLab, command: list[str]) -> list[Finding]:
-    [found] = diagnosed(lab, [command]).values()
-    return found
+    paths = eventually(new)
+    findings = [measure(open_run(paths[rig])).findings for rig in rigs if rig in paths]
+    return [[one for one in of_rig if one.list == "timing"] for of_rig in findings]
 
 
 def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
@@ -92,27 +110,63 @@ def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
             time.sleep(stop_s)  # the duration of the stop is under test
         finally:
             os.kill(pid, signal.SIGCONT)
-        time.sleep(0.8)  # undisturbed time between two stops
+        time.sleep(0.5)  # undisturbed time between two stops
         yield
 
 
-def test_example_that_writes_the_old_torques_is_found(lab: RunningLab, tmp_path: Path) -> None:
+def takes_processor(pid: int, count: int, busy_s: float) -> Iterator[None]:
+    """Occupy the core of a process several times, with a higher priority; the process may use no other one."""
+    time.sleep(1.0)  # the programs connect and move the arm before they are disturbed
+    threads, cores = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()], os.sched_getaffinity(pid)
+    for thread in threads:
+        os.sched_setaffinity(thread, {max(cores)})
+    try:
+        subprocess.run([sys.executable, "-c", FIFO_LOAD, *map(str, (max(cores), count, busy_s))], check=True)
+    finally:
+        for thread in threads:
+            os.sched_setaffinity(thread, cores)
+    yield
+
+
+def require_real_time() -> None:
+    """Skip the test if a program can't have a higher priority than the services."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        pytest.skip("needs root on Linux for a real-time priority")
+
+
+@pytest.fixture(scope="module")
+def causes(lab: RunningLab, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Finding]]:
+    """Timing causes of programs with one mistake each, by mistake."""
     source = EXAMPLE.read_text(encoding="utf-8")
     written = "answer = client.write_registers(0, words)"
     late = source.replace(written, "answer = client.write_registers(0, old)\n        old = words")
     late = late.replace("error = [0.0] * 4\n", "error = [0.0] * 4\n    old = [0, 0, 0, 0]\n", 1)
     assert "write_registers(0, old)" in late
     assert "old = [0, 0, 0, 0]" in late
-    path = tmp_path / "hold_previous.py"
+    path = tmp_path_factory.mktemp("example") / "hold_previous.py"
     path.write_text(late, encoding="utf-8")
+    values = {
+        "wait before write": 20.0,
+        "two segments": 0.0,
+        "read once": 0.0,
+        "slow polling": 100.0,
+        "competitor": 0.0,
+    }
+    programs = [program(lab, mistake, value, rig=rig) for rig, (mistake, value) in enumerate(values.items(), start=1)]
     arguments = ["--port", str(lab.port), "--duration", str(2 * SECONDS)]
-    first, *_ = causes_of(lab, [sys.executable, str(path), *arguments])
+    rival = program(lab, "competitor", rig=RIGS - 1, seconds=SECONDS + 0.5)
+    found = diagnosed(lab, [[sys.executable, str(path), *arguments], *programs, rival])
+    return dict(zip(("previous poll", *values), found, strict=True))
+
+
+def test_example_that_writes_the_old_torques_is_found(causes: dict[str, list[Finding]]) -> None:
+    first = causes["previous poll"][0]
     assert first.code == "previous_poll", first
     assert "add one period of 20 ms" in first.text
 
 
-def test_wait_between_read_and_write_is_found(lab: RunningLab) -> None:
-    first, *others = causes_of(lab, program(lab, "wait before write", 20))
+def test_wait_between_read_and_write_is_found(causes: dict[str, list[Finding]]) -> None:
+    first, *others = causes["wait before write"]
     assert (first.code, others) == ("wait_before_write", [])
     assert first.text == "the program waits 20 ms between read and write"
     assert first.remedy == "read, compute, write, then wait"
@@ -120,29 +174,32 @@ def test_wait_between_read_and_write_is_found(lab: RunningLab) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="TCP_QUICKACK is an option of Linux")
-def test_two_segments_cost_no_delay(lab: RunningLab) -> None:
+def test_two_segments_cost_no_delay(causes: dict[str, list[Finding]]) -> None:
     # The edge acknowledges an incomplete request at once.
-    assert causes_of(lab, program(lab, "two segments")) == []
+    assert causes["two segments"] == []
 
 
-def test_open_loop_after_one_read_is_found(lab: RunningLab) -> None:
-    first, *others = causes_of(lab, program(lab, "read once"))
+def test_open_loop_after_one_read_is_found(causes: dict[str, list[Finding]]) -> None:
+    first, *others = causes["read once"]
     assert (first.code, others) == ("open_loop", [])
 
 
-def test_slow_polling_has_period_and_age(lab: RunningLab) -> None:
-    first, *others = causes_of(lab, program(lab, "slow polling", 100))
+def test_slow_polling_has_period_and_age(causes: dict[str, list[Finding]]) -> None:
+    first, *others = causes["slow polling"]
     assert (first.code, others) == ("slow_polling", [])
     assert "polls every 100 ms" in first.text
     assert "the mean age 6" in first.text
 
 
-@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
-def test_refused_writes_of_a_second_program_are_found(lab: RunningLab) -> None:
-    competitor = subprocess.Popen(program(lab, "competitor", seconds=SECONDS + 1, rig=1))
-    found = diagnosed(lab, [program(lab, "competitor", rig=1)])
-    competitor.wait(30)
-    assert "competing_clients" in {one.code for causes in found.values() for one in causes}, found
+def test_refused_writes_of_a_second_program_are_found(causes: dict[str, list[Finding]]) -> None:
+    assert "competing_clients" in {one.code for one in causes["competitor"]}
+
+
+def test_program_that_takes_the_edges_processor_is_found(lab: RunningLab) -> None:
+    require_real_time()
+    [[first, *others]] = diagnosed(lab, [program(lab, "none")], takes_processor(lab.service_pid("edge"), 2, 0.25))
+    assert (first.code, others) == ("cpu_steal", [])
+    assert first.evidence["run_delay_ms"] == pytest.approx(first.evidence["longest_ms"], rel=0.2)
 
 
 @pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
@@ -152,26 +209,34 @@ def test_error_rate_of_live_causes(lab: RunningLab, capsys: pytest.CaptureFixtur
     require_delay_line()
     random = np.random.default_rng(24)
     outcomes: dict[str, list[list[str]]] = defaultdict(list)
-    rigs = [rig.name for rig in lab.lab.rigs]
 
-    def note(code: str, found: dict[str, list[Finding]]) -> None:
-        outcomes[code] += [[one.code for one in causes] for causes in found.values()]
+    def note(code: str, found: list[list[Finding]]) -> None:
+        outcomes[code] += [[one.code for one in causes] for causes in found]
 
     for batch in range(LIVE_RUNS):
-        order = random.permutation(RIGS)
-        commands = [
-            program(lab, mistake, float(random.uniform(*values)), rig=int(rig))
-            for rig, (mistake, values) in zip(order, MISTAKES.values(), strict=True)
-        ]
-        found = diagnosed(lab, commands)
+        order = [int(rig) for rig in random.permutation(RIGS)]
+        with ExitStack() as forwarding:
+            commands: list[list[str]] = []
+            for rig, (mistake, values) in zip(order, MISTAKES.values(), strict=True):
+                port = None
+                if mistake == "two segments":
+                    target = lab.lab.ports[lab.lab.rigs[rig].name]
+                    port = forwarding.enter_context(Forwarder(target)).port
+                commands.append(program(lab, mistake, float(random.uniform(*values)), rig=rig, port=port))
+            rival = program(lab, "competitor", rig=order[-1], seconds=SECONDS + 0.5)
+            found = diagnosed(lab, [*commands, rival])
         for rig, code in zip(order, MISTAKES, strict=True):
-            outcomes[code].append([one.code for one in found[rigs[rig]]])
-        if batch % RIGS == 0:
+            note(code, [found[rig]])
+        if batch * RIGS < LIVE_RUNS:
             good = [program(lab, "none", rig=rig) for rig in range(RIGS)]
-            note("undisturbed", diagnosed(lab, good))
-            for service, code in (("edge", "edge_stall"), ("sim", "simulation_stall")):
-                stop_s = float(random.uniform(0.15, 0.4))
-                note(code, diagnosed(lab, good, stops(lab.service_pid(service), 3, stop_s)))
+            note(UNDISTURBED, diagnosed(lab, good))
+            edge, sim = lab.service_pid("edge"), lab.service_pid("sim")
+            for code, disturb, pid in (
+                ("edge_stall", stops, edge),
+                ("simulation_stall", stops, sim),
+                ("cpu_steal", takes_processor, (edge, sim)[batch % 2]),
+            ):
+                note(code, diagnosed(lab, good, disturb(pid, 3, float(random.uniform(0.15, 0.4)))))
             delay_s = float(random.uniform(0.008, 0.03))
             for code, line in (
                 ("network", DelayLine(delay_s, delay_s)),
@@ -184,10 +249,12 @@ def test_error_rate_of_live_causes(lab: RunningLab, capsys: pytest.CaptureFixtur
         print()
         for code, every in outcomes.items():
             found_count, wrong = (
-                sum(code in causes if code != "undisturbed" else not causes for causes in every),
+                sum(code in causes if code != UNDISTURBED else not causes for causes in every),
                 sum(bool(causes) and causes[0] != code for causes in every),
             )
             print(f"| {code} | {len(every)} | {interval(found_count, len(every))} | {interval(wrong, len(every))} |")
-            missed = [causes for causes in every if causes[:1] != ([code] if code != "undisturbed" else [])]
+            missed = [causes for causes in every if causes[:1] != ([code] if code != UNDISTURBED else [])]
             print(missed)
-            assert found_count >= 0.9 * len(every), code
+    for code, every in outcomes.items():
+        found_count = sum(code in causes if code != UNDISTURBED else not causes for causes in every)
+        assert found_count >= 0.9 * len(every), code

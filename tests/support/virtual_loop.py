@@ -73,6 +73,8 @@ class Program:
     """Stalls of the simulation: time, s → duration."""
     edge_stalls: Mapping[float, float] = field(default_factory=dict)
     """Stalls of the edge, which it reports: time, s → duration."""
+    starved_share: float = 0.0
+    """Part of each stall in which the service is ready to run and has no processor."""
     watchdog_ms: float = 500.0
     start: tuple[float, float, float, float] = (0.0, 0.0, 0.05, 0.0)
     task: str = ""
@@ -225,6 +227,8 @@ class _Loop:
         state["sampled_ns"] = tick_ns + START_WALL_NS + SIM_FROM_WALL_NS
         state["wall_ns"] = state["log_ns"] = tick_ns + START_WALL_NS
         state["lateness_ns"], state["missed_steps"] = late_ns, missed
+        stalled_ms = late_ns / MS + missed * self.program.step_ms
+        state["run_delay_ns"] = self.program.starved_share * stalled_ms * MS if missed else 0
         state["position"], state["velocity"] = position, velocity
         self.registers[step] = np.rint(position * REGISTER_SCALE * 100) / 100
         if newest < 0:
@@ -281,6 +285,7 @@ class _Loop:
             event = Event(kind=Event.OVERRUN, severity=Event.WARNING, source="edge/1", session=SESSION)
             event.wall_ns = round(at_s * 1e9 + ms * MS) + START_WALL_NS
             event.overrun_data.lateness_ns, event.overrun_data.stalls = round(ms * MS), 1
+            event.overrun_data.run_delay_ns = round(self.program.starved_share * ms * MS)
             events.append(event)
         change = np.diff(states["safe"].astype(np.int8))
         for row in np.flatnonzero(change).tolist():

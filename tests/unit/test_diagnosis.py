@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hilrig_replay.analysis.age import LoopAge
+from hilrig_replay.analysis.data_quality import Stalls
 from hilrig_replay.analysis.diagnosis import control_observations, timing_causes
 from hilrig_replay.analysis.diagnosis.diagnose import MAX_FINDINGS, diagnose
 from hilrig_replay.analysis.diagnosis.evidence import Evidence, Finding, sections
+from hilrig_replay.analysis.distribution import Statistics
 from hilrig_replay.analysis.feedback import rounding_gains
 from hilrig_replay.analysis.latency import measure
 from hilrig_replay.analysis.samples import SAMPLE_DTYPE
@@ -21,6 +24,7 @@ from hilrig_replay.io.records import EVENT_DTYPE, Records
 from hilrig_replay.io.run import open_run
 from hilrig_runtime.config.task import PoseConfig
 from support.recordings import Script, make, record, write
+from support.virtual_loop import Program, virtual_runs
 
 MS = 1_000_000
 DATA = Path(__file__).parents[1] / "data"
@@ -180,6 +184,112 @@ def test_pauses_far_from_a_retransmission_are_not_of_the_network() -> None:
     apart = lossy(3, 200)
     apart.windows[0].connections["wall_ns"] += 4_000 * MS
     assert timing_causes.retransmissions(apart) is None
+
+
+def test_smallest_round_trip_time_is_the_network() -> None:
+    samples = rows_of_samples(held_ms=41.0)
+    far = replace(evidence([], samples), min_rtt_ns=39.0 * MS, age=AGE, bases=300)
+    found = {one.code: one for one in diagnose(far)}
+    assert found["network"].evidence["min_rtt_ms"] == 39
+    # Without it, each command acts two steps earlier; the 2 ms that remain are no computing time.
+    assert found["network"].gain_ms == 40
+    assert set(found) == {"network"}
+    assert "network" not in {one.code for one in diagnose(replace(far, min_rtt_ns=0.0))}
+
+
+AGE = LoopAge(Statistics(60.0, 60.0, 60.0, 60.0, 60.0, 60.0, 0.0), 20.0, 60.0, 0.0, {})
+
+
+def rows_of_samples(held_ms: float) -> Rows:
+    """Samples with a loop of 60 ms and a time between reading and writing."""
+    samples = np.zeros(300, SAMPLE_DTYPE)
+    samples["loop"], samples["controller"], samples["tick_wait"] = 60 * MS, held_ms * MS, 2 * MS
+    return samples
+
+
+def test_refused_writes_are_of_competing_clients() -> None:
+    traffic = np.zeros(100, TRAFFIC_DTYPE)
+    traffic["function"], traffic["controller"] = 16, np.arange(100) % 2
+    traffic["exception"][1:20:2] = 6
+    found = timing_causes.competing_clients(evidence([replace(EMPTY, traffic=traffic)]))
+    assert found is not None
+    assert (found.evidence["refused"], found.evidence["refused_share"], found.evidence["clients"]) == (10, 0.1, 1)
+    traffic["exception"] = np.where(np.arange(100) < 4, 6, 2)
+    assert timing_causes.competing_clients(evidence([replace(EMPTY, traffic=traffic)])) is None
+
+
+@pytest.mark.parametrize("kind", ["edge", "simulation"])
+def test_stall_without_a_processor_is_cpu_steal(kind: str) -> None:
+    stalls = {("edge_stalls" if kind == "edge" else "stalls"): {3.0: 200.0, 5.0: 220.0}}
+
+    def found(starved_share: float) -> dict[str, Finding]:
+        program = Program(lambda _, q: -0.1 * q, seconds=8.0, starved_share=starved_share, **stalls)
+        [run] = virtual_runs([program])
+        return {one.code: one for one in measure(run).findings if one.list == "timing"}
+
+    steal = found(0.8)
+    assert set(steal) == {"cpu_steal"}
+    assert steal["cpu_steal"].evidence["run_delay_ms"] == pytest.approx(0.8 * 220, abs=1)
+    assert steal["cpu_steal"].evidence["at_s"] == pytest.approx(5.0, abs=0.3)
+    assert set(found(0.3)) == {f"{kind}_stall"}
+
+
+def cycles_of(held_ns: np.ndarray, cycle_ns: np.ndarray) -> Records:
+    """Commands that answer reads after a time, in cycles of a length, (n,) each."""
+    commands = np.zeros(len(held_ns), COMMAND_DTYPE)
+    commands["write_received_ns"] = commands["write_arrived_ns"] = 1_000 * MS + np.cumsum(cycle_ns)
+    commands["state_served_ns"] = commands["write_arrived_ns"] - held_ns
+    commands["basis_step"], commands["session"] = np.arange(1, len(held_ns) + 1), 1
+    return replace(EMPTY, commands=commands)
+
+
+def test_pauses_of_a_controller_are_found_unless_explained() -> None:
+    cycle_ns = np.where(np.arange(400) % 40 == 39, 300, 20) * MS
+    paused = replace(evidence([cycles_of(np.full(400, MS), cycle_ns)], rows_of_samples(1.0)), age=AGE, bases=300)
+    [found] = [one for one in diagnose(paused) if one.list == "timing"]
+    assert found.code == "controller_pauses"
+    assert (found.evidence["pauses"], found.evidence["longest_ms"]) == (10, 300)
+    assert found.gain_ms == pytest.approx(300**2 / 2 / (39 * 20 + 300), rel=0.02)
+    stalled = replace(paused, edge_stalls=Stalls(10, 300 * MS, area_ns2=10 * (300.0 * MS) ** 2 / 2))
+    assert {one.code for one in diagnose(stalled) if one.list == "timing"} == {"edge_stall"}
+    regular = [cycles_of(np.full(400, MS), np.full(400, 20 * MS))]
+    assert diagnose(replace(paused, windows=regular)) == ()
+
+
+def test_drifting_phase_of_two_connections_is_a_wait() -> None:
+    samples, held_ns = rows_of_samples(19.0), (4 + np.arange(400) % 18) * MS
+    drifting = replace(evidence([cycles_of(held_ns, np.full(400, 21 * MS))], samples), age=AGE, bases=300)
+    two = replace(drifting, other_connection=True)
+    assert [one.code for one in diagnose(two) if one.list == "timing"] == ["wait_before_write"]
+    assert [one.code for one in diagnose(drifting) if one.list == "timing"] == ["computing_time"]
+
+
+@pytest.mark.parametrize(("deadlines", "code"), [(True, "wait_before_write"), (False, "computing_time")])
+def test_hold_of_a_timer_may_vary_more_than_a_sleep(deadlines: bool, code: str) -> None:
+    late_ns = np.random.default_rng(1).normal(1.0, 1.0, 400) * MS
+    cycle_ns = 22 * MS + (np.diff(late_ns, prepend=MS) if deadlines else late_ns)
+    varying = replace(evidence([cycles_of(cycle_ns - 0.3 * MS, cycle_ns)], rows_of_samples(22.0)), age=AGE, bases=300)
+    assert [one.code for one in diagnose(varying) if one.list == "timing"] == [code]
+
+
+def test_writes_after_the_first_one_are_no_wait() -> None:
+    commands = np.zeros(400, COMMAND_DTYPE)
+    # A read every 100 ms, and a write 1 ms later and again every 20 ms.
+    number = np.arange(400)
+    commands["state_served_ns"] = 1_000 * MS + number // 5 * 100 * MS
+    commands["write_arrived_ns"] = commands["state_served_ns"] + 1 * MS + number % 5 * 20 * MS
+    commands["write_received_ns"] = commands["write_arrived_ns"]
+    commands["basis_step"], commands["session"] = number // 5 * 5 + 1, 1
+    samples = rows_of_samples(0.0)
+    samples["controller"] = (1 + np.arange(300) % 5 * 20) * MS
+    repeated = replace(evidence([replace(EMPTY, commands=commands)], samples), age=AGE, bases=60)
+    [found] = [one for one in diagnose(repeated) if one.list == "timing"]
+    assert found.code == "slow_polling"
+    assert found.text.startswith("the program polls every 100 ms, and writes again without reading;")
+    # One write a register is one answer.
+    commands["write_arrived_ns"] = commands["state_served_ns"] + (1 + number % 5) * MS
+    cycles = replace(repeated, windows=[replace(EMPTY, commands=commands)]).cycles()
+    assert np.median(cycles["pause_ns"]) == 95 * MS
 
 
 EMPTY = Records(

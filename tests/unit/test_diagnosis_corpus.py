@@ -1,6 +1,7 @@
 """Error rate of the diagnosis on runs with a known cause; with HILRIG_LONG set, of the complete corpus."""
 
 import os
+from itertools import product
 
 import pytest
 
@@ -10,21 +11,27 @@ LONG = bool(os.environ.get("HILRIG_LONG"))
 
 
 def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
-    tuning, judged = PARTS["tuning"], PARTS["judged"]
-    assert not set(tuning.laws) & set(judged.laws)
-    assert not set(tuning.goals) & set(judged.goals)
-    assert tuning.ranges.keys() == judged.ranges.keys()
-    for name in ("kp", *tuning.ranges):
-        (low, high), (other_low, other_high) = (
-            part.kp if name == "kp" else part.ranges[name] for part in (tuning, judged)
-        )
-        assert high < other_low or other_high < low, name
+    judged = PARTS["judged"]
+    for other in (part for name, part in PARTS.items() if name != "judged"):
+        assert not set(other.laws) & set(judged.laws)
+        assert not set(other.goals) & set(judged.goals)
+        assert other.ranges.keys() == judged.ranges.keys()
+        for name in judged.ranges:
+            for (low, high), (other_low, other_high) in product(judged.intervals(name), other.intervals(name)):
+                assert high < other_low or other_high < low, name
 
 
 def test_a_sample_of_forty_runs_is_diagnosed() -> None:
-    # Two runs of each cause, and six undisturbed ones.
-    results = list(diagnosed(corpus("judged", 2)))
-    assert len(results) == 40
+    # Two runs of each cause, and two undisturbed ones.
+    cases = corpus("judged", 2)[4:]
+    assert len(cases) == 40
+    for case in cases:
+        if case.code in ("open_loop", "joint_on_stop", "limit_cycle"):
+            # Stops are slow to simulate, also for the other runs of the same duration.
+            case.program.seconds = 8.0
+        elif case.program.seconds > 20.0:
+            case.program.seconds = 30.0
+    results = list(diagnosed(cases))
     missed = [(one.case.code, one.timing, one.control) for one in results if not one.found or one.wrong]
     assert len(missed) <= 1, missed
 
@@ -41,5 +48,4 @@ def test_error_rate_of_the_complete_corpus() -> None:
     assert sum(one.found for one in disturbed) >= 0.9 * len(disturbed)
     for code in {one.case.code for one in disturbed}:
         ours = [one for one in disturbed if one.case.code == code]
-        # Weak gains do not show their poll.
-        assert sum(one.found for one in ours) >= (0.75 if code == "previous_poll" else 0.9) * len(ours), code
+        assert sum(one.found for one in ours) >= 0.9 * len(ours), code

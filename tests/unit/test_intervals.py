@@ -126,7 +126,7 @@ def test_statistics_without_intervals_fit_a_terminal() -> None:
 def test_report_has_the_intervals_of_loop_stages_and_age(tmp_path: Path) -> None:
     report = measure(open_run(record(tmp_path / "run.mcap", Script(seconds=8.0, poll_ms=33.0))))
     plain = report.as_dict()
-    assert set(plain["intervals_ms"]) == {"loop", "age", *plain["stages_ms"]}
+    assert set(plain["intervals_ms"]) == {"loop", "age", "tick_lateness", *plain["stages_ms"]}
     for quantity in ("loop", "age"):
         for name, (low, high) in plain["intervals_ms"][quantity].items():
             assert low <= plain[f"{quantity}_ms"][name] <= (math.inf if high is None else high)

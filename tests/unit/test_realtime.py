@@ -4,8 +4,10 @@ import multiprocessing
 import os
 import struct
 import sys
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import pytest
 
@@ -47,6 +49,36 @@ def test_threads_get_short_slices_and_small_timer_slack() -> None:
     release = tuple(int(part) for part in os.uname().release.split(".")[:2])
     if release >= (6, 12):
         assert slices == [realtime.SLICE_NS, realtime.SLICE_NS]
+
+
+def _shares_its_core(connection: Connection) -> None:
+    """Half of the time another process has the only core."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    delay = realtime.RunDelay()
+    child = os.fork()
+    end = time.monotonic() + 0.2
+    while time.monotonic() < end:
+        pass
+    if not child:
+        os._exit(0)
+    shared_ns = delay.take()
+    os.waitpid(child, 0)
+    delay.take()
+    time.sleep(0.02)  # no time without a processor
+    connection.send((shared_ns, delay.take()))
+
+
+@pytest.mark.skipif(not Path("/proc/thread-self/schedstat").exists(), reason="this kernel does not count run delays")
+def test_run_delay_is_the_time_without_a_processor() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_shares_its_core, args=(theirs,))
+    process.start()
+    assert ours.poll(20)
+    shared_ns, slept_ns = ours.recv()
+    process.join(10)
+    assert shared_ns > 50_000_000
+    # A sleep is no time without a processor; waking up is.
+    assert slept_ns < shared_ns
 
 
 def _asked_for_realtime(connection: Connection) -> None:

@@ -1,6 +1,8 @@
 """Publishers and caches of a service: published bytes are recorded unchanged, and only the newest value is cached."""
 
 import platform
+from itertools import chain, repeat
+from types import SimpleNamespace
 
 import pytest
 
@@ -88,7 +90,7 @@ def test_service_token_exists_from_ready_to_close() -> None:
     assert hub.subscribers == []
 
 
-def test_health_report_is_published_once_a_second() -> None:
+def test_health_report_is_published_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     hub, clock = MemoryHub(), ManualClock()
     seen: list[Health] = []
     MemoryBus(hub).subscribe(HEALTH.key("lab", "*", "*"), lambda _, payload: seen.append(HEALTH.decode(payload)))
@@ -96,12 +98,17 @@ def test_health_report_is_published_once_a_second() -> None:
         service.counters.requests = 3
         service.counters.published = 500
         service.counters.latenesses_ns += range(101)
+        delays_ns = chain((70, 30, 5), repeat(0))
+        monkeypatch.setattr(service.health, "_run_delay", SimpleNamespace(take=lambda: next(delays_ns)))
+        # A late tick in the first second.
+        assert service.health.take_run_delay() == 70
         for _ in range(30):
             clock.advance(100_000_000)
             service.beat(clock.monotonic_ns())
         assert [health.requests for health in seen] == [3, 3, 3]
         assert (seen[0].lateness_p50_ns, seen[0].lateness_p99_ns, seen[0].lateness_max_ns) == (50, 99, 100)
         assert seen[1].lateness_max_ns == 0
+        assert [health.run_delay_ns for health in seen] == [100, 5, 0]
         # Rates are of the last second, counts since the start.
         assert [health.published_hz for health in seen] == pytest.approx([500, 0, 0], rel=0.01)
         assert (seen[0].service, seen[0].instance, seen[0].incarnation) == ("sim", "1", service.incarnation)

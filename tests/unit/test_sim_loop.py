@@ -142,12 +142,15 @@ def test_contact_of_the_quill_is_reported_once(rig: VirtualRig) -> None:
     assert "mm/s" in hit.text
 
 
-def test_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig) -> None:
+def test_stall_is_one_overrun_with_its_missed_steps(rig: VirtualRig, monkeypatch: pytest.MonkeyPatch) -> None:
     rig.tick(3)
+    monkeypatch.setattr(rig.service.health, "take_run_delay", lambda: 90_000_000)
     rig.clock.advance(130_000_000)
     state = rig.tick()
     assert state.missed_steps == 5
     assert state.step == 4
+    # Of a punctual tick it is not read.
+    assert (rig.states[-2].run_delay_ns, state.run_delay_ns) == (0, 90_000_000)
     (overrun,) = [event for event in rig.events if event.kind == Event.OVERRUN]
     assert overrun.overrun_data.missed_steps == 5
     # Lateness against the original deadline, not the one after the skipped steps.

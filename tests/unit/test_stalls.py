@@ -13,9 +13,9 @@ def bench() -> Bench:
     return bench
 
 
-def stall(bench: Bench, ms: int) -> None:
+def stall(bench: Bench, ms: int, run_delay_ms: int = 0) -> None:
     bench.clock.advance(ms * MS)
-    bench.device.report_stall(ms * MS, bench.clock.monotonic_ns())
+    bench.device.report_stall(ms * MS, run_delay_ms * MS, bench.clock.monotonic_ns())
 
 
 def reported(bench: Bench) -> list[tuple[int, int]]:
@@ -54,6 +54,16 @@ def test_stalls_of_a_second_are_reported_together(bench: Bench) -> None:
     assert bench.events[-1].text.startswith("the edge stalled 2 times, at most for 75 ms:")
     bench.wait(5000)
     assert len(reported(bench)) == 2
+
+
+def test_event_has_the_run_delay_of_the_longest_stall(bench: Bench) -> None:
+    bench.write(bench.connect(), 0, 1)
+    stall(bench, 60)
+    for ms, run_delay_ms in ((70, 65), (190, 170), (80, 80)):
+        stall(bench, ms, run_delay_ms)
+    bench.wait(1000)
+    last = [event.overrun_data for event in bench.events if event.kind == Event.OVERRUN][-1]
+    assert (last.lateness_ns, last.run_delay_ns) == (190 * MS, 170 * MS)
 
 
 def test_stalls_at_the_end_of_a_session_are_reported_before_it(bench: Bench) -> None:

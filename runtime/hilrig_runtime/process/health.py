@@ -14,7 +14,7 @@ from hilrig_runtime.bus.api import Publisher
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.process.discovery import ClockOffset
 from hilrig_runtime.timing.clock import Clock
-from hilrig_runtime.timing.realtime import realtime_priority
+from hilrig_runtime.timing.realtime import RunDelay, realtime_priority
 from hilrig_schemas import Health, PeerReport, RigReport
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
@@ -48,14 +48,25 @@ class HealthReporter:
         self._last_ns = self._start_ns
         self._last = (0, 0)
         self._rejected_due_ns = self._start_ns
+        self._run_delay, self._run_delay_ns = RunDelay(), 0
 
     def report_if_due(self, now_ns: int) -> None:
         """Publish a report if the last one is a second old; `now_ns`: monotonic clock."""
         if now_ns - self._last_ns >= REPORT_PERIOD_NS:
             self.report(now_ns)
 
+    def take_run_delay(self) -> int:
+        """Return the time since the last call or report in which this thread was ready and had no processor, ns.
+
+        0: none, or unknown on this system.
+        """
+        taken_ns = self._run_delay.take()
+        self._run_delay_ns += taken_ns
+        return taken_ns
+
     def report(self, now_ns: int) -> None:
         """Publish a report now."""
+        self.take_run_delay()
         counters = self.counters
         seconds = max(1, now_ns - self._last_ns) * 1e-9
         received, published = self._last
@@ -72,6 +83,7 @@ class HealthReporter:
             lateness_p50_ns=_percentile(latenesses, 0.50),
             lateness_p99_ns=_percentile(latenesses, 0.99),
             lateness_max_ns=latenesses[-1] if latenesses else 0,
+            run_delay_ns=self._run_delay_ns,
             clock_peer=clock.peer,
             clock_offset_ns=clock.offset_ns,
             clock_uncertainty_ns=clock.uncertainty_ns,
@@ -84,6 +96,7 @@ class HealthReporter:
             setattr(health, name, value if isinstance(value, str) else min(value, _MAX_COUNT))
         self._last = (counters.received, counters.published)
         self._last_ns = now_ns
+        self._run_delay_ns = 0
         self._publisher.put(health.SerializeToString())
         self._log_rejected(now_ns)
 

@@ -99,6 +99,30 @@ def lower_priority() -> None:
         Path("/proc/self/autogroup").write_text(str(BACKGROUND_NICE))
 
 
+class RunDelay:
+    """Time in which a thread was ready to run and had no processor, because other threads of the host had it.
+
+    Create and read it in that thread. The time in which a hypervisor gives the host no processor is not contained.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns = _run_delay_ns()
+
+    def take(self) -> int:
+        """Return the time since the last call, ns; 0: none, or unknown on this system."""
+        last_ns, self._last_ns = self._last_ns, _run_delay_ns()
+        return max(0, self._last_ns - last_ns)
+
+
+def _run_delay_ns() -> int:
+    """Time since the start of this thread, ns, from its `schedstat`; 0: unknown on this system."""
+    if sys.platform == "linux":
+        # A process that has reached its limit of open files must keep running; a kernel may have no such statistics.
+        with contextlib.suppress(OSError), open("/proc/thread-self/schedstat", "rb") as schedstat:  # noqa: PTH123  # in a real-time loop
+            return int(schedstat.read().split()[1])
+    return 0
+
+
 def freeze_gc() -> None:
     """Collect garbage once and exclude the existing objects from later collections, so that these are shorter."""
     gc.collect()

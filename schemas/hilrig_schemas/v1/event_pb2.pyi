@@ -168,14 +168,16 @@ class PartData(_message.Message):
     def __init__(self, part: _Optional[str] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ..., mass: _Optional[float] = ...) -> None: ...
 
 class OverrunData(_message.Message):
-    __slots__ = ("lateness_ns", "missed_steps", "stalls")
+    __slots__ = ("lateness_ns", "missed_steps", "stalls", "run_delay_ns")
     LATENESS_NS_FIELD_NUMBER: _ClassVar[int]
     MISSED_STEPS_FIELD_NUMBER: _ClassVar[int]
     STALLS_FIELD_NUMBER: _ClassVar[int]
+    RUN_DELAY_NS_FIELD_NUMBER: _ClassVar[int]
     lateness_ns: int
     missed_steps: int
     stalls: int
-    def __init__(self, lateness_ns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., stalls: _Optional[int] = ...) -> None: ...
+    run_delay_ns: int
+    def __init__(self, lateness_ns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., stalls: _Optional[int] = ..., run_delay_ns: _Optional[int] = ...) -> None: ...
 
 class ConfigurationData(_message.Message):
     __slots__ = ("text",)

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Health(_message.Message):
-    __slots__ = ("service", "instance", "incarnation", "wall_ns", "uptime_ns", "cpu_ns", "resident_bytes", "rigs", "ticks", "overruns", "missed_steps", "lateness_p50_ns", "lateness_p99_ns", "lateness_max_ns", "received_hz", "published_hz", "lost_transport", "lost_recorder", "queue_depth", "queue_capacity", "connections", "requests", "malformed", "refused", "recordings", "bytes_written", "alert", "host", "software_version", "clock_offset_ns", "clock_uncertainty_ns", "clock_peer", "rig_reports", "realtime_priority", "peers", "inaccurate_steps")
+    __slots__ = ("service", "instance", "incarnation", "wall_ns", "uptime_ns", "cpu_ns", "resident_bytes", "rigs", "ticks", "overruns", "missed_steps", "lateness_p50_ns", "lateness_p99_ns", "lateness_max_ns", "received_hz", "published_hz", "lost_transport", "lost_recorder", "queue_depth", "queue_capacity", "connections", "requests", "malformed", "refused", "recordings", "bytes_written", "alert", "host", "software_version", "clock_offset_ns", "clock_uncertainty_ns", "clock_peer", "rig_reports", "realtime_priority", "peers", "inaccurate_steps", "run_delay_ns")
     SERVICE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
@@ -44,6 +44,7 @@ class Health(_message.Message):
     REALTIME_PRIORITY_FIELD_NUMBER: _ClassVar[int]
     PEERS_FIELD_NUMBER: _ClassVar[int]
     INACCURATE_STEPS_FIELD_NUMBER: _ClassVar[int]
+    RUN_DELAY_NS_FIELD_NUMBER: _ClassVar[int]
     service: str
     instance: str
     incarnation: int
@@ -80,7 +81,8 @@ class Health(_message.Message):
     realtime_priority: int
     peers: _containers.RepeatedCompositeFieldContainer[PeerReport]
     inaccurate_steps: int
-    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., cpu_ns: _Optional[int] = ..., resident_bytes: _Optional[int] = ..., rigs: _Optional[int] = ..., ticks: _Optional[int] = ..., overruns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., lateness_p50_ns: _Optional[int] = ..., lateness_p99_ns: _Optional[int] = ..., lateness_max_ns: _Optional[int] = ..., received_hz: _Optional[float] = ..., published_hz: _Optional[float] = ..., lost_transport: _Optional[int] = ..., lost_recorder: _Optional[int] = ..., queue_depth: _Optional[int] = ..., queue_capacity: _Optional[int] = ..., connections: _Optional[int] = ..., requests: _Optional[int] = ..., malformed: _Optional[int] = ..., refused: _Optional[int] = ..., recordings: _Optional[int] = ..., bytes_written: _Optional[int] = ..., alert: _Optional[str] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., clock_offset_ns: _Optional[int] = ..., clock_uncertainty_ns: _Optional[int] = ..., clock_peer: _Optional[str] = ..., rig_reports: _Optional[_Iterable[_Union[RigReport, _Mapping]]] = ..., realtime_priority: _Optional[int] = ..., peers: _Optional[_Iterable[_Union[PeerReport, _Mapping]]] = ..., inaccurate_steps: _Optional[int] = ...) -> None: ...
+    run_delay_ns: int
+    def __init__(self, service: _Optional[str] = ..., instance: _Optional[str] = ..., incarnation: _Optional[int] = ..., wall_ns: _Optional[int] = ..., uptime_ns: _Optional[int] = ..., cpu_ns: _Optional[int] = ..., resident_bytes: _Optional[int] = ..., rigs: _Optional[int] = ..., ticks: _Optional[int] = ..., overruns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., lateness_p50_ns: _Optional[int] = ..., lateness_p99_ns: _Optional[int] = ..., lateness_max_ns: _Optional[int] = ..., received_hz: _Optional[float] = ..., published_hz: _Optional[float] = ..., lost_transport: _Optional[int] = ..., lost_recorder: _Optional[int] = ..., queue_depth: _Optional[int] = ..., queue_capacity: _Optional[int] = ..., connections: _Optional[int] = ..., requests: _Optional[int] = ..., malformed: _Optional[int] = ..., refused: _Optional[int] = ..., recordings: _Optional[int] = ..., bytes_written: _Optional[int] = ..., alert: _Optional[str] = ..., host: _Optional[str] = ..., software_version: _Optional[str] = ..., clock_offset_ns: _Optional[int] = ..., clock_uncertainty_ns: _Optional[int] = ..., clock_peer: _Optional[str] = ..., rig_reports: _Optional[_Iterable[_Union[RigReport, _Mapping]]] = ..., realtime_priority: _Optional[int] = ..., peers: _Optional[_Iterable[_Union[PeerReport, _Mapping]]] = ..., inaccurate_steps: _Optional[int] = ..., run_delay_ns: _Optional[int] = ...) -> None: ...
 
 class PeerReport(_message.Message):
     __slots__ = ("service", "host", "silent_ns")

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class JointState(_message.Message):
-    __slots__ = ("rig", "session", "incarnation", "step", "sampled_ns", "wall_ns", "lateness_ns", "missed_steps", "position", "velocity", "effort", "external_force_z", "external_torque_z", "integration_error", "magnet", "held_part", "parts", "limit_flags", "command_seq", "safe", "basis_step", "command_arrived_ns", "loop_latency_ns", "substeps")
+    __slots__ = ("rig", "session", "incarnation", "step", "sampled_ns", "wall_ns", "lateness_ns", "missed_steps", "position", "velocity", "effort", "external_force_z", "external_torque_z", "integration_error", "magnet", "held_part", "parts", "limit_flags", "command_seq", "safe", "basis_step", "command_arrived_ns", "loop_latency_ns", "substeps", "run_delay_ns")
     RIG_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     INCARNATION_FIELD_NUMBER: _ClassVar[int]
@@ -32,6 +32,7 @@ class JointState(_message.Message):
     COMMAND_ARRIVED_NS_FIELD_NUMBER: _ClassVar[int]
     LOOP_LATENCY_NS_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
+    RUN_DELAY_NS_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
     incarnation: int
@@ -56,7 +57,8 @@ class JointState(_message.Message):
     command_arrived_ns: int
     loop_latency_ns: int
     substeps: int
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., incarnation: _Optional[int] = ..., step: _Optional[int] = ..., sampled_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., lateness_ns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., effort: _Optional[_Iterable[float]] = ..., external_force_z: _Optional[float] = ..., external_torque_z: _Optional[float] = ..., integration_error: _Optional[_Iterable[float]] = ..., magnet: _Optional[bool] = ..., held_part: _Optional[str] = ..., parts: _Optional[_Iterable[_Union[PartState, _Mapping]]] = ..., limit_flags: _Optional[int] = ..., command_seq: _Optional[int] = ..., safe: _Optional[bool] = ..., basis_step: _Optional[int] = ..., command_arrived_ns: _Optional[int] = ..., loop_latency_ns: _Optional[int] = ..., substeps: _Optional[int] = ...) -> None: ...
+    run_delay_ns: int
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., incarnation: _Optional[int] = ..., step: _Optional[int] = ..., sampled_ns: _Optional[int] = ..., wall_ns: _Optional[int] = ..., lateness_ns: _Optional[int] = ..., missed_steps: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., effort: _Optional[_Iterable[float]] = ..., external_force_z: _Optional[float] = ..., external_torque_z: _Optional[float] = ..., integration_error: _Optional[_Iterable[float]] = ..., magnet: _Optional[bool] = ..., held_part: _Optional[str] = ..., parts: _Optional[_Iterable[_Union[PartState, _Mapping]]] = ..., limit_flags: _Optional[int] = ..., command_seq: _Optional[int] = ..., safe: _Optional[bool] = ..., basis_step: _Optional[int] = ..., command_arrived_ns: _Optional[int] = ..., loop_latency_ns: _Optional[int] = ..., substeps: _Optional[int] = ..., run_delay_ns: _Optional[int] = ...) -> None: ...
 
 class PartState(_message.Message):
     __slots__ = ("name", "x", "y", "z", "yaw", "vx", "vy", "vz")

@@ -293,8 +293,9 @@ class EdgeService:
             # Lateness against the original deadline: `lateness_ns` is against the one after the skipped periods.
             late_ns = tick.lateness_ns + tick.missed_steps * TICK_NS
             if late_ns > TICK_NS:
+                run_delay_ns = service.health.take_run_delay()
                 for endpoint in self._endpoints.values():
-                    endpoint.device.report_stall(late_ns, monotonic_ns())
+                    endpoint.device.report_stall(late_ns, run_delay_ns, monotonic_ns())
             for number, endpoint in enumerate(list(self._endpoints.values())):
                 if number and number % RIGS_PER_TURN == 0:
                     await asyncio.sleep(0)

@@ -97,6 +97,7 @@ class Simulation:
             wall_ns=wall_ns,
             lateness_ns=sampled_ns - tick.deadline_ns,
             missed_steps=tick.missed_steps,
+            run_delay_ns=self._service.health.take_run_delay() if overrun else 0,
         ).SerializeToString()
         # Most new commands are based on the same state.
         latencies_ns = {basis: sampled_ns - (times.get(basis) or sampled_ns) for basis in {r.basis_step for r in rigs}}

@@ -18,6 +18,7 @@ _SERVICE_METRICS: Final[tuple[tuple[str, str, str, str, float], ...]] = (
     ("lateness_p50_seconds", "gauge", "Tick lateness in the last second, p50.", "lateness_p50_ns", 1e-9),
     ("lateness_p99_seconds", "gauge", "Tick lateness in the last second, p99.", "lateness_p99_ns", 1e-9),
     ("lateness_max_seconds", "gauge", "Tick lateness in the last second, maximum.", "lateness_max_ns", 1e-9),
+    ("run_delay_seconds", "gauge", "Time without a processor in the last second.", "run_delay_ns", 1e-9),
     ("realtime_priority", "gauge", "SCHED_FIFO priority; 0: ordinary policy.", "realtime_priority", 1),
     ("received_per_second", "gauge", "Messages received.", "received_hz", 1),
     ("published_per_second", "gauge", "Messages published.", "published_hz", 1),

@@ -176,10 +176,13 @@ class Device:
         text = f"{address}: connection to {self.rig} refused: {reason}{repeat_suffix(count)}"
         self._events.emit_for_controller(Event.CONNECTION_REFUSED, Event.WARNING, text, address, reason=reason)
 
-    def report_stall(self, late_ns: int, now_ns: int) -> None:
-        """Report a tick of the edge that is late by more than its period, if a session is open; ns, monotonic clock."""
+    def report_stall(self, late_ns: int, run_delay_ns: int, now_ns: int) -> None:
+        """Report a tick of the edge that is late by more than its period, if a session is open; ns, monotonic clock.
+
+        `run_delay_ns`: the part of it in which the edge was ready to run and had no processor.
+        """
         if self.session is not None:
-            self._write_access.stalls.record(late_ns, now_ns)
+            self._write_access.stalls.record(late_ns, run_delay_ns, now_ns)
 
     def connections_of(self, host: str) -> int:
         """Return the number of connections of a host."""

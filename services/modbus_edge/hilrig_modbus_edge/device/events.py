@@ -160,13 +160,18 @@ class StallReporter:
     def __init__(self, events: EventEmitter) -> None:
         self._events = events
         self._rate_limiter: RateLimiter[None] = RateLimiter(STALL_EVENT_PERIOD_NS)
-        self._count = self._longest_ns = 0
-        """Of the stalls that were not reported yet."""
+        self._count = 0
+        """Number of the stalls that were not reported yet."""
+        self._longest = (0, 0)
+        """Their longest, and the part of it without a processor, ns."""
 
-    def record(self, late_ns: int, now_ns: int) -> None:
-        """Record a stall, and report it if that is due; ns, monotonic clock."""
+    def record(self, late_ns: int, run_delay_ns: int, now_ns: int) -> None:
+        """Record a stall, and report it if that is due; ns, monotonic clock.
+
+        `run_delay_ns`: the part of it in which the edge was ready to run and had no processor.
+        """
         self._count += 1
-        self._longest_ns = max(self._longest_ns, late_ns)
+        self._longest = max(self._longest, (late_ns, min(run_delay_ns, late_ns)))
         if self._rate_limiter.record(None, now_ns):
             self.flush()
 
@@ -180,11 +185,10 @@ class StallReporter:
         if not self._count:
             return
         times = "once" if self._count == 1 else f"{self._count} times, at most"
-        text = (
-            f"the edge stalled {times} for {self._longest_ns / MS:.0f} ms: its host was overloaded, or it was stopped"
-        )
+        longest_ns, run_delay_ns = self._longest
+        text = f"the edge stalled {times} for {longest_ns / MS:.0f} ms: its host was overloaded, or it was stopped"
         event = self._events.event(Event.OVERRUN, Event.WARNING, text)
-        event.overrun_data.lateness_ns = self._longest_ns
+        event.overrun_data.lateness_ns, event.overrun_data.run_delay_ns = longest_ns, run_delay_ns
         event.overrun_data.stalls = self._count
         self._events.emit(event)
-        self._count = self._longest_ns = 0
+        self._count, self._longest = 0, (0, 0)

@@ -123,7 +123,7 @@ def print_report(report: "LatencyReport") -> None:
         table.add_section()
     if report.age_ms is not None:
         table.add_row("age", *cells(report.age_ms, report.intervals_ms["age"]), style="bold", end_section=True)
-    table.add_row("tick lateness", *cells(report.jitter_ms.tick_lateness))
+    table.add_row("tick lateness", *cells(report.jitter_ms.tick_lateness, report.intervals_ms["tick_lateness"]))
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "
     lost = f"lost: {report.lost.transport} in transport, {report.lost.recorder} in the recorder"

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,7 +12,7 @@ from hilrig_replay.analysis.age import LoopAge
 from hilrig_replay.analysis.distribution import Statistics, median
 from hilrig_replay.analysis.stages import ALL_STAGES
 from hilrig_replay.io.columns import Rows
-from hilrig_replay.io.disk_table import DiskTable
+from hilrig_replay.io.disk_table import Blocks, DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Losses, Run
 from hilrig_replay.io.sequence_order import Repairs
@@ -34,6 +34,8 @@ MAX_BACKLOG_NS: Final = 1_000_000_000
 WALL_CLOCK_STEP_NS: Final = 10_000_000
 """Change of wall clock minus monotonic clock between two states that counts as a clock step; slewing changes it by
 microseconds."""
+MIN_STARVED_SHARE: Final = 0.5
+"""Smallest part of a stall without a processor from which the other programs of the host are its cause."""
 
 _TICK: Final = np.dtype([("lateness_ns", "<i8")])
 _WRITE: Final = np.dtype([("cycle_ns", "<i8")])
@@ -95,6 +97,26 @@ class Stalls:
     """0: not known."""
     area_ns2: float = 0.0
     """Integral over time of the age that grew during the stalls: half the sum of their squared lengths."""
+    run_delay_ns: int = 0
+    """Part of the longest stall in which the service was ready to run and had no processor."""
+    starved_area_ns2: float = 0.0
+    """`area_ns2` of the stalls of which this part is at least `MIN_STARVED_SHARE`."""
+
+    @property
+    def starved(self) -> bool:
+        """Whether the stalls are above all times without a processor."""
+        return self.count > 0 and self.starved_area_ns2 >= 0.5 * self.area_ns2
+
+    def __add__(self, other: "Stalls") -> "Stalls":
+        """All stalls of both."""
+        longest = other if other.longest_ns > self.longest_ns else self
+        return replace(
+            longest,
+            count=self.count + other.count,
+            shortest_ns=min(filter(None, (self.shortest_ns, other.shortest_ns)), default=0),
+            area_ns2=self.area_ns2 + other.area_ns2,
+            starved_area_ns2=self.starved_area_ns2 + other.starved_area_ns2,
+        )
 
     def __str__(self) -> str:
         """Count and length as text."""
@@ -227,29 +249,37 @@ class DataQuality:
                 self.watchdog_gaps += self._tripped
                 self._tripped = False
             elif event["kind"] == "OVERRUN" and event["source"].startswith("edge/"):
-                stalls, stalled_ns = self.edge_stalls, message.overrun_data.lateness_ns
-                longest_ns, at_ns = stalls.longest_ns, stalls.at_ns
-                if stalled_ns > longest_ns:
-                    longest_ns, at_ns = stalled_ns, int(event["wall_ns"]) - self._run.start_wall_ns - stalled_ns
-                shortest_ns = min(stalls.shortest_ns or stalled_ns, stalled_ns)
+                data, stalled_ns = message.overrun_data, message.overrun_data.lateness_ns
+                at_ns = int(event["wall_ns"]) - self._run.start_wall_ns - stalled_ns
                 # Stalls within a second are one event.
-                count = max(1, message.overrun_data.stalls)
-                area_ns2 = stalls.area_ns2 + count * float(stalled_ns) ** 2 / 2
-                self.edge_stalls = Stalls(stalls.count + count, longest_ns, at_ns, shortest_ns, area_ns2)
+                count = max(1, data.stalls)
+                area_ns2 = count * float(stalled_ns) ** 2 / 2
+                starved_area_ns2 = area_ns2 * (data.run_delay_ns >= MIN_STARVED_SHARE * stalled_ns)
+                self.edge_stalls += Stalls(
+                    count, stalled_ns, at_ns, stalled_ns, area_ns2, data.run_delay_ns, starved_area_ns2
+                )
                 self._edge_overruns += 1
 
     def _add_stalls(self, states: Rows, lateness: NDArray[np.int64]) -> None:
-        stalls, worst = self.stalls, int(np.argmax(lateness))
-        count = stalls.count + int((lateness > self._run.step_ns).sum())
-        longest_ns, at_ns = stalls.longest_ns, stalls.at_ns
-        if lateness[worst] > max(longest_ns, self._run.step_ns):
-            longest_ns, at_ns = int(lateness[worst]), int(self._run.time_ns(states[worst : worst + 1])[0])
-        late_ns = lateness[lateness > self._run.step_ns].astype(np.float64)
-        self.stalls = Stalls(count, longest_ns, at_ns, area_ns2=stalls.area_ns2 + float((late_ns**2).sum()) / 2)
+        late = lateness > self._run.step_ns
+        if not late.any():
+            return
+        worst = int(np.argmax(lateness))
+        areas_ns2 = lateness[late].astype(np.float64) ** 2 / 2
+        starved = states["run_delay_ns"][late] >= MIN_STARVED_SHARE * lateness[late]
+        self.stalls += Stalls(
+            int(late.sum()),
+            int(lateness[worst]),
+            int(self._run.time_ns(states[worst : worst + 1])[0]),
+            area_ns2=float(areas_ns2.sum()),
+            run_delay_ns=int(states["run_delay_ns"][worst]),
+            starved_area_ns2=float(areas_ns2[starved].sum()),
+        )
 
-    def lateness(self) -> Statistics:
-        """Statistics of the lateness of all ticks."""
-        return Statistics.of(self._ticks.column("lateness_ns"))
+    @property
+    def latenesses_ns(self) -> Blocks:
+        """Lateness of all ticks, ns."""
+        return self._ticks.column("lateness_ns")
 
     def cycle_ns(self) -> float:
         """Median time between two writes of a controller at the edge, ns; 0: fewer than two writes."""

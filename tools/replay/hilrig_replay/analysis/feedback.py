@@ -44,6 +44,9 @@ MIN_ERROR_VARIANCE: Final = 0.002
 """Smallest variance of the rounding errors of a block; that of a moving joint is 1/12."""
 MAX_POLLS: Final = 3
 """Number of earlier polls that are compared with the newest one."""
+KNOWN_POLLS: Final = 6
+"""Number of polls whose exact positions explain a torque: a law of the previous poll with a velocity over three polls
+needs five. Polls answer states at irregular distances, so a trend in time does not replace the positions."""
 MIN_GAIN_STATISTIC: Final = 25.0
 """Squared ratio of the largest gain to its standard error from which the gains are significant."""
 MIN_GAIN_RATIO: Final = 0.4
@@ -107,7 +110,8 @@ class RoundingGains:
         if not statistics.max() >= MIN_GAIN_STATISTIC:
             return None
         used = (gains >= MIN_GAIN_RATIO * gains.max()) & (statistics >= MIN_GAIN_STATISTIC / 2)
-        return int(np.argmax(used))
+        # Older gains may contain those of still older polls, but not a smaller error.
+        return int(np.argmax(used | (statistics == statistics.max())))
 
 
 def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
@@ -126,13 +130,13 @@ def rounding_gains(windows: Iterable[tuple[Rows, Rows]]) -> RoundingGains:
             older.append(lagged[:, MAX_POLLS:])
             # A poll that returned the state of the one before can't be distinguished from it.
             fresh = np.flatnonzero(steps > 0)
-            fresh = fresh[fresh >= MAX_POLLS]
+            fresh = fresh[fresh >= KNOWN_POLLS - 1]
             rows = fresh[: len(fresh) // GAIN_BLOCK_COMMANDS * GAIN_BLOCK_COMMANDS].reshape(-1, GAIN_BLOCK_COMMANDS)
             if not len(rows):
                 continue
             error = np.rint(position) - position
             for joint in range(4):
-                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(MAX_POLLS + 1)])
+                known = _basis_of_known(time_s[rows], [position[rows - lag, joint] for lag in range(KNOWN_POLLS)])
                 unexplained = _without(known, torque[rows, joint])
                 errors = _without(known, np.stack([error[rows - lag, joint] for lag in range(MAX_POLLS + 1)], axis=-1))
                 # The variance without the part that the errors explain, which may be most of it.

@@ -65,8 +65,8 @@ class LatencyReport:
     stages_ms: dict[str, Statistics]
     """By the key of each of `stages`."""
     intervals_ms: dict[str, dict[str, Interval]]
-    """95 % confidence intervals of the percentiles of `loop`, each stage and `age`, by percentile (`intervals.SHARES`);
-    an infinite bound is not supported by the samples."""
+    """95 % confidence intervals of the percentiles of `loop`, each stage, `age` and `tick_lateness`, by percentile
+    (`intervals.SHARES`); an infinite bound is not supported by the samples."""
     age_ms: Statistics | None
     """Age of the loop at each step; None: no command that is based on a state took effect."""
     control_period_ms: float | None
@@ -194,7 +194,8 @@ def measure(
     table.finish()
     ages.finish()
     age, loop, stages, spread = ages.statistics(), None, {}, 0.0
-    intervals: dict[str, dict[str, Interval]] = {}
+    lateness = Statistics.of(quality.latenesses_ns)
+    intervals = {"tick_lateness": _intervals_ms(quality.latenesses_ns)}
     windows = windows_of(run)
     other_connection = _share(table, "basis_on_other_connection") >= 0.5
     client_role = _share(table, "polled") >= 0.5
@@ -208,7 +209,7 @@ def measure(
         stages = {stage.key: Statistics.of(table.column(stage.key)) for stage in role_stages}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
-        intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *stages)}
+        intervals |= {name: _intervals_ms(table.column(name)) for name in ("loop", *stages)}
     if age is not None:
         intervals["age"] = _intervals_ms(ages.ages_ns)
     stalled = edge_stalls(quality.edge_stalls, table, windows, run.time_ns)
@@ -225,6 +226,7 @@ def measure(
         windows=windows,
         duration_s=run.duration_s,
         client_role=client_role,
+        other_connection=other_connection,
         age=age,
         stalls=quality.stalls,
         edge_stalls=stalled,
@@ -256,7 +258,7 @@ def measure(
         device_scan=device_scan(np.concatenate([window.commands for window in windows])),
         older_positions=older_positions(evidence.gains, run.step_ns) if is_bound else None,
         network=network,
-        jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
+        jitter_ms=Jitter(loop.std if loop else 0.0, spread, lateness),
         lost=quality.lost(),
         repaired=quality.repairs,
         fit=not reasons,

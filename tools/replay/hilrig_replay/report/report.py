@@ -317,7 +317,7 @@ def _latency(summary: RunSummary) -> str:
         rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in latency.stages]
     if latency.age_ms is not None:
         rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
-    rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])
+    rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness, latency.intervals_ms["tick_lateness"])])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'
         if latency.fit

@@ -56,6 +56,8 @@ REST_S: Final = 0.1
 """A joint that rests for this time before a turning point does not oscillate."""
 REST_SHARE: Final = 0.06
 """Share of the largest speed of a move; a joint that is slower at its end rests."""
+MIN_REST_SHARE: Final = 0.12
+"""Shortest rest before a move, as a share of the move's duration: a sum of sines is slow for 4 % of a swing."""
 MIN_MOVES: Final = 3
 MIN_MOVE: Final = 8.0
 """° or mm."""
@@ -294,12 +296,25 @@ def _overshoots(stretch: Rows, joint: int, step_s: float) -> Iterator[float]:
         if abs(move) < 0.5 * abs(position[peak, other] - position[before, other]):
             # Joints 1 and 2 move each other.
             continue
-        slow = max(REST_SPEED, REST_SHARE * float(np.abs(speed[before:peak]).max(initial=0.0)))
+        fastest = float(np.abs(speed[before:peak]).max(initial=0.0))
+        if _rest(np.abs(speed), int(before), REST_SHARE * fastest) < MIN_REST_SHARE * (peak - before):
+            # It did not rest before: a periodic set point.
+            continue
+        slow = max(REST_SPEED, REST_SHARE * fastest)
         if (np.abs(speed[max(int(peak - REST_S / step_s), 0) : peak]) < slow).all():
             # It rested, and then turned to another set point.
             continue
         beyond = abs(returned) / (1 + abs(again) / abs(returned))
         yield beyond / (abs(move) - beyond)
+
+
+def _rest(speed: Floats, at: int, slow: float) -> int:
+    """Number of consecutive rows around a row, (n,), with less than a speed."""
+    fast = np.flatnonzero(speed >= slow)
+    after = int(np.searchsorted(fast, at))
+    begin = int(fast[after - 1]) + 1 if after else 0
+    end = int(fast[after]) if after < len(fast) else len(speed)
+    return end - begin
 
 
 def noise_amplification(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Finding]:  # noqa: ARG001

@@ -15,7 +15,7 @@ from hilrig_replay.analysis.data_quality import Stalls
 from hilrig_replay.analysis.feedback import MAX_POLLS, RoundingGains
 from hilrig_replay.analysis.samples import SAMPLE_DTYPE
 from hilrig_replay.analysis.stages import TICK_WAIT
-from hilrig_replay.io.columns import Rows, last_of_each_read
+from hilrig_replay.io.columns import Rows, written
 from hilrig_replay.io.disk_table import DiskTable
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
@@ -28,6 +28,8 @@ MAX_WINDOWS: Final = 6
 """Maximum number of windows, evenly spread over a run, whose messages are examined."""
 PROGRAM_NS: Final = 1_000_000
 """Time between reading and writing that is no cause: a request of a small program on the same host."""
+NO_PAUSE_NS: Final = 3 * MS
+"""Time between a write and the next request of a program that does not wait there."""
 
 NO_STALLS: Final = Stalls()
 DEFAULT_ARM: Final = ArmParameters()
@@ -36,8 +38,8 @@ NO_GAINS: Final = RoundingGains(np.zeros((4, MAX_POLLS + 1)), np.zeros((4, MAX_P
 Floats = NDArray[np.float64]
 
 CYCLE_DTYPE: Final = np.dtype([("held_ns", "<f8"), ("pause_ns", "<f8"), ("cycle_ns", "<f8")])
-"""One row per control cycle. `held_ns`: from the last read to the last write that follows it; `pause_ns`: from that
-write to the next read; `cycle_ns`: from that write to the next one."""
+"""One row per control cycle. `held_ns`: from the last read to the write that answers it; `pause_ns`: from that write to
+the next read; `cycle_ns`: from that write to the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,8 @@ class Evidence:
     duration_s: float
     client_role: bool = False
     """Whether the edge was the client of the controller."""
+    other_connection: bool = False
+    """Whether positions are read on another connection than torques are written."""
     age: LoopAge | None = None
     """None: no command that is based on a state took effect."""
     stalls: Stalls = NO_STALLS
@@ -133,7 +137,7 @@ def windows_of(run: Run) -> list[Records]:
 
 
 def _cycles(commands: Rows) -> Rows:
-    last = last_of_each_read(commands)
+    last = _answers(written(commands))
     cycles = np.empty(max(len(last) - 1, 0), CYCLE_DTYPE)
     if not len(cycles):
         return cycles
@@ -142,6 +146,24 @@ def _cycles(commands: Rows) -> Rows:
     cycles["cycle_ns"] = np.diff(last["write_arrived_ns"])
     same = last["session"][1:] == last["session"][:-1]
     return np.asarray(cycles[same & (cycles["cycle_ns"] > 0) & (cycles["held_ns"] >= 0)])
+
+
+def _answers(commands: Rows) -> Rows:
+    """The write that answers each read: of several ones at once, such as one a register, the last.
+
+    A later write without another read repeats or updates the torques.
+    """
+    if not len(commands):
+        return commands
+    first = np.diff(commands["state_served_ns"], prepend=commands["state_served_ns"][:1] - 1) != 0
+    begin = np.flatnonzero(first)[np.cumsum(first) - 1]
+    answered_ns = (commands["write_received_ns"] - commands["state_served_ns"])[begin]
+    apart_ns = np.diff(commands["write_arrived_ns"], prepend=commands["write_arrived_ns"][:1])
+    later = ~first & (apart_ns > answered_ns + NO_PAUSE_NS)
+    # All writes of a read from the first later one on.
+    count = np.cumsum(later)
+    at_once = commands[count == count[begin]]
+    return np.asarray(at_once[np.append(np.diff(at_once["state_served_ns"]) != 0, True)])
 
 
 def controlled(evidence: Evidence) -> list[Rows]:

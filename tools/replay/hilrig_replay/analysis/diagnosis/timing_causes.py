@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from hilrig_replay.analysis.diagnosis.evidence import MS, PROGRAM_NS, Evidence, Finding, Floats
+from hilrig_replay.analysis.diagnosis.evidence import MS, NO_PAUSE_NS, PROGRAM_NS, Evidence, Finding, Floats
 from hilrig_replay.analysis.stages import CONTROLLER, INJECTED, REGISTER_WAIT, TICK_WAIT
 from hilrig_replay.io.columns import Rows
 
@@ -31,15 +31,22 @@ MAX_WAIT_SPREAD: Final = 0.02
 """Largest interquartile range of a wait, as a share of it: computations vary more."""
 MAX_ROUND_WAIT_SPREAD: Final = 0.06
 """The same for a wait of a multiple of `ROUND_NS`, as programs contain it."""
+MAX_TIMER_SPREAD: Final = 0.2
+"""The same if the cycle is kept with absolute deadlines."""
+MIN_CORRECTION: Final = 0.2
+"""Smallest negative correlation of consecutive cycles with absolute deadlines, for which −0.5 is expected."""
+MIN_DRIFT_SHARE: Final = 0.2
+"""Smallest interquartile range of the time between reading and writing, as a share of the cycle, that is no constant
+phase."""
 ROUND_NS: Final = 5 * MS
 MAX_OVERSLEPT_NS: Final = 1.2 * MS
 """Largest time by which a wait is longer than requested, with the time of the requests."""
-NO_PAUSE_NS: Final = 3 * MS
-"""Time between a write and the next read of a program that does not wait there."""
 ACK_DELAYS_NS: Final = ((39 * MS, 46 * MS), (195 * MS, 215 * MS))
 """Ranges of TCP's delayed-acknowledgment timeout: 40 ms on Linux, 200 ms on Windows."""
 MIN_RTT_NS: Final = 1 * MS
 """Smallest round-trip time of a network that is a cause."""
+MAX_ANSWER_SHARE: Final = 0.5
+"""Mean time in which reads are answered, as a share of that between reading and writing, below which writes repeat."""
 PAUSE_RATIO: Final = 2.5
 """Ratio to the median cycle from which a cycle is a pause."""
 RETRANSMISSION_WINDOW_NS: Final = 1.5e9
@@ -136,6 +143,18 @@ def delayed_acknowledgement(evidence: Evidence) -> Finding | None:
 def wait_before_write(evidence: Evidence) -> Finding | None:
     """A program that reads, waits, and then writes."""
     cycles = evidence.cycles()
+    if _reads_unsynchronized(evidence, cycles):
+        held_ns = float(cycles["held_ns"].mean())
+        return _cause(
+            evidence,
+            "wait_before_write",
+            f"positions wait {held_ns / MS:.0f} ms on average before the torques are written: they are read on another "
+            "connection, and the times of reading and writing are not related",
+            "read, compute and write in one thread, then wait",
+            evidence.saved_ns(lambda rows: _computing_ns(evidence, rows)),
+            wait_ms=held_ns / MS,
+            cycle_ms=_median(cycles["cycle_ns"]) / MS,
+        )
     if not _waits_before_writing(evidence, cycles):
         return None
     held_ns = _median(cycles["held_ns"]) - evidence.min_rtt_ns
@@ -161,7 +180,24 @@ def _waits_before_writing(evidence: Evidence, cycles: Rows) -> bool:
     if held < MIN_DELAY_NS or _median(cycles["pause_ns"]) - evidence.min_rtt_ns > max(NO_PAUSE_NS, 0.1 * held):
         return False
     spread = (high - low) / held
+    if _keeps_deadlines(cycles["cycle_ns"]):
+        return bool(spread < MAX_TIMER_SPREAD)
     return bool(spread < (MAX_ROUND_WAIT_SPREAD if _is_round(held) else MAX_WAIT_SPREAD))
+
+
+def _keeps_deadlines(cycle_ns: Floats) -> bool:
+    """Whether cycles are kept with absolute deadlines: after a long one, the next is shorter."""
+    moved = np.minimum(cycle_ns, PAUSE_RATIO * _median(cycle_ns))
+    moved = moved - moved.mean()
+    return bool((moved[1:] * moved[:-1]).sum() < -MIN_CORRECTION * (moved**2).sum())
+
+
+def _reads_unsynchronized(evidence: Evidence, cycles: Rows) -> bool:
+    """Whether one thread reads and another one writes, so that the time between them drifts."""
+    if not evidence.other_connection or len(cycles) < 10:
+        return False
+    low, high = np.percentile(cycles["held_ns"], (25, 75))
+    return bool(high - low >= MIN_DRIFT_SHARE * _median(cycles["cycle_ns"]))
 
 
 def _is_round(wait_ns: float) -> bool:
@@ -174,12 +210,19 @@ def _computing_ns(evidence: Evidence, rows: Rows) -> Floats:
     return np.where(spent_ns > MIN_DELAY_NS, spent_ns - PROGRAM_NS, 0.0)
 
 
+def _writes_without_reading(evidence: Evidence, cycles: Rows) -> bool:
+    """Whether the torques are older than the time in which a read is answered: most writes follow no read."""
+    if not len(cycles) or not len(evidence.samples):
+        return False
+    spent_ns = sum(float(values.sum()) for values in evidence.samples.column(CONTROLLER.key)()) / len(evidence.samples)
+    return bool(cycles["held_ns"].mean() < MAX_ANSWER_SHARE * spent_ns)
+
+
 def computing_time(evidence: Evidence) -> Finding | None:
     """A long time between reading and writing."""
-    gain_ns = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows))
-    if not gain_ns:
+    gain_ns, cycles = evidence.saved_ns(lambda rows: _computing_ns(evidence, rows)), evidence.cycles()
+    if not gain_ns or _writes_without_reading(evidence, cycles):
         return None
-    cycles = evidence.cycles()
     spent_ns = (cycles["held_ns"] if len(cycles) else evidence.samples[CONTROLLER.key]) - evidence.min_rtt_ns
     spent_ns = spent_ns[spent_ns > MIN_DELAY_NS]
     if not len(spent_ns):
@@ -209,10 +252,11 @@ def slow_polling(evidence: Evidence) -> Finding | None:
     # A torque is held for a cycle: on average it is half of the additional steps older.
     gain_ns = (cycle_ns - max(cycle_ns - pause_ns, step_ns)) / 2
     age = f", the mean age {evidence.mean_age_ns / MS:.0f} ms" if evidence.age else ""
+    repeats = ", and writes again without reading" if _writes_without_reading(evidence, cycles) else ""
     return _cause(
         evidence,
         "slow_polling",
-        f"the program polls every {cycle_ns / MS:.0f} ms; the step is {step_ns / MS:g} ms{age}",
+        f"the program polls every {cycle_ns / MS:.0f} ms{repeats}; the step is {step_ns / MS:g} ms{age}",
         f"poll at least every {step_ns / MS:g} ms",
         gain_ns,
         cycle_ms=cycle_ns / MS,
@@ -275,7 +319,7 @@ def retransmissions(evidence: Evidence) -> Finding | None:
 def edge_stall(evidence: Evidence) -> Finding | None:
     """Stalls of the Modbus edge."""
     stalls = evidence.edge_stalls
-    if not stalls.count:
+    if not stalls.count or stalls.starved:
         return None
     longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return _cause(
@@ -293,7 +337,7 @@ def edge_stall(evidence: Evidence) -> Finding | None:
 def simulation_stall(evidence: Evidence) -> Finding | None:
     """Ticks that were more than one step late."""
     stalls = evidence.stalls
-    if not stalls.count:
+    if not stalls.count or stalls.starved:
         return None
     longest_ms, at_s = stalls.longest_ns / MS, stalls.at_ns / 1e9
     return _cause(
@@ -306,6 +350,29 @@ def simulation_stall(evidence: Evidence) -> Finding | None:
         stalls=float(stalls.count),
         longest_ms=longest_ms,
         at_s=at_s,
+    )
+
+
+def cpu_steal(evidence: Evidence) -> Finding | None:
+    """Stalls in which a service was ready to run, and the host gave its processors to other programs."""
+    services = (("simulation", evidence.stalls), ("Modbus edge", evidence.edge_stalls))
+    starved = [(name, stalls) for name, stalls in services if stalls.starved]
+    if not starved:
+        return None
+    name, longest = max(starved, key=lambda one: one[1].longest_ns)
+    count, names = sum(stalls.count for _, stalls in starved), " and ".join(f"the {name}" for name, _ in starved)
+    longest_ms, waited_ms = longest.longest_ns / MS, min(longest.run_delay_ns, longest.longest_ns) / MS
+    return _cause(
+        evidence,
+        "cpu_steal",
+        f"other programs of the host took the processor of {names} {_times(count)}: the {name} was ready to run for "
+        f"{waited_ms:.0f} of the {longest_ms:.0f} ms of its longest stall",
+        "end the other programs, or run the services with real-time priority (hilrig doctor)",
+        _per_time(evidence, sum(stalls.area_ns2 for _, stalls in starved)),
+        stalls=float(count),
+        longest_ms=longest_ms,
+        run_delay_ms=waited_ms,
+        at_s=longest.at_ns / 1e9,
     )
 
 
@@ -385,6 +452,25 @@ def watchdog_gaps(evidence: Evidence) -> Finding | None:
     return Finding("timing", "watchdog_gaps", text, remedy, None, values)
 
 
+def controller_pauses(evidence: Evidence) -> Finding | None:
+    """Times without a write that are much longer than the cycle."""
+    cycles = evidence.cycles()["cycle_ns"]
+    paused = cycles[cycles > max(PAUSE_RATIO * _median(cycles), PAUSE_RATIO * evidence.step_ns)]
+    if not len(paused):
+        return None
+    longest_ms = float(paused.max()) / MS
+    return _cause(
+        evidence,
+        "controller_pauses",
+        f"the controller did not write for up to {longest_ms:.0f} ms: {len(paused)} of {len(cycles)} cycles were more "
+        f"than {PAUSE_RATIO:g} times as long as usual",
+        "write in each cycle; without waiting for other connections, files or the garbage collection",
+        float((paused**2).sum()) / 2 / float(cycles.sum()),
+        pauses=float(len(paused)),
+        longest_ms=longest_ms,
+    )
+
+
 def competing_clients(evidence: Evidence) -> Finding | None:
     """Writes that are refused because another client writes the same."""
     refused = total = clients = 0
@@ -412,16 +498,26 @@ RULES: Final[tuple[Rule, ...]] = (
     retransmissions,
     edge_stall,
     simulation_stall,
+    cpu_steal,
     injected_delay,
     beating,
     watchdog_gaps,
+    controller_pauses,
     competing_clients,
 )
 OF_A_POLLING_PROGRAM: Final[frozenset[Rule]] = frozenset(
-    {previous_poll, delayed_acknowledgement, wait_before_write, slow_polling, computing_time, beating}
+    {
+        previous_poll,
+        delayed_acknowledgement,
+        wait_before_write,
+        slow_polling,
+        computing_time,
+        beating,
+        controller_pauses,
+    }
 )
 """Rules about a program that polls the rig; in the client role the edge itself polls."""
-RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "watchdog_gaps"})
+RARE: Final = frozenset({"retransmissions", "edge_stall", "simulation_stall", "cpu_steal", "watchdog_gaps"})
 SUPPRESSED: Final = {
     "open_loop": frozenset(rule.__name__ for rule in RULES[1:]),
     "delayed_acknowledgement": frozenset({"wait_before_write", "slow_polling", "computing_time", "network", "beating"}),
@@ -429,9 +525,12 @@ SUPPRESSED: Final = {
     "computing_time": frozenset({"beating"}),
     "slow_polling": frozenset({"beating"}),
     "network": frozenset({"beating"}),
-    "edge_stall": frozenset({"watchdog_gaps"}),
-    "simulation_stall": frozenset({"watchdog_gaps"}),
-    "retransmissions": frozenset({"watchdog_gaps"}),
+    **dict.fromkeys(
+        ("edge_stall", "simulation_stall", "cpu_steal", "retransmissions"),
+        frozenset({"watchdog_gaps", "controller_pauses"}),
+    ),
+    "watchdog_gaps": frozenset({"controller_pauses"}),
+    "competing_clients": frozenset({"controller_pauses"}),
 }
 """By cause: the generic causes that it explains."""
 
