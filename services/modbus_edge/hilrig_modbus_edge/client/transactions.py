@@ -21,6 +21,7 @@ from hilrig_modbus_edge.client.faults import ControllerError, FaultKind, closed_
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import Request, decode_frames, encode_frame
 from hilrig_runtime.config.controller import ClientConfig, RegisterBlock, Table
+from hilrig_runtime.timing.clock import Clock
 
 _READ: Final[dict[Table, FunctionCode]] = {
     "coil": FunctionCode.READ_COILS,
@@ -28,6 +29,10 @@ _READ: Final[dict[Table, FunctionCode]] = {
     "input": FunctionCode.READ_INPUT_REGISTERS,
     "holding": FunctionCode.READ_HOLDING_REGISTERS,
 }
+_HEAD: Final = struct.Struct(">BHH")
+LogRequest = Callable[[bytes, int, int, int], None]
+"""Records a request: the first five bytes of its PDU, the times of sending and of the response (ns, monotonic clock),
+and the exception code or 0."""
 MAX_REMEMBERED_REQUESTS: Final = 16
 """Number of failed requests whose late responses are recognized."""
 
@@ -139,13 +144,18 @@ class ControllerConnection:
         unit: int,
         settings: ClientConfig,
         context: ssl.SSLContext | None,
+        clock: Clock,
+        *,
         on_late: Callable[[], None] = lambda: None,
+        log: LogRequest = lambda *_: None,
     ) -> None:
         # Failures are reported as events at a limited rate; pymodbus would log a line for each.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
         self._address = host, port
         self._unit = unit
         self._settings = settings
+        self._monotonic_ns = clock.monotonic_ns
+        self._log = log
         self._client = client = AsyncModbusTcpClient(host, port=port, reconnect_delay=0, retries=0)
         client.comm_params.sslctx = context
         self._timed_out = False
@@ -256,6 +266,7 @@ class ControllerConnection:
         if transactions.lost is not None:
             raise transactions.lost
         transactions.expected = expected
+        sent_ns = self._monotonic_ns()
         try:
             response = await request()
         except ModbusException:
@@ -265,6 +276,8 @@ class ControllerConnection:
         finally:
             transactions.expected = None
         self._timed_out = False
+        head = _HEAD.pack(expected.function, block.address, block.count)
+        self._log(head, sent_ns, self._monotonic_ns(), response.exception_code if response.isError() else 0)
         if response.isError():
             raise exception_fault(response.exception_code, expected.function, action, block)
         return response
