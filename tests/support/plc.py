@@ -51,6 +51,7 @@ class Plc:
         """Returns the bytes that answer a request (transaction, unit, PDU); None: the connection is closed."""
         self.tls: ssl.SSLContext | None = None
         """Context of a server with TLS; None: without TLS."""
+        self.closes_after_response = False
         self.connections = 0
         self._scan_s, self._delay_s, self._law, self._copies_step = scan_s, delay_s, law, copies_step
         self._lock = threading.Lock()
@@ -64,7 +65,8 @@ class Plc:
 
     def listen(self) -> None:
         """Open the port, the same one each time."""
-        self._listening = socket.create_server((self._host, self.port))
+        family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+        self._listening = socket.create_server((self._host, self.port), family=family)
         self.port = self._listening.getsockname()[1]
         self._start(self._accept, self._listening)
 
@@ -87,7 +89,7 @@ class Plc:
 
     @property
     def address(self) -> str:
-        return f"{self._host}:{self.port}"
+        return f"[{self._host}]:{self.port}" if ":" in self._host else f"{self._host}:{self.port}"
 
     @property
     def positions(self) -> tuple[int, ...]:
@@ -170,6 +172,8 @@ class Plc:
                 if self._delay_s:
                     time.sleep(self._delay_s)
                 connected.sendall(reply)
+                if self.closes_after_response:
+                    break
         except OSError:
             pass
         finally:

@@ -1,4 +1,4 @@
-"""What is stated of the latency without an echo register contains the truth that virtual devices know."""
+"""Bound and estimate of the latency without an echo register contain the truth that virtual devices know."""
 
 from dataclasses import dataclass, field
 

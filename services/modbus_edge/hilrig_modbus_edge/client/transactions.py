@@ -10,6 +10,7 @@ import ssl
 import struct
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from pymodbus.client import AsyncModbusTcpClient
@@ -29,6 +30,8 @@ _READ: Final[dict[Table, FunctionCode]] = {
     "input": FunctionCode.READ_INPUT_REGISTERS,
     "holding": FunctionCode.READ_HOLDING_REGISTERS,
 }
+NEXT_ADDRESS_S: Final = 0.25
+"""Time after which the next address of a host is tried, too (RFC 8305), s."""
 _HEAD: Final = struct.Struct(">BHH")
 LogRequest = Callable[[bytes, int, int, int], None]
 """Records a request: the first five bytes of its PDU, the times of sending and of the response (ns, monotonic clock),
@@ -60,8 +63,11 @@ class _Transactions(TransactionManager):
         super().__init__(*arguments)
         self._unit = unit
         self._on_late = on_late
+        self._responses = 0
         self._failed: deque[int] = deque(maxlen=MAX_REMEMBERED_REQUESTS)
-        create = self.call_create
+        # A host may have several addresses, of which some do not answer. The function is asyncio's.
+        call_create: Any = self.call_create
+        create = partial(call_create, happy_eyeballs_delay=NEXT_ADDRESS_S)
 
         async def create_connection() -> Any:
             try:
@@ -80,7 +86,7 @@ class _Transactions(TransactionManager):
     def callback_disconnected(self, exc: Exception | None) -> None:
         """See `TransactionManager`: the connection was lost."""
         super().callback_disconnected(exc)
-        self._fail(ControllerError(FaultKind.CLOSED, closed_text(exc)))
+        self._fail(ControllerError(FaultKind.CLOSED, closed_text(exc, self._responses)))
 
     def callback_data(self, data: bytes, addr: tuple[str, int] | None = None) -> int:  # noqa: ARG002
         """See `TransactionManager`: bytes were received; pass on the valid response only."""
@@ -122,6 +128,7 @@ class _Transactions(TransactionManager):
             )
             return ControllerError(FaultKind.MALFORMED, text)
         self.expected = None
+        self._responses += 1
         super().callback_data(encode_frame(frame.transaction, frame.unit, pdu))
         return None
 
