@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Bytecode files are always written: a lab has four processes, and tests start hundreds of processes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-long together alone check gen bench system clean
+.PHONY: help demo test test-long together real-time again coverage check gen bench system clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -37,27 +37,36 @@ demo: .venv/ready ## run the complete rig for 20 s with a Modbus TCP controller;
 
 test: .venv/bin/python ## run all tests and checks of CI
 	@$(MAKE) --no-print-directory --jobs=2 system .venv/dev
-	@$(MAKE) --no-print-directory --jobs=2 check together
-	@$(MAKE) --no-print-directory alone
+	@$(MAKE) --no-print-directory --jobs=2 check together; first=$$?; $(MAKE) --no-print-directory real-time && exit $$first
 
-# What judges real time runs alone, one test after the other; all else shares the cores, with more workers than there are
-# cores, for real processes are often waited for; so no process spreads its matrices over all cores. Where the host of a
-# virtual machine takes its processors away for a moment, a test of real processes can fail for it: what failed is made
-# again, with nothing beside it, and all is there to be read. What fails for a reason fails again.
-AGAIN = $(BIN)/pytest --last-failed --last-failed-no-failures none
-together alone: export OPENBLAS_NUM_THREADS = 1
-together: .venv/dev
-	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not alone" || $(AGAIN) -m "not alone"
-alone: .venv/dev
-	$(BIN)/pytest -m alone tests/rig || $(AGAIN) -m alone tests/rig || $(AGAIN) -m alone tests/rig
+# Bytecode of all modules, written by one process: otherwise each worker would compile all of them at the same time.
+.venv/compiled: .venv/dev
+	@$(BIN)/pytest --collect-only --quiet >/dev/null || true
+	@touch $@
+
+# Tests of timing run after the others, two at a time. The others have more workers than there are cores, because they
+# often wait for processes; so no process spreads its matrices over all cores.
+together real-time again coverage: export OPENBLAS_NUM_THREADS = 1
+together: .venv/compiled
+	$(BIN)/pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not real_time"
+real-time: .venv/dev
+	$(BIN)/pytest -n 2 --dist loadfile -m real_time tests/rig
+again: .venv/dev ## repeat the tests that failed, one after the other
+	$(BIN)/pytest --last-failed --last-failed-no-failures none
+
+coverage: .venv/dev ## line and branch coverage by the unit and contract tests; writes htmlcov/
+	$(BIN)/pytest -n 2 --dist loadfile --cov --cov-report term --cov-report html tests/unit tests/contract
 
 test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet captures, long outages, random faults
 	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
 	HILRIG_BUS_FUZZ_MESSAGES=100000 $(BIN)/pytest tests/rig/test_bus_fuzz.py
 	HILRIG_RANDOM_ARMS=100 $(BIN)/pytest tests/unit/test_automatic_substeps.py
+	HILRIG_FUZZ_FRAMES=200000 $(BIN)/pytest tests/rig/test_modbus_fuzz.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_doctor.py tests/rig/test_console.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py tests/rig/test_diagnosis_live.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_pick_and_place.py tests/rig/test_demo_slow_network.py tests/rig/test_study_live.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py tests/rig/test_installation.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_exercises.py tests/unit/test_assign_check.py tests/unit/test_class_of_30.py tests/rig/test_interactive_report.py
+	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
 	$(BIN)/python tests/chaos.py
 
 check: .venv/dev ## check format, lint rules, types and layers
@@ -79,4 +88,4 @@ bench: .venv/dev system ## run all benchmarks (up to one hour); writes docs/perf
 	$(BIN)/python bench/run_all.py
 
 clean: ## remove everything that was built or installed here
-	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis dist
+	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov dist

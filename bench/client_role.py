@@ -24,8 +24,7 @@ from harness import Report, build_c, cpu_seconds, progress, rigs_text
 from numpy.typing import NDArray
 from steal import StealMonitor
 
-from hilrig_cli.local.demo import free_ports
-from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.local_lab import free_ports, running_lab
 from hilrig_replay.analysis.latency import LatencyReport
 from hilrig_replay.analysis.latency import measure as latency_of
 from hilrig_replay.io.columns import Rows

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import free_ports
 from hilrig_runtime.config.lab import LabConfig, load_lab
 
 HERE = Path(__file__).parent

@@ -29,8 +29,7 @@ from harness import Report, build_c, cpu_seconds, percentile, progress, write_la
 from numpy.typing import NDArray
 from steal import StealMonitor
 
-from hilrig_cli.local.demo import free_ports
-from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.local_lab import free_ports, running_lab
 from hilrig_cli.local.supervisor import DEFAULT_PROCESSES, Supervisor
 from hilrig_replay.analysis import latency
 from hilrig_replay.analysis.stages import STAGES

@@ -21,7 +21,7 @@ from typing import Any
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import free_ports
 from hilrig_modbus_edge.command_scheduler import COALESCE_WINDOW_NS, DEADLINE_MARGIN_NS
 from hilrig_modbus_edge.service import run as run_edge
 from hilrig_runtime.bus.api import CACHE_DEPTH, Publisher

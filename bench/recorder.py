@@ -23,7 +23,7 @@ from harness import Report, progress, run
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from hilrig_cli.local.demo import free_ports
+from hilrig_cli.local.local_lab import free_ports
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig, load_lab
 from hilrig_runtime.process.service import Service

@@ -29,8 +29,7 @@ import numpy as np
 import zenoh
 from harness import Report, build_c, progress, services_log, write_lab
 
-from hilrig_cli.local.demo import free_ports
-from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.local_lab import free_ports, running_lab
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.bus import BusConfig
 from hilrig_schemas.topics import COMMANDS, HEALTH, LOG, STATES, ServiceTopic

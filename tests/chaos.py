@@ -110,7 +110,7 @@ class Chaos:
         }[fault.kind]
         fault.begin_ns, fault.begin_wall_ns = time.monotonic_ns(), time.time_ns()
         begin(fault.host)
-        time.sleep(fault.duration_s)
+        time.sleep(fault.duration_s)  # the duration of the fault
         fault.end_ns = time.monotonic_ns()
         end(fault.host)
         self.faults.append(fault)

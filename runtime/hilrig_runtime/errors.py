@@ -4,6 +4,8 @@ An error is raised where it is found and states the defect, its place and the ac
 top of the process (`process.shutdown.run_main`).
 """
 
+import shlex
+import sys
 from collections.abc import Sequence
 
 
@@ -27,3 +29,8 @@ def list_names(names: Sequence[str], limit: int = 3) -> str:
     """Join names for a message; those beyond `limit` are only counted."""
     more = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {more} more" if more > 0 else "")
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs hilrig with an extra for the running Python; it is run in hilrig's folder."""
+    return f"{shlex.quote(sys.executable)} -m pip install '.[{extra}]'"

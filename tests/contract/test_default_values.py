@@ -106,7 +106,7 @@ DOCUMENTED = [
             *(f"docs/controllers/{name}.md" for name in ("python", "c", "nodejs", "go", "forte")),
             *(f"examples/hold_position.{kind}" for kind in ("py", "c", "js")),
         )
-        for pattern in (r"(?:127\.0\.0\.1[: ]|-p |--port |[pP]ort.{1,22}[=:] \"?)(\d{4})\b",)
+        for pattern in (r"(?:127\.0\.0\.1[: ]|-p |--port |port=|[pP]ort.{1,22}[=:] \"?)(\d{4})\b",)
     ),
     ("examples/pick_and_place.py", r"--port.*?(\d{4})", [(PORT, 1)]),
     ("examples/openplc/mbconfig.cfg", r'IP_Port = "(\d+)"', [(PORT, 1)]),

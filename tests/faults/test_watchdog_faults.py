@@ -17,11 +17,11 @@ from mcap.reader import make_reader
 from hilrig_schemas import Event, JointState, TorqueCommand
 from support.labs import HILRIG, RunningLab, hilrig, write_lab
 from support.namespaces import Network, require_namespaces
-from support.waiting import LONG_TIMEOUT_S, StallMonitor, eventually
+from support.waiting import LONG_TIMEOUT_S, eventually
 
 TIMEOUT_MS, STEP_MS = 400, 20
-TOLERANCE_MS = 15
-"""Tolerance for the wake-up of two processes in sequence on a busy machine, ms."""
+TOLERANCE_MS = 1000
+"""Other processes may take the processors for some time, ms; with a clock of its own: tests/unit/test_device.py."""
 
 ASK = ("lease", "--json", "--config")
 
@@ -52,12 +52,8 @@ def messages(path: Path, topic: str, kind: type) -> list:  # type: ignore[type-a
         return [kind.FromString(message.data) for _, _, message in make_reader(file).iter_messages(topics=[topic])]
 
 
-def check_recording(recording: Path, cause: str, stalls: StallMonitor) -> None:
-    """Check that the torque of the last write ended in time, and that the event has the cause.
-
-    The machine may stall twice.
-    """
-    late_ms = TOLERANCE_MS + 2e3 * stalls.worst_s
+def check_recording(recording: Path, cause: str) -> None:
+    """Check that the torque of the last write ended in time, and that the event has the cause."""
     commands = messages(recording, "/command", TorqueCommand)
     states = messages(recording, "/state", JointState)
     events = messages(recording, "/event", Event)
@@ -67,11 +63,11 @@ def check_recording(recording: Path, cause: str, stalls: StallMonitor) -> None:
     first_zero = next(state for state in states if state.step > acting[-1].step)
     assert first_zero.sampled_ns > last_write.write_arrived_ns
     took_ms = (first_zero.sampled_ns - last_write.write_arrived_ns) / 1e6
-    assert TIMEOUT_MS <= took_ms <= TIMEOUT_MS + STEP_MS + late_ms
+    assert TIMEOUT_MS <= took_ms <= TIMEOUT_MS + STEP_MS + TOLERANCE_MS
     [trip] = [event for event in events if event.kind == Event.WATCHDOG_TRIP]
     assert cause in trip.text
     assert trip.watchdog_data.timeout_ns == TIMEOUT_MS * 1_000_000
-    assert TIMEOUT_MS <= trip.watchdog_data.silent_ns / 1e6 < TIMEOUT_MS + late_ms
+    assert TIMEOUT_MS <= trip.watchdog_data.silent_ns / 1e6 < TIMEOUT_MS + TOLERANCE_MS
 
 
 FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
@@ -85,7 +81,7 @@ FAULTS: dict[str, tuple[str, signal.Signals | None, str]] = {
 @pytest.mark.rig
 def test_torque_is_zero_after_controller_failure(tmp_path: Path) -> None:
     config = write_lab(tmp_path, rigs=3, extra=f"edge.watchdog_ms = {TIMEOUT_MS}")
-    with StallMonitor() as stalls, RunningLab(config) as lab:
+    with RunningLab(config) as lab:
         processes = {
             rig: subprocess.Popen(controller(lab.lab.ports[rig], mode), stdout=subprocess.PIPE, text=True)
             for rig, (mode, _, _) in FAULTS.items()
@@ -101,11 +97,11 @@ def test_torque_is_zero_after_controller_failure(tmp_path: Path) -> None:
         finally:
             for process in processes.values():
                 process.kill()
-                process.wait()
+                process.communicate()
         assert lab.stop() == 0
         for rig, (_, _, cause) in FAULTS.items():
             [recording] = [path for path in lab.recordings if path.parent.name == rig]
-            check_recording(recording, cause, stalls)
+            check_recording(recording, cause)
 
 
 def tripped(status: dict[str, object]) -> bool:
@@ -117,7 +113,7 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
     """A killed edge does not repeat the command: the command timeout of the simulation stops the torque."""
     extra = "sim.command_timeout_ms = 300\nedge.repeat_ms = 100"
     config = write_lab(tmp_path, extra=extra)
-    with StallMonitor() as stalls, RunningLab(config) as lab:
+    with RunningLab(config) as lab:
         process = subprocess.Popen(controller(lab.port), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         try:
             assert process.stdout is not None
@@ -127,7 +123,7 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
             eventually(lambda: hilrig("lease", "rig1", "--config", config).returncode == 0)
         finally:
             process.kill()
-            process.wait()
+            process.communicate()
         assert lab.stop() == 0
         [recording] = lab.recordings[:1]
         commands = [c for c in messages(recording, "/command", TorqueCommand) if c.controller]
@@ -135,18 +131,14 @@ def test_torque_is_zero_after_edge_failure(tmp_path: Path) -> None:
         acting = [state for state in states if any(state.effort)]
         zero = next(state for state in states if state.step > acting[-1].step)
         # The last command may be a repetition, which is not recorded.
-        assert (
-            0
-            < (zero.sampled_ns - commands[-1].sent_ns) / 1e6
-            <= 300 + 100 + STEP_MS + TOLERANCE_MS + 2e3 * stalls.worst_s
-        )
+        assert 0 < (zero.sampled_ns - commands[-1].sent_ns) / 1e6 <= 300 + 100 + STEP_MS + TOLERANCE_MS
 
 
 @pytest.mark.hosts
 def test_torque_is_zero_after_network_failure(tmp_path: Path) -> None:
     require_namespaces()
     lab = write_lab(tmp_path, extra=f"edge.watchdog_ms = {TIMEOUT_MS}\nedge.host = '0.0.0.0'")
-    with StallMonitor() as stalls, Network(["rig", "pc"]) as network:
+    with Network(["rig", "pc"]) as network:
         log = (tmp_path / "up.log").open("w")
         up = network.popen("rig", [*HILRIG, "up", "--config", str(lab)], stdout=log, stderr=log, cwd=tmp_path)
         eventually(lambda: "running" in (tmp_path / "up.log").read_text())
@@ -168,4 +160,4 @@ def test_torque_is_zero_after_network_failure(tmp_path: Path) -> None:
         assert up.wait(LONG_TIMEOUT_S) == 0
         log.close()
     [recording] = (tmp_path / "recordings").rglob("*.mcap")
-    check_recording(recording, "no request from", stalls)
+    check_recording(recording, "no request from")

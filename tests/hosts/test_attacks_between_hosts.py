@@ -109,7 +109,7 @@ def test_flood_on_one_rig_affects_no_other_rig_or_watchdog(lab: MultiHostLab) ->
         begin_ns = time.monotonic_ns()
         command = [sys.executable, "-c", FLOOD, FLOODED_RIG.edge, str(FLOODED_RIG.port), str(FLOOD_S)]
         flood = lab.network.popen("attacker", command)
-        time.sleep(FLOOD_S / 2)
+        time.sleep(FLOOD_S / 2)  # a part of the flood
         # A controller is killed during the flood: the watchdog must still set its torque to zero.
         killed_ns = time.monotonic_ns()
         beside.controller.kill()

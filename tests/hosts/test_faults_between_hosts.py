@@ -67,7 +67,7 @@ def test_loop_recovers_after_router_restart(lab: MultiHostLab) -> None:
     logged = {host: count(host, text) for host, text in LOST.items()}
     with ControllerSession(lab) as session:
         killed_ns = lab.kill("router")
-        time.sleep(2.0)
+        time.sleep(2.0)  # the duration of the outage: longer than every time-out
         lab.start("router")
         lab.wait_for_closed_loop(15)
         back_ns = time.monotonic_ns()
@@ -110,7 +110,7 @@ def test_loop_recovers_after_simulation_link_cut(lab: MultiHostLab, cut_s: float
     with ControllerSession(lab) as session:
         lab.network.set_link("sim", False)
         cut_ns = time.monotonic_ns()
-        time.sleep(cut_s)
+        time.sleep(cut_s)  # the duration of the cut is under test
         linked_ns = time.monotonic_ns()
         lab.network.set_link("sim", True)
         lab.wait_for_closed_loop(30)
@@ -148,10 +148,10 @@ def test_controllers_detect_simulation_host_failure(lab: MultiHostLab) -> None:
 def test_edge_failure_zeroes_torque(lab: MultiHostLab) -> None:
     with ControllerSession(lab) as session:
         killed_ns = lab.kill("edge")
-        time.sleep(1.5)
+        time.sleep(1.5)  # the duration of the outage
         lab.start("edge")
         lab.wait_for_closed_loop(20)
-        time.sleep(1.0)
+        time.sleep(1.0)  # the recording shall have torques after the recovery
     states = session.states()
     assert time_to_zero_ns(states, killed_ns) <= TIMEOUT_NS + TOLERANCE_NS
     assert np.abs(states["effort"][states["sampled_ns"] > killed_ns + 2 * TIMEOUT_NS]).max() > 0, (
@@ -162,7 +162,7 @@ def test_edge_failure_zeroes_torque(lab: MultiHostLab) -> None:
 def test_recorder_failure_does_not_affect_the_loop(lab: MultiHostLab) -> None:
     with ControllerSession(lab) as session:
         killed_ns = lab.kill("recorder")
-        time.sleep(1.5)
+        time.sleep(1.5)  # the duration of the outage
         lab.start("recorder")
         eventually(lab.unfinished)
     states = session.states()

@@ -47,7 +47,7 @@ def record_with_a_cut(folder: Path, cut_s: float) -> tuple[list[Key], list[Path]
         eventually(lambda: size() > 20_000)
         network.set_link("store", False)
         send_line("emit rig1")
-        time.sleep(cut_s)
+        time.sleep(cut_s)  # the duration of the cut is under test
         during = size()
         network.set_link("store", True)
         eventually(lambda: size() > during + 10_000)

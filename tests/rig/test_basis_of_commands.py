@@ -21,7 +21,7 @@ from hilrig_schemas import Event, TorqueCommand, topics
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 ROOT = Path(__file__).parents[2]
 HOLD = ROOT / "examples/hold_position.py"
@@ -68,14 +68,14 @@ def record(
     known = set(lab.recordings)
     controller = subprocess.Popen([sys.executable, str(program), *arguments], stdout=subprocess.DEVNULL)
     edge = lab.service_pid("edge")
-    time.sleep(0.8)
+    time.sleep(0.8)  # the program connects and moves the arm before it is disturbed
     for _ in range(stops):
         os.kill(edge, signal.SIGSTOP)
         try:
-            time.sleep(stop_ms / 1e3)
+            time.sleep(stop_ms / 1e3)  # the duration of the stop is under test
         finally:
             os.kill(edge, signal.SIGCONT)
-        time.sleep(every_s - stop_ms / 1e3)
+        time.sleep(every_s - stop_ms / 1e3)  # undisturbed time between two stops
     controller.wait(60)
     return Session(eventually(lambda: next((path for path in lab.recordings if path not in known), None)))
 

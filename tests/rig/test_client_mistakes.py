@@ -135,7 +135,7 @@ def test_request_in_slow_pieces_is_answered_without_log(caplog: pytest.LogCaptur
     with caplog.at_level(logging.WARNING), running_edge() as rig, rig.client() as client:
         for byte in client.frame(b"\x03\x00\x00\x00\x01"):
             client.send(bytes((byte,)))
-            time.sleep(0.02)
+            time.sleep(0.02)  # a segment of its own for each byte
         assert client.receive()[2] == b"\x03\x02\x00\x00"
         assert not lines(caplog)
 
@@ -150,16 +150,12 @@ def test_request_in_two_segments_is_not_delayed(split: int) -> None:
     with running_edge() as rig, rig.client() as client:
         client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0)
         frame = client.frame(b"\x03\x00\x04\x00\x04")
-
-        def cycle() -> float:
-            begin = time.monotonic()
+        begin = time.monotonic()
+        for _ in range(50):
             client.send(frame[:split])
             client.send(frame[split:])
             client.receive()
-            return time.monotonic() - begin
-
-        times = sorted(cycle() for _ in range(40))
-        assert times[20] < 0.02
+        assert time.monotonic() - begin < 1, "delayed requests take two seconds"
 
 
 # -- idle connections
@@ -169,7 +165,7 @@ def test_idle_connection_stays_while_there_is_room() -> None:
     with running_edge(idle_timeout_s=0.2, max_connections=2) as rig, rig.client() as idle, rig.client() as other:
         idle.write(0, 0)
         other.read(0, 1)
-        time.sleep(0.9)
+        time.sleep(0.9)  # longer than the time-out that must not be applied
         assert idle.read(0, 1) == [0]
 
 
@@ -178,7 +174,7 @@ def test_longest_idle_connection_makes_room() -> None:
         clients = [rig.client() for _ in range(3)]
         for client in clients:
             client.read(0, 1)
-        time.sleep(0.3)
+        time.sleep(0.3)  # longer than the time-out: all connections are idle
         clients[0].read(0, 1)
         with rig.client() as fourth:
             assert fourth.read(0, 1) == [0]
@@ -202,7 +198,7 @@ def test_idle_connection_of_the_same_host_makes_room() -> None:
         foreign.sendall(frame)
         assert foreign.recv(99)
         idle.read(0, 1)
-        time.sleep(0.3)
+        time.sleep(0.3)  # longer than the time-out: all connections are idle
         used.read(0, 1)
         with rig.client() as third:
             assert third.read(0, 1) == [0]
@@ -218,7 +214,7 @@ def test_abandoned_connections_do_not_lock_a_client_out() -> None:
         for _ in range(12):
             clients.append(rig.client())
             assert clients[-1].read(0, 1) == [0]
-            time.sleep(0.03)
+            time.sleep(0.03)  # three connections exceed the time-out, one does not
         assert rig.service.counters.refused == 0
         for client in clients:
             client.close()

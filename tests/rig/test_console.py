@@ -23,11 +23,13 @@ import pytest
 
 from hilrig_console.app import MAX_BROWSERS
 from hilrig_console.auth import AccessPolicy
-from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
+from hilrig_console.serving import ConsoleServer, TlsFiles, check_health
 from hilrig_runtime.config.lab import load_lab
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.listen_address import ListenAddress
 from support.browser import CHROMIUM, Browser
 from support.bus_certificates import make_bus_folder
+from support.edge_rig import RawClient
 from support.labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
 from support.recordings import Script, record
 from support.waiting import LONG_TIMEOUT_S, eventually
@@ -331,6 +333,15 @@ def test_browser_shows_changing_values(running_lab: ConsoleWithLab, tmp_path: Pa
             eventually(lambda: "in use" in card(text) and "127.0.0.1:" in card(text))
             eventually(lambda: abs(float(card(arm)) - before) > 20)
         eventually(lambda: "session" in browser.run("document.getElementById('events').innerText"))
+        assert browser.run("document.getElementById('refused-panel').hidden")
+        with RawClient("127.0.0.1", running_lab.lab.lab.ports["rig2"]) as client:
+            assert client.ask("03 00 00 00 0A").hex() == "8302"
+        eventually(
+            lambda: (
+                "rig2 127.0.0.1 3 02 1"
+                in browser.run("document.querySelector('#refused tbody').innerText.replace(/\\s+/g, ' ')")
+            )
+        )
         eventually(lambda: browser.run("document.querySelectorAll('#runs tbody tr').length") >= 1)
         assert browser.run("document.getElementById('link').innerText") == "live"
         browser.run("document.getElementById('as-table').click()")
@@ -371,7 +382,7 @@ def test_password_is_required_off_loopback(tmp_path: Path) -> None:
         assert running.ask("/health")[0] == 200
         with Watcher(running.port, authorization=basic(match[1])) as watcher:
             eventually(lambda: "lab" in watcher.newest)
-            assert answers(ListenAddress("", running.port), None)
+            assert answers(ListenAddress("0.0.0.0", running.port), None)
             running.process.send_signal(signal.SIGINT)
             assert running.process.wait(LONG_TIMEOUT_S) == 0
             eventually(lambda: watcher.ended)
@@ -404,10 +415,10 @@ def test_serves_https_with_certificate(tmp_path: Path) -> None:
     with ConsoleServer(
         load_lab(write_lab(tmp_path)), ListenAddress.parse("127.0.0.1:0"), AccessPolicy(), tls
     ) as server:
-        assert server.url.startswith("https://127.0.0.1:")
-        address = ListenAddress.parse(server.url.removeprefix("https://").rstrip("/"))
+        assert server.urls.startswith("https://127.0.0.1:")
+        address = ListenAddress.parse(server.urls.removeprefix("https://").rstrip("/"))
         eventually(lambda: answers(address, tls))
-        with urllib.request.urlopen(server.url, timeout=10, context=trusting) as page:
+        with urllib.request.urlopen(server.urls, timeout=10, context=trusting) as page:
             assert b"console.js" in page.read()
         assert not answers(address, None)
 

@@ -19,7 +19,7 @@ import pytest
 from support.clients import mbpoll_read
 from support.edge_rig import RawClient
 from support.guides import commands, write_programs
-from support.labs import RunningLab, write_lab
+from support.labs import RunningLab, free_ports, write_lab
 from support.waiting import eventually
 
 pytestmark = [
@@ -51,19 +51,31 @@ def environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in hidden} | {"PATH": ":".join(path)}
 
 
-def run(lines: list[str], folder: Path) -> str:
+def shell(lines: list[str], folder: Path) -> "subprocess.CompletedProcess[str]":
     """Run command lines in one shell, which ends at the first that fails."""
-    done = subprocess.run(
+    return subprocess.run(
         ["bash", "-e", "-c", "\n".join(lines)],
         cwd=folder,
         env=environment(),
         check=False,
         capture_output=True,
         text=True,
-        timeout=400,
+        timeout=1200,
     )
+
+
+def run(lines: list[str], folder: Path) -> str:
+    done = shell(lines, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def download(lines: list[str], folder: Path) -> None:
+    """Run command lines that download sources; skip the test if the host can't be reached."""
+    assert all(line.startswith("git clone ") for line in lines)
+    done = shell(lines, folder)
+    if done.returncode:
+        pytest.skip(f"can't download: {done.stderr.strip().splitlines()[-1]}")
 
 
 def positions(port: int) -> list[float]:
@@ -101,8 +113,6 @@ def test_program_of_the_guide_runs_with_pymodbus_2(lab: RunningLab, tmp_path: Pa
 def test_node_red_flow_holds_the_arm(lab: RunningLab, tmp_path: Path, flow: str) -> None:
     require("node", "npm")
     write_programs("node-red", tmp_path, lab.port)
-    text = (tmp_path / flow).read_text(encoding="utf-8")
-    (tmp_path / flow).write_text(text.replace("5020", str(lab.port)), encoding="utf-8")
     install, start = commands("node-red", lab.port)
     run([install], tmp_path)
     with started(start.replace("hold.json", flow).replace("1880", "0"), tmp_path):
@@ -131,11 +141,58 @@ def started(command: str, folder: Path) -> Iterator[None]:
         process.wait()
 
 
-def test_octave_program_holds_the_arm(lab: RunningLab, tmp_path: Path) -> None:
-    require("octave-cli")
-    check = 'pkg load instrument-control; modbus("tcpip", "127.0.0.1", ' + f"{lab.port});"
-    if subprocess.run(["octave-cli", "--eval", check], check=False, capture_output=True).returncode:
-        pytest.skip("needs Octave's package instrument-control, compiled with libmodbus")
-    write_programs("octave", tmp_path, lab.port)
-    *_, start = commands("octave", lab.port)
-    assert "at the end" in run([start], tmp_path)
+@pytest.mark.parametrize(("guide", "program"), [("octave", "octave-cli"), ("go", "go")])
+def test_program_of_distribution_packages_holds_the_arm(
+    lab: RunningLab, tmp_path: Path, guide: str, program: str
+) -> None:
+    require(program)
+    write_programs(guide, tmp_path, lab.port)
+    lines = commands(guide, lab.port)
+    package = {"octave": ["octave-cli --eval 'pkg load instrument-control'"], "go": lines[:1]}[guide]
+    if shell(package, tmp_path).returncode:
+        pytest.skip("needs octave-instrument-control, or golang-github-goburrow-modbus-dev (Debian's packages)")
+    assert "at the end" in run(lines, tmp_path)
+    assert is_at_goal(lab.port)
+
+
+def test_openplc_holds_the_arm_in_both_roles(lab: RunningLab, tmp_path: Path) -> None:
+    require("git", "g++", "autoreconf", "libtoolize", "bison", "flex")
+    write_programs("openplc", tmp_path, lab.port)
+    clone, build, start, *as_server, start_server, start_modbus, start_rig = commands("openplc", lab.port)
+    download([clone], tmp_path)
+    run([build], tmp_path)
+    with started(start, tmp_path):
+        eventually(lambda: is_at_goal(lab.port), timeout_s=20)
+    port = free_ports(1)
+    assert start_rig == "hilrig up --controller 127.0.0.1:5502"
+    run(as_server, tmp_path)
+    (tmp_path / "rig").mkdir()
+    config = write_lab(tmp_path / "rig")
+    config.write_text(f'{config.read_text(encoding="utf-8")}controller = "127.0.0.1:{port}"\n', encoding="utf-8")
+    with started(start_server, tmp_path):
+        eventually(lambda: shell([start_modbus.replace("5502", str(port))], tmp_path).returncode == 0)
+        with RunningLab(config) as rig:
+            eventually(lambda: is_at_goal(rig.port), timeout_s=20)
+
+
+def test_beremiz_project_holds_the_arm(lab: RunningLab, tmp_path: Path) -> None:
+    require("git", "gcc", "autoreconf", "bison", "flex", "python3")
+    write_programs("beremiz", tmp_path, lab.port)
+    *lines, start = commands("beremiz", lab.port)
+    download(lines[:3], tmp_path)
+    run(lines[3:], tmp_path)
+    with started(start, tmp_path):
+        eventually(lambda: is_at_goal(lab.port), timeout_s=60)
+
+
+def test_forte_boot_file_holds_joint_1(lab: RunningLab, tmp_path: Path) -> None:
+    require("git", "cmake", "g++")
+    write_programs("forte", tmp_path, lab.port)
+    clone, *build, start = commands("forte", lab.port)
+    download([clone], tmp_path)
+    run(build, tmp_path)
+    with started(start, tmp_path):
+        eventually(lambda: abs(positions(lab.port)[0] - GOAL[0]) < 0.1, timeout_s=20)
+        # It stays there.
+        time.sleep(3)
+        assert abs(positions(lab.port)[0] - GOAL[0]) < 0.1

@@ -95,7 +95,7 @@ def test_loop_that_never_closes_is_exit_code_1(tmp_path: Path, monkeypatch: pyte
         "    time.sleep(1)\n"
         "print('{}')\n"
     )
-    monkeypatch.setattr(module, "controller_path", lambda: controller)
+    monkeypatch.setattr(module, "example_path", lambda _: controller)
     from typer.testing import CliRunner
 
     from hilrig_cli.main import app

@@ -1,6 +1,6 @@
 """The demo's controller on a slow network: with a loop latency of 60 ms it places every part.
 
-Runs once; with HILRIG_LONG in the environment three times.
+In virtual time: `tests/unit/test_pick_and_place.py`.
 """
 
 import asyncio
@@ -21,10 +21,14 @@ from hilrig_replay.io.run import open_run
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [
+    pytest.mark.rig,
+    pytest.mark.real_time,
+    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes a minute; set HILRIG_LONG=1 to run it"),
+]
 
 ROOT = Path(__file__).parents[2]
-RUNS = 3 if os.environ.get("HILRIG_LONG") else 1
+RUNS = 3
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 PROGRAM = Path(__file__).parents[1] / "support/student_program.py"
 EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"
@@ -85,14 +85,14 @@ def causes_of(lab: RunningLab, command: list[str]) -> list[Finding]:
 
 def stops(pid: int, count: int, stop_s: float) -> Iterator[None]:
     """Stop a process several times."""
-    time.sleep(1.0)
+    time.sleep(1.0)  # the programs connect and move the arm before they are disturbed
     for _ in range(count):
         os.kill(pid, signal.SIGSTOP)
         try:
-            time.sleep(stop_s)
+            time.sleep(stop_s)  # the duration of the stop is under test
         finally:
             os.kill(pid, signal.SIGCONT)
-        time.sleep(0.8)
+        time.sleep(0.8)  # undisturbed time between two stops
         yield
 
 

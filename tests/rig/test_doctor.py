@@ -64,7 +64,7 @@ def stopped(lab: RunningLab, service: str) -> Iterator[None]:
 def test_stopped_service_shifts_no_clock_of_others(lab: RunningLab) -> None:
     # The bus is closed last: it waits for the stopped service.
     with ZenohBus(lab.lab.bus, "tool") as bus:
-        eventually(lambda: len(list_services(bus, lab.lab.name)) == 3)
+        eventually(lambda: len(list_services(bus, lab.lab)) == 3)
         with stopped(lab, "recorder"):
             replies = query_services(bus, lab.lab.name, "*", Counters(), 1.5)
             found = {info.service: offset for info, offset in replies}

@@ -28,17 +28,22 @@ RUNS_UNTIL_STOPPED = ("hilrig live",)
 OPENS_A_VIEWER = ("hilrig replay", "hilrig live")
 """Commands that are run with --save, because there is no display."""
 TESTED_ELSEWHERE: dict[str, str] = {
+    "docker compose run --rm demo": "tests/hosts/test_compose.py",
     "docker compose up": "tests/hosts/test_compose.py",
+    "hilrig assign": "tests/unit/test_class_of_30.py",
     "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
-    "hilrig grade": "tests/unit/test_classroom_grades.py",
+    "hilrig grade": "tests/unit/test_class_of_30.py",
     "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig join": "tests/unit/test_join.py",
     "hilrig play": "tests/rig/test_recorder_play.py",
     "hilrig record ": "tests/rig/test_recorder_process.py",
     "hilrig study examples/": "tests/rig/test_study_live.py",
     "make demo": "tests/rig/test_demo.py",
+    "python3 -m venv": "tests/rig/test_installation.py",
+    ". .venv/bin/activate": "tests/rig/test_installation.py",
+    "python examples/paper_figures.py": "tests/rig/test_sim_commands.py",
 }
 """Start of a command, and the test that covers it."""
 
@@ -86,7 +91,19 @@ def cold_started() -> set[str]:
 
 
 def test_front_page_contains_commands() -> None:
-    assert {"make demo", "make test", "hilrig up"} <= set(COMMANDS)
+    assert {"hilrig demo", "hilrig up", "docker compose up --build"} <= set(COMMANDS)
+
+
+def test_controller_of_the_front_page_reaches_its_goal(tmp_path: Path) -> None:
+    (program,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert len(program.splitlines()) <= 15
+    with RunningLab(write_lab(tmp_path)) as lab:
+        (tmp_path / "first.py").write_text(program.replace("port=5020", f"port={lab.port}"))
+        command = [sys.executable, tmp_path / "first.py"]
+        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+    angle = re.fullmatch(r"joint 1 is at (\S+) degrees\n", done.stdout)
+    assert angle is not None
+    assert float(angle[1]) == pytest.approx(30.0, abs=1.0)
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("make ")])

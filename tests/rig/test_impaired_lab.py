@@ -22,12 +22,12 @@ from hilrig_replay.analysis.stages import STAGES
 from hilrig_replay.io.run import Run, open_run
 from hilrig_runtime.config.impairment import LinkImpairment
 from support.edge_rig import RawClient
-from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.labs import RunningLab, free_ports, hilrig
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
-SECONDS = 9.0
+SECONDS = 4.0
 STEP_MS = 10.0
 SEED = 2
 TRACE_MS = [4.0, 19.0, 7.5, 0.25, 12.0, 25.0, 3.0]
@@ -66,7 +66,7 @@ def write_impaired_lab(folder: Path) -> Path:
     impairments["trace"] = f"command = 'trace:{trace}'"
     impairments["state-link"] = f"state = '{STATE_DELAY}'"
     impairments["lossy"] = "command.loss = 'gilbert:0.05,0.4'"
-    impairments["scheduled"] = "schedule = [{ at_s = 2, command = 'constant:20' }, { at_s = 4, preset = 'none' }]"
+    impairments["scheduled"] = "schedule = [{ at_s = 1, command = 'constant:20' }, { at_s = 2, preset = 'none' }]"
     text = f"[sim]\nstep_ms = {STEP_MS}\n[edge]\nfirst_port = {free_ports(len(RIGS))}\nsession_grace_ms = 0\n"
     text += f"[bus]\nfirst_port = {free_ports(3)}\n[recorder]\nfolder = '{folder / 'recordings'}'\n"
     for rig in RIGS:
@@ -106,7 +106,7 @@ def write_for_each_state(port: int) -> None:
             if step != last:
                 last = step
                 client.write(0, step[1] & 0xFF, 0, 0, 0)
-            time.sleep(0.001)
+            time.sleep(0.001)  # polls for the next state
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def assert_stages_add_up(session: Session) -> None:
 def test_injected_delay_has_configured_distribution(sessions: dict[str, Session], rig: str) -> None:
     session, distribution = sessions[rig], DISTRIBUTIONS[COMMAND_RIGS[rig]]
     assert_stages_add_up(session)
-    assert session.report.samples > 200
+    assert session.report.samples > 90
     if distribution is None:
         assert set(session.injected_ms) == {35.0}
     else:
@@ -190,7 +190,7 @@ def test_injected_state_delay_is_that_of_its_seed(sessions: dict[str, Session]) 
     """
     session = sessions["state-link"]
     assert_stages_add_up(session)
-    assert session.report.samples > 250
+    assert session.report.samples > 120
     table = session.report.table[5:-5]
     link = LinkImpairment.model_validate(STATE_DELAY)
     sampled, _ = Impairment(link, link_seed(SEED, "state-link", "state")).draw(3000)
@@ -233,7 +233,7 @@ def test_schedule_is_followed_and_recorded(sessions: dict[str, Session]) -> None
     commands = run.commands[run.commands["write_arrived_ns"] > 0]
     begun_ns = commands["write_arrived_ns"][0]
     late = (commands["write_arrived_ns"] - begun_ns) / 1e9
-    for low, high, injected_ns in ((0.0, 1.95, 0), (2.1, 3.95, 20_000_000), (4.1, SECONDS, 0)):
+    for low, high, injected_ns in ((0.0, 0.95, 0), (1.1, 1.95, 20_000_000), (2.1, SECONDS, 0)):
         part = commands[(late > low) & (late < high)]
         assert len(part) > 20
         assert set(part["command_injected_ns"].tolist()) == {injected_ns}
@@ -258,47 +258,3 @@ def test_recording_can_be_used_as_delay_trace(sessions: dict[str, Session], lab_
     assert np.mean(trace.delays_ms) > np.mean(session.injected_ms), (
         "the trace must include the controller and its network"
     )
-
-
-def test_impairment_is_set_by_command_at_run_time(tmp_path: Path, sessions: dict[str, Session]) -> None:
-    recording = sessions["gamma-link"].run.path
-    config = write_lab(tmp_path)
-    with RunningLab(config) as lab, RawClient("127.0.0.1", lab.port) as client:
-        client.write(0, 1)
-
-        def row(*options: str | Path) -> dict[str, Any]:
-            done = hilrig("impair", "rig1", *options, "--json", "--config", config)
-            assert done.returncode == 0, done.stderr
-            decoded: dict[str, Any] = json.loads(done.stdout)
-            return decoded
-
-        assert row()["impairment"] == "none"
-        status = row("--preset", "vpn", "--loss", "bernoulli:0.2", "--seed", "7")
-        assert status["ways"]["state"]["delay"]["offset_ms"] == 15
-        assert status["ways"]["command"]["loss"] == {"kind": "bernoulli", "rate": 0.2}
-        assert (status["seed"], status["set_by"]) == (7, "override")
-        assert row() | {"states": 0, "commands": 0} == status | {"states": 0, "commands": 0}
-        assert row("--trace", recording)["ways"]["command"]["delay"]["kind"] == "trace"
-        assert row("--off")["impairment"] == "none"
-        assert row("--lab")["set_by"] == "lab.toml"
-        table = hilrig("impair", "rig1", "--preset", "mobile", "--seed", "3", "--config", config)
-        for word in ("gamma mean 15 ms", "gilbert", "(override, seed 3)"):
-            assert word in table.stdout
-        for options, message in (
-            (("rig1", "--command", "constant:-3"), "delay_ms: must be ≥ 0, got '-3'"),
-            (("rig1", "--preset", "wlan"), "unknown preset 'wlan'; must be one of none, wired"),
-            (("rig1", "--trace", tmp_path / "none.mcap"), "none.mcap"),
-            (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
-            (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
-            (("rig9", "--off"), "unknown rig 'rig9'"),
-            (("--off",), "a rig is required to set an impairment"),
-        ):
-            done = hilrig("impair", *options, "--config", config)
-            assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
-            assert message in done.stderr
-
-
-def test_missing_edge_is_reported(tmp_path: Path) -> None:
-    done = hilrig("impair", "--config", write_lab(tmp_path))
-    assert done.returncode == 3
-    assert "no edge answers for lab 'lab'" in done.stderr

@@ -1,11 +1,13 @@
 """The interactive part of a report in a browser: player, plots, events, print and dark mode."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hilrig_replay.report.timeline import MAX_ROWS
 from support.browser import CHROMIUM, Browser
 from support.labs import hilrig
 from support.recordings import Script, make, write
@@ -90,6 +92,12 @@ def test_event_in_the_list_leads_to_its_time(page: Path, browser: Browser) -> No
     assert browser.run(f"{PLAYER}.at") == pytest.approx(min(max(times[-1], 0), browser.run(f"{PLAYER}.run.end")))
 
 
+def test_value_that_is_rounded_to_zero_has_no_sign(page: Path, browser: Browser) -> None:
+    browser.open(page.as_uri())
+    values = browser.run("[fixed(-0.004, 2), fixed(-0.006, 2), fixed(-0.4, 0), fixed(-10, 0), fixed(0, 1)]")
+    assert values == ["0.00", "-0.01", "0", "-10", "0.0"]
+
+
 def test_keys_move_by_one_state(page: Path, browser: Browser) -> None:
     browser.open(page.as_uri())
 
@@ -114,3 +122,32 @@ def test_dark_page_is_dark_and_paper_has_still_pictures(page: Path, browser: Bro
     assert np.median(browser.screenshot()) > 0.95
     browser.emulate()
     assert browser.run(shown) == [False, False, True, True]
+
+
+SCRUB = """new Promise(done => {
+  const player = %s, begin = performance.now();
+  let frames = 0;
+  function frame() {
+    const passed = performance.now() - begin;
+    if (passed > 3000) return done(frames / (passed / 1000));
+    player.slider.value = player.run.end * ((frames++ * 7) %% 300) / 300;
+    player.slider.dispatchEvent(new Event('input'));
+    requestAnimationFrame(frame);
+  }
+  requestAnimationFrame(frame);
+})"""
+
+
+@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes 20 s; set HILRIG_LONG=1 to run it")
+def test_ten_minutes_are_small_and_scrubbed_smoothly(tmp_path: Path, browser: Browser) -> None:
+    script = Script(seconds=600.0, poll_ms=20.0)
+    run = write(tmp_path / "run.mcap", make(script), script=script, lab_toml=TASK)
+    assert hilrig("report", run, "--out", tmp_path / "report.html").returncode == 0
+    assert (tmp_path / "report.html").stat().st_size < 15e6
+    browser.open((tmp_path / "report.html").as_uri(), width=1280)
+    rows = browser.run(f"{PLAYER}.run.time.length")
+    # Every state is shown.
+    assert 30_000 <= rows <= MAX_ROWS
+    reply = browser._call("Runtime.evaluate", expression=SCRUB % PLAYER, awaitPromise=True, returnByValue=True)
+    assert reply["result"]["value"] >= 30.0
+    assert browser.errors == []

@@ -184,12 +184,12 @@ def test_responses_are_sent_without_delay(client: RawClient) -> None:
         # Otherwise the response to a host that lost its power is retransmitted for a quarter of an hour.
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 11_000
     begin = time.monotonic()
-    for _ in range(20):
+    for _ in range(50):
         client.send(client.frame(b"\x03\x00\x00\x00\x08"))
         client.send(client.frame(b"\x03\x00\x00\x00\x08"))
         client.receive()
         client.receive()
-    assert time.monotonic() - begin < 0.4
+    assert time.monotonic() - begin < 1, "delayed responses take two seconds"
 
 
 def _sockets() -> list[socket.socket]:

@@ -3,14 +3,14 @@
 The examples in Python, C and Node.js run as a student runs them; each must move the arm to two poses.
 """
 
+import functools
 import json
-import os
 import re
 import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,6 +30,7 @@ LONG_LEASE = "edge.lease_timeout_ms = 60000"
 """Long enough for a command to start on a busy machine."""
 SECONDS = "7.8"
 """Duration of nearly both poses: the arm is at the second one when the program ends."""
+SECONDS_OF_ONE_POSE = "5"
 
 
 @pytest.fixture(scope="module")
@@ -46,43 +47,65 @@ def in_c(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> Path:
     return compile_with_libmodbus(folder / "hold_position.c", folder)
 
 
+PYTHON_LIBRARIES = {
+    "pymodbus==3.0.*": ("hold.py", "rig5"),
+    "pyModbusTCP": ("hold_pymodbustcp.py", "rig6"),
+}
+"""Libraries of another version or project: their program of the guide, and its rig."""
+
+
 @pytest.fixture(scope="module")
-def in_node(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> Path:
-    if shutil.which("node") is None or shutil.which("npm") is None:
-        pytest.skip("needs node and npm (Debian's packages nodejs and npm)")
-    folder = tmp_path_factory.mktemp("node")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Path]]:
+    """Install the foreign libraries, all at once; returns a function that waits for one and returns its folder."""
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", "--no-deps", "--target", "."]
+    npm = ["npm", "install", "--omit=optional", "--no-audit", "--no-fund", "--loglevel=error"]
+    commands = {library: [*pip, library] for library in PYTHON_LIBRARIES}
+    if shutil.which("node") is not None and shutil.which("npm") is not None:
+        commands["node"] = [*npm, "jsmodbus"]
+    folders = {library: tmp_path_factory.mktemp("library") for library in commands}
+    if "node" in commands:
+        shutil.copy(EXAMPLES / "package.json", folders["node"])
+    running = {
+        library: subprocess.Popen(
+            command, cwd=folders[library], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        for library, command in commands.items()
+    }
+
+    def wait(library: str) -> Path:
+        if library not in running:
+            pytest.skip("needs node and npm (Debian's packages nodejs and npm)")
+        output, _ = running[library].communicate(timeout=120)
+        if running[library].returncode:
+            pytest.skip(f"{running[library].args[0]} can't install {library} here: {output.strip().splitlines()[-1:]}")
+        return folders[library]
+
+    yield functools.cache(wait)
+    for process in running.values():
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def in_node(lab: RunningLab, installed: Callable[[str], Path]) -> Path:
+    folder = installed("node")
     write_programs("nodejs", folder, lab.lab.ports["rig4"])
-    command = ["npm", "install", "--omit=optional", "--no-audit", "--no-fund", "--loglevel=error", "jsmodbus"]
-    done = subprocess.run(command, cwd=folder, check=False, capture_output=True, text=True, timeout=60)
-    if done.returncode:
-        pytest.skip(f"npm can't install modbus-serial and jsmodbus here: {done.stderr.strip().splitlines()[-1:]}")
     return folder / "hold_position.js"
 
 
 @pytest.fixture(scope="module")
-def in_python(tmp_path_factory: pytest.TempPathFactory, lab: RunningLab) -> dict[str, tuple[Path, Path]]:
-    """By library of another version or project: its program of the guide, and the folder where it is installed."""
-    programs = {
-        "pymodbus==3.0.*": ("hold.py", "rig5"),
-        "pyModbusTCP": ("hold_pymodbustcp.py", "rig6"),
-    }
+def in_python(lab: RunningLab, installed: Callable[[str], Path]) -> dict[str, Path]:
+    """By library: its program of the guide, in the folder where it is installed."""
     found = {}
-    installing = []
-    for library, (name, rig) in programs.items():
-        folder = tmp_path_factory.mktemp("python")
+    for library, (name, rig) in PYTHON_LIBRARIES.items():
+        folder = installed(library)
         write_programs("python", folder, lab.lab.ports[rig])
-        command = [sys.executable, "-m", "pip", "install", "--quiet", "--target", folder / "installed", library]
-        installing.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
-        found[library] = (folder / name, folder / "installed")
-    for process in installing:
-        output, _ = process.communicate(timeout=120)
-        if process.returncode:
-            pytest.skip(f"pip can't install {', '.join(programs)} here: {output.strip().splitlines()[-1:]}")
+        found[library] = folder / name
     return found
 
 
 def test_examples_hold_and_move_the_arm(
-    lab: RunningLab, in_c: Path, in_node: Path, in_python: dict[str, tuple[Path, Path]]
+    installed: Callable[[str], Path], lab: RunningLab, in_c: Path, in_node: Path, in_python: dict[str, Path]
 ) -> None:
     """The examples and the programs of the guides run at once, each on its own rig."""
     port = {rig.name: str(lab.lab.ports[rig.name]) for rig in lab.lab.rigs}
@@ -90,22 +113,20 @@ def test_examples_hold_and_move_the_arm(
         "Python": [sys.executable, EXAMPLES / "hold_position.py", "--port", port["rig1"], "--duration", SECONDS],
         "C": [in_c, "127.0.0.1", port["rig2"], SECONDS],
         "Node.js": ["node", in_node, "127.0.0.1", port["rig3"], SECONDS],
-        "jsmodbus": ["node", in_node.with_name("hold_jsmodbus.js"), SECONDS],
+        "jsmodbus": ["node", in_node.with_name("hold_jsmodbus.js"), SECONDS_OF_ONE_POSE],
         "one part": [sys.executable, EXAMPLES / "pick_one_part.py", "--port", port["rig7"]],
     }
     last_line = dict.fromkeys(commands, "error at the end") | {"jsmodbus": "at the end: ", "one part": "done"}
-    folder_of = {}
-    for library, (program, installed) in in_python.items():
-        commands[library] = [sys.executable, program, SECONDS]
+    for library, program in in_python.items():
+        # The library beside the program is found before that of this environment.
+        commands[library] = [sys.executable, program, SECONDS_OF_ONE_POSE]
         last_line[library] = "at the end: "
-        folder_of[library] = str(installed)
     running = {
         name: subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=os.environ | ({"PYTHONPATH": folder_of[name]} if name in folder_of else {}),
         )
         for name, command in commands.items()
     }

@@ -81,7 +81,13 @@ def churn(lab: RunningLab, connections: int, seconds: float) -> tuple[int, int]:
 
 def settled(pid: int) -> int:
     """Return the number of handles when two consecutive readings agree."""
-    return eventually(lambda: (first := handles(pid)) == (time.sleep(0.1), handles(pid))[1] and first)
+
+    def same_twice() -> int:
+        first = handles(pid)
+        time.sleep(0.1)  # the edge closes connections between the two readings
+        return first if handles(pid) == first else 0
+
+    return eventually(same_twice)
 
 
 def test_hundreds_of_connections_leak_nothing(lab: RunningLab) -> None:

@@ -17,7 +17,7 @@ from support.labs import HILRIG
 from support.recordings import MS, Script, TimedMessage, make, write
 
 pytestmark = [
-    pytest.mark.alone,
+    pytest.mark.real_time,
     pytest.mark.rig,
     pytest.mark.timeout(1200),
     pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),

@@ -119,7 +119,7 @@ def cpu_s_of(process: int, while_s: float) -> float:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     before_s = used_s()
-    time.sleep(while_s)
+    time.sleep(while_s)  # the processor time within this time is measured
     return used_s() - before_s
 
 

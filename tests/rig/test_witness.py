@@ -28,7 +28,7 @@ from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
 from support.waiting import eventually
 
-pytestmark = [pytest.mark.rig, pytest.mark.alone]
+pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 CONTROLLER = Path(__file__).parents[1] / "support/witness_controller.py"
 LONG = bool(os.environ.get("HILRIG_LONG"))
@@ -147,16 +147,16 @@ def observe(
         controller = subprocess.Popen(command if line is None else line.command(command))
         edge = lab.service_pid("edge")
         end_s = time.monotonic() + seconds - 0.3
-        time.sleep(0.5)
+        time.sleep(0.5)  # the program connects and moves the arm before it is disturbed
         while stall_ms and time.monotonic() < end_s:
             begin_ns = time.monotonic_ns()
             os.kill(edge, signal.SIGSTOP)
             try:
-                time.sleep(stall_ms / 1e3)
+                time.sleep(stall_ms / 1e3)  # the duration of the stop is under test
             finally:
                 os.kill(edge, signal.SIGCONT)
             stalls.append((begin_ns, time.monotonic_ns()))
-            time.sleep(0.5 - stall_ms / 1e3)
+            time.sleep(0.5 - stall_ms / 1e3)  # undisturbed time between two stops
         assert controller.wait(seconds + 30) == 0
     recording = eventually(lambda: next((path for path in lab.recordings if path not in known), None))
     run = open_run(recording)

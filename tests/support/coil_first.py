@@ -20,7 +20,7 @@ def main() -> None:
         position = (position - 65536 if position > 32767 else position) / 100
         torque = int(1000 * max(-5.0, min(5.0, 0.02 * (30 - position)))) & 0xFFFF
         assert not client.write_registers(0, [torque, 0, -4905 & 0xFFFF, 0]).isError()
-        time.sleep(0.015)
+        time.sleep(0.015)  # the period of a controller
     client.close()
 
 

@@ -24,8 +24,9 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from mcap.opcode import Opcode
 
+from hilrig_recorder.mcap_format.file_names import MAGIC
 from hilrig_recorder.mcap_format.reader import buffer_reader
-from hilrig_recorder.mcap_format.records import FOOTER_BYTES, MAGIC, RECORD_HEAD, DamagedError
+from hilrig_recorder.mcap_format.records import FOOTER_BYTES, RECORD_HEAD, DamagedError
 from support.recordings import PARAMETERS, Script, make, write
 
 SCRIPT = Script(seconds=0.6)

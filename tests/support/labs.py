@@ -196,6 +196,8 @@ class RunningLab:
             self.process.wait()
             for pid in children:
                 os.kill(pid, signal.SIGKILL)
+        if self.process.stdin is not None:
+            self.process.stdin.close()
 
 
 @contextmanager

@@ -122,12 +122,11 @@ class ControllerSession:
         eventually(lambda: self.lab.receives_states(self.rig), every_s=0.1)
         self.controller = self.lab.controller(self.rig)
         eventually(lambda: self.lab.unfinished(self.rig.name))
-        time.sleep(1.0)
+        time.sleep(1.0)  # recorded before the fault
         return self
 
     def __exit__(self, *_: object) -> None:
-        # Record for one more second after the fault.
-        time.sleep(1.0)
+        time.sleep(1.0)  # recorded after the fault
         self.end_ns = time.monotonic_ns()
         assert self.controller.stdin is not None
         self.controller.stdin.close()

@@ -159,7 +159,7 @@ class Plc:
                 transaction, _, length, unit = HEADER.unpack(_exactly(connected, 7))
                 pdu = _exactly(connected, length - 1)
                 if self._delay_s:
-                    time.sleep(self._delay_s)
+                    time.sleep(self._delay_s)  # a slow network
                 self.requests.append((time.monotonic_ns(), pdu))
                 reply: bytes | None
                 if self.fault is not None:
@@ -170,7 +170,7 @@ class Plc:
                 if reply is None:
                     break
                 if self._delay_s:
-                    time.sleep(self._delay_s)
+                    time.sleep(self._delay_s)  # a slow network
                 connected.sendall(reply)
                 if self.closes_after_response:
                     break

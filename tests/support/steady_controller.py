@@ -31,9 +31,9 @@ def main() -> None:
                     connection.sendall(READ)
                     if not connection.recv(64):
                         break
-                    time.sleep(0.02)
+                    time.sleep(0.02)  # the period of a controller
         except OSError:
-            time.sleep(0.1)
+            time.sleep(0.1)  # the rig is not reachable: try again
     print(answered)
 
 

@@ -50,7 +50,7 @@ def main() -> None:
             )
             before, before_s = position, now
             if mistake == "wait before write":
-                time.sleep(value_s)
+                time.sleep(value_s)  # the mistake
             if mistake == "computing":
                 # The amount of work varies, as that of an optimization does.
                 end = time.perf_counter() + value_s * (0.8 + 0.4 * ((now * 7.3) % 1))

@@ -23,7 +23,7 @@ def eventually(condition: Callable[[], T], *, timeout_s: float = LONG_TIMEOUT_S,
             return value
         if time.monotonic() > deadline:
             raise AssertionError(f"condition not met within {timeout_s} s (last value: {value!r})")
-        time.sleep(every_s)
+        time.sleep(every_s)  # polls
 
 
 def cpu_wait_s(pid: int) -> float:

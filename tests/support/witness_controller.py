@@ -25,7 +25,7 @@ def main() -> None:
                 struct.unpack_from(">f", response, 9 + 2 * 12)[0],
                 struct.unpack_from(">f", response, 9 + 2 * 20)[0],
             )
-            time.sleep(think_s)
+            time.sleep(think_s)  # the time in which a controller computes
             number += 1
             # Alternating signs: joint 4 does not speed up.
             mark = (number % 100 + 1) * (1 if number % 2 else -1)

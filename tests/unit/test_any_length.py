@@ -22,7 +22,7 @@ from hilrig_replay.plots.latency_plot import latency_figure
 from hilrig_replay.rerun_view import view as rerun_view
 from support.recordings import Script, record
 
-SHORT_S, TIMES = 16.0, 3
+SHORT_S, TIMES = 8.0, 3
 ROWS = 160
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 from hilrig_classroom.assignment import Assignment, AssignmentConfig, Measure, load_assignment
-from hilrig_classroom.gradebook import fill_export, grades_csv
+from hilrig_classroom.gradebook import fill_export, grades_csv, similar_text
 from hilrig_classroom.output import GradeFolder
-from hilrig_classroom.roster import Roster, read_roster
+from hilrig_classroom.pages import similar_groups
+from hilrig_runtime.config.roster import Roster, read_roster
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import InputError
 from support.labs import hilrig
@@ -75,10 +76,37 @@ def test_points_follow_the_rubric(graded: tuple[Path, dict[str, Any]]) -> None:
 
 def test_copies_are_listed_on_both_sides_without_a_verdict(graded: tuple[Path, dict[str, Any]]) -> None:
     rows = rows_of(graded[1])
-    assert rows["zoe"]["similar"] == ["zoe.mcap: the same recording as eve/eve.mcap"]
-    assert rows["eve"]["similar"] == ["eve.mcap: the same recording as zoe/zoe.mcap"]
+    same = {"share": 1.0, "same_recording": True}
+    assert rows["zoe"]["similar"] == [{"file": "zoe.mcap", "student": "eve", "other_file": "eve.mcap", **same}]
+    assert rows["eve"]["similar"] == [{"file": "eve.mcap", "student": "zoe", "other_file": "zoe.mcap", **same}]
     assert rows["taro"]["similar"] == []
+    assert similar_groups(graded[1]) == ["eve: eve.mcap; zoe: zoe.mcap: the same recording"]
     assert rows["zoe"]["points"] == rows["eve"]["points"]
+
+
+def test_many_similar_students_are_one_group_and_a_short_cell() -> None:
+    names = [f"s{number}" for number in range(8)]
+
+    def run(student: str, share: float) -> dict[str, Any]:
+        return {
+            "file": "a",
+            "student": student,
+            "other_file": f"{student}.mcap",
+            "share": share,
+            "same_recording": False,
+        }
+
+    rows = [{"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names]
+    rows[0]["similar"][6]["share"] = 0.91
+    pair = [{"id": "x", "similar": [run("y", 0.7)]}, {"id": "y", "similar": [run("x", 0.7)]}]
+    document = {"students": [*rows, *pair, {"id": "alone", "similar": []}]}
+    files = "; ".join(f"{name}: {name}.mcap" for name in names)
+    assert similar_groups(document) == [
+        f"{files}: 91 % same torques to 60 % same torques",
+        "x: x.mcap; y: y.mcap: 70 % same torques",
+    ]
+    assert similar_text(rows[0]).startswith("s7 (91 % same torques), s1 (60 % same torques), ")
+    assert similar_text(rows[0]).endswith(" and 2 more")
 
 
 def test_same_files_give_the_same_bytes(classroom: Path, graded: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

@@ -1,11 +1,17 @@
 """Roster of a class: encodings, separators, names of any script, and errors with their lines."""
 
+import csv
+import io
+import time
+import unicodedata
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hilrig_classroom.attempts import owner_of
-from hilrig_classroom.roster import Student, read_roster
+from hilrig_runtime.config.roster import Student, check_rigs, read_roster
 from hilrig_runtime.errors import InputError
 
 NAMES = ["Zoë Müller", "Νίκος Παπάς", "山田 太郎", "عمر حسن", "=HYPERLINK(1)"]
@@ -39,7 +45,89 @@ def test_every_invalid_row_is_named_with_its_line(tmp_path: Path) -> None:
     lines = str(failed.value).splitlines()
     assert [line.split(": ")[1] for line in lines] == ["line 2", "line 3", "line 4", "line 6", "line 7"]
     assert "expected 1 to 63 letters" in lines[0]
-    assert "occurs twice" in lines[3]
+    assert "occurs twice, first in line 5" in lines[3]
+
+
+_names = st.text(st.characters(exclude_categories=("Cc", "Cs", "Cf", "Zl", "Zp", "Zs")), min_size=1, max_size=12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    names=st.lists(_names, min_size=1, max_size=8),
+    delimiter=st.sampled_from(",;\t"),
+    newline=st.sampled_from(["\n", "\r\n", "\r"]),
+    quoting=st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL]),
+    bom=st.booleans(),
+    gaps=st.booleans(),
+)
+def test_every_written_name_is_read_again(
+    tmp_path_factory: pytest.TempPathFactory,
+    names: list[str],
+    delimiter: str,
+    newline: str,
+    quoting: int,
+    bom: bool,
+    gaps: bool,
+) -> None:
+    text = io.StringIO()
+    table = csv.writer(text, delimiter=delimiter, lineterminator=newline, quoting=quoting)  # type: ignore[arg-type]
+    table.writerow(["id", "name", "rig"])
+    for number, name in enumerate(names):
+        table.writerow([f"s{number}", f"={name}", f"rig{number}"])
+        if gaps:
+            text.write(newline + delimiter * 2 + newline)
+    path = tmp_path_factory.mktemp("roster") / "r.csv"
+    students = read_roster(roster_file(path, text.getvalue(), "utf-8-sig" if bom else "utf-8")).students
+    assert [unicodedata.normalize("NFC", f"={name}") for name in names] == [student.name for student in students]
+    assert [student.line for student in students] == [2 + (3 * n if gaps else n) for n in range(len(names))]
+
+
+def test_roster_of_ten_thousand_students_is_read_quickly(tmp_path: Path) -> None:
+    rows = "".join(f"s{number},Name {number},,rig{number}\n" for number in range(10_000))
+    path = roster_file(tmp_path / "r.csv", f"id,name,group,rig\n{rows}")
+    start = time.process_time()
+    roster = read_roster(path)
+    check_rigs(path, roster, {f"rig{number}" for number in range(10_000)}, claimed=False)
+    # A comparison of each student with all others takes ten times as long.
+    assert time.process_time() - start < 2
+    assert len(roster.students) == 10_000
+    with pytest.raises(InputError, match="at most 10000"):
+        read_roster(roster_file(path, f"id,name,group,rig\n{rows}one-more,Name,,\n"))
+
+
+def test_cell_with_line_breaks_does_not_shift_lines(tmp_path: Path) -> None:
+    text = 'id,name\na,"Ann\nMarie"\nb c,Bob\nd,"x\n'
+    path = roster_file(tmp_path / "r.csv", text)
+    with pytest.raises(InputError, match="line 5: no CSV table"):
+        read_roster(path)
+    with pytest.raises(InputError, match="line 4: id 'b c'"):
+        read_roster(roster_file(path, text.replace('"x', "Dan")))
+    assert read_roster(roster_file(path, text[:22])).students == (Student("a", "Ann Marie"),)
+
+
+def test_unquoted_separator_in_a_name_is_a_mistake(tmp_path: Path) -> None:
+    path = roster_file(tmp_path / "r.csv", "id,name,group,rig\na,Doe, Jane,A,rig1\nb,Bob,A,rig1,,\n")
+    with pytest.raises(InputError, match="line 2: 5 cells, the header has 4: put quotation marks") as failed:
+        read_roster(path)
+    assert "line 3" not in str(failed.value)
+    with pytest.raises(InputError, match="column 'rig' occurs twice"):
+        read_roster(roster_file(path, "id,name,rig,Rig\na,Ann,rig1,rig2\n"))
+
+
+def test_rigs_of_a_roster_are_those_of_the_lab(tmp_path: Path) -> None:
+    text = (
+        "id,name,group,rig\na,Ann,A,rig1\nb,Bob,A,rig1\nc,Cy,B,rig1\nd,Dan,,rig9\ne,Eve,,rig2\nf,Fay,,rig2\ng,Gil,,\n"
+    )
+    path = roster_file(tmp_path / "r.csv", text)
+    with pytest.raises(InputError) as failed:
+        check_rigs(path, read_roster(path), ["rig1", "rig2"], claimed=False)
+    lines = [line.split(": ", 2)[1:] for line in str(failed.value).splitlines()]
+    assert [line for line, _ in lines] == ["line 4", "line 5", "line 7"]
+    assert "rig1 of c is also the rig of a (line 2)" in lines[0][1]
+    assert "unknown rig 'rig9' of d; the lab has rig1, rig2" in lines[1][1]
+    with pytest.raises(InputError) as failed:
+        check_rigs(path, read_roster(path), ["rig1", "rig2"], claimed=True)
+    assert "line 4" not in str(failed.value)
 
 
 @pytest.mark.parametrize(

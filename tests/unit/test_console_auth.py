@@ -1,4 +1,4 @@
-"""Access control of the console: host names, password, listening address, options."""
+"""Access control of the console: host names, password, options."""
 
 import base64
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 from hilrig_cli.commands.console import console
 from hilrig_console.auth import AccessPolicy, normalize_host_names
-from hilrig_console.serving import ListenAddress
 from hilrig_runtime.errors import HilrigError, InputError, OperationError
 
 POLICY = AccessPolicy(allowed_hosts=normalize_host_names(["Lab-PC", "", "wall.example."]))
@@ -50,36 +49,6 @@ def test_accepts_password_with_any_user_name() -> None:
         assert not policy.accepts_password(header), header
     assert not policy.accepts_password(basic("a:sésame ouvre-toi").replace("Basic", "Bearer"))
     assert AccessPolicy().accepts_password("")
-
-
-@pytest.mark.parametrize(
-    ("text", "host", "port", "loopback"),
-    [
-        ("127.0.0.1:8050", "127.0.0.1", 8050, True),
-        ("localhost:0", "localhost", 0, True),
-        ("[::1]:80", "::1", 80, True),
-        (":8050", "", 8050, False),
-        ("0.0.0.0:8050", "0.0.0.0", 8050, False),
-        ("[::]:8050", "::", 8050, False),
-        ("lab.example:1", "lab.example", 1, False),
-    ],
-)
-def test_parses_listen_address(text: str, host: str, port: int, loopback: bool) -> None:
-    address = ListenAddress.parse(text)
-    assert (address.host, address.port, address.is_loopback) == (host, port, loopback)
-
-
-@pytest.mark.parametrize("text", ["8050", "127.0.0.1", "127.0.0.1:web", "127.0.0.1:70000", "a:²"])
-def test_rejects_invalid_listen_address(text: str) -> None:
-    with pytest.raises(InputError, match="expected HOST:PORT"):
-        ListenAddress.parse(text)
-
-
-def test_recognizes_loopback_addresses() -> None:
-    assert ListenAddress("127.1.2.3", 1).is_loopback
-    assert ListenAddress("localhost", 1).is_loopback
-    assert not ListenAddress("", 1).is_loopback
-    assert not ListenAddress("10.0.0.1", 1).is_loopback
 
 
 @pytest.mark.parametrize(

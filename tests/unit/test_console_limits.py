@@ -105,7 +105,7 @@ def test_second_request_on_a_connection_is_limited_too(server: Server) -> None:
     with socket.create_connection(server.address) as connection:
         assert get(connection).endswith(b"ok")
         for _ in range(3):
-            time.sleep(0.1)
+            time.sleep(0.1)  # the sum of the pauses exceeds the time-out of one request
             assert get(connection).endswith(b"ok")
         connection.sendall(REQUEST[:20])
         assert is_closed(connection)

@@ -12,10 +12,10 @@ from hilrig_console import catalog
 from hilrig_console.app import FRAME_PERIOD_S, STATIC_FOLDER
 from hilrig_console.events import MAX_EVENTS, EventBuffer
 from hilrig_console.view_model import ClientState, ViewModel
-from hilrig_monitoring.lab_view import RigStatus
+from hilrig_monitoring.lab_view import LabView, RigStatus
 from hilrig_replay.analysis.index import RunEntry
 from hilrig_replay.geometry import arm_picture
-from hilrig_schemas import Event, Health
+from hilrig_schemas import Event, ExceptionCount, Health, RigReport
 from support.recordings import PARAMETERS
 
 SCRIPT = (STATIC_FOLDER / "console.js").read_text(encoding="utf-8")
@@ -33,10 +33,17 @@ def fields_read(variable: str, *heads: str) -> set[str]:
 
 
 def lab_message() -> dict[str, Set[str]]:
-    model = ViewModel("lab", ("rig1",), start=0)
+    model = ViewModel("lab", LabView(("rig1",)), start=0)
     model.view.update(Health(service="sim", instance="1"), 0.0)
+    refused = ExceptionCount(host="127.0.0.1", function=3, code=2, count=7)
+    model.view.update(Health(service="edge", rig_reports=[RigReport(rig="rig1", exceptions=[refused])]), 0.0)
     lab = json.loads(model.frame(0.0, {"runs": 1}).lab)
-    return {"lab": lab.keys(), "rig": lab["rigs"][0].keys(), "service": lab["services"][0].keys()}
+    return {
+        "lab": lab.keys(),
+        "rig": lab["rigs"][0].keys(),
+        "service": lab["services"][0].keys(),
+        "refused": lab["rigs"][0]["exceptions"][0].keys(),
+    }
 
 
 def event_row() -> Set[str]:
@@ -61,6 +68,7 @@ def test_fields_of_the_lab_are_sent() -> None:
     assert (
         {"host", "silent"} <= fields_read("service", "function showServices(", "function showLab(") <= sent["service"]
     )
+    assert {"host", "function", "code", "count"} == fields_read("refused", "function showRefused(") == sent["refused"]
     assert set(re.findall(r"\(rig\) => rig\.(\w+)", body("function showLab("))) - {"level"} <= sent["rig"]
 
 
@@ -113,7 +121,7 @@ def test_constants_of_the_page_equal_those_of_python(name: str, value: int) -> N
 
 
 def test_page_listens_to_each_kind_of_message() -> None:
-    model = ViewModel("lab", ("rig1",), start=0)
+    model = ViewModel("lab", LabView(("rig1",)), start=0)
     model.events.add("hil/lab/sim/event", Event(text="text").SerializeToString())
     text, _ = model.frame(0.0, {}).updates(ClientState())
     assert set(re.findall(r'on\("(\w+)", ', SCRIPT)) == set(re.findall(r"^event: (\w+)$", text, re.MULTILINE))

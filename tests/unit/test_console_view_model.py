@@ -180,7 +180,7 @@ def test_browser_receives_updates_and_all_events() -> None:
 
 
 def lab_model() -> ViewModel:
-    model = ViewModel("lab", ("rig1", "rig2"), 0)
+    model = ViewModel("lab", LabView(("rig1", "rig2")), 0)
     sim = [RigReport(rig="rig1", loop_us=[20_000, 30_000]), RigReport(rig="rig2", safe=True)]
     edge = [RigReport(rig="rig1", controller="192.0.2.7:9", session="s"), RigReport(rig="rig2")]
     model.view.update(Health(service="sim", instance="1", overruns=3, lateness_p99_ns=40_000, rig_reports=sim), 0.0)
@@ -209,7 +209,7 @@ def test_lab_message_has_state_of_each_rig() -> None:
 
 
 def test_lab_message_has_bus_error_without_lab() -> None:
-    model = ViewModel("lab", ("rig1",), 0)
+    model = ViewModel("lab", LabView(("rig1",)), 0)
     model.bus_error = "no zenoh router answers"
     lab = json.loads(model.frame(0.0, {}).lab)
     assert (lab["services"], lab["bus_error"]) == ([], "no zenoh router answers")
@@ -225,7 +225,7 @@ def test_lab_message_changes_once_per_second() -> None:
 
 
 def test_lab_message_is_sent_without_changes() -> None:
-    model, client = ViewModel("lab", (), 0), ClientState()
+    model, client = ViewModel("lab", LabView(()), 0), ClientState()
     for second in range(3):
         text, client = model.frame(float(second), {}).updates(client)
         assert text.startswith("event: lab\n")

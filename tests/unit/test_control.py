@@ -2,12 +2,22 @@
 
 import pytest
 
+from hilrig_cli import client
 from hilrig_cli.client import send_control_request
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.control import handle_control_request, release_series
-from hilrig_schemas import ControlReply, ControlRequest, ResetRig, ServiceInfo, StartSession, topics
+from hilrig_schemas import (
+    ControlReply,
+    ControlRequest,
+    LeaseRequest,
+    LeaseStatus,
+    ResetRig,
+    ServiceInfo,
+    StartSession,
+    topics,
+)
 from support.foreign_requests import EXECUTED, KINDS, OWN, REFUSED, SERIES
 
 LAB = LabConfig()
@@ -91,3 +101,42 @@ def test_only_queries_have_a_request_type(topic: topics.Topic) -> None:  # type:
 
 def test_every_request_is_executed_by_a_service() -> None:
     assert {kind for kinds in EXECUTED.values() for kind in kinds} == set(KINDS)
+
+
+def test_request_with_a_value_out_of_bounds_is_refused() -> None:
+    service = FakeService()
+    with pytest.raises(OperationError, match="rig has 5000 characters"):
+        service.handle(ControlRequest(software_version=OWN, reset_rig=ResetRig(rig="x" * 5_000)).SerializeToString())
+    assert service.rigs == []
+
+
+EDGE = ServiceInfo(service="edge", instance="1", software_version=OWN, rigs=["rig1"])
+
+
+def replying(key: str, payload: bytes) -> MemoryBus:
+    bus = MemoryBus(MemoryHub())
+    bus.declare_queryable(key, lambda _: payload)
+    bus.declare_queryable(topics.SERVICE_INFO.key(LAB.name, "edge", "1"), lambda _: EDGE.SerializeToString())
+    return bus
+
+
+def test_text_of_a_reply_is_printable() -> None:
+    payload = ControlReply(text="done\x1b[2J", session="s\n1").SerializeToString()
+    bus = replying(topics.CONTROL.key(LAB.name, "edge", "1"), payload)
+    reply = send_control_request(bus, LAB, EDGE, reset())
+    assert (reply.text, reply.session) == (r"done\x1b[2J", r"s\x0a1")
+
+
+@pytest.mark.parametrize("payload", [b"\xff", ControlReply(text="x" * 2_000_000).SerializeToString()])
+def test_invalid_control_reply_is_an_error(payload: bytes) -> None:
+    bus = replying(topics.CONTROL.key(LAB.name, "edge", "1"), payload)
+    with pytest.raises(OperationError, match=r"edge/1 on .* sent an invalid reply: .*; compare the versions"):
+        send_control_request(bus, LAB, EDGE, reset())
+
+
+@pytest.mark.parametrize("reply", [LeaseStatus(rig="rig2"), LeaseStatus(rig="rig1", watchdog_timeout_ns=-(1 << 63))])
+def test_invalid_lease_reply_is_an_error(monkeypatch: pytest.MonkeyPatch, reply: LeaseStatus) -> None:
+    bus = replying(topics.LEASE.key(LAB.name, "rig1"), reply.SerializeToString())
+    monkeypatch.setattr(client, "ZenohBus", lambda *_: bus)
+    with pytest.raises(OperationError, match=r"an edge sent an invalid reply: (message of rig|watchdog_timeout_ns is)"):
+        client.query_edges(LAB, topics.LEASE, "rig1", LeaseRequest())

@@ -93,7 +93,7 @@ def test_services_with_distinct_rigs_do_not_conflict() -> None:
     with service(hub, "1", ("rig1", "rig2"), 1_000) as one, service(hub, "2", ("rig3",), 2_000) as other:
         one.ready()
         other.ready()
-        found = list_services(MemoryBus(hub), LAB.name)
+        found = list_services(MemoryBus(hub), LAB)
         assert [(each.instance, list(each.rigs)) for each in found] == [("1", ["rig1", "rig2"]), ("2", ["rig3"])]
         assert all(each.host and each.software_version for each in found)
 
@@ -156,7 +156,7 @@ def test_reply_that_contradicts_its_key_is_dropped() -> None:
         assert not victim.stopping.is_set()
         assert victim.counters.malformed >= 1
         assert "edge/west: message of 'edge/1'" in victim.counters.rejected
-    assert list_services(MemoryBus(hub), LAB.name) == []
+    assert list_services(MemoryBus(hub), LAB) == []
 
 
 def test_conflict_needs_a_liveliness_token() -> None:
@@ -175,6 +175,17 @@ def test_claimed_rigs_of_another_certificate_are_ignored() -> None:
         own.ready()
         assert not own.stopping.is_set()
         assert own.counters.malformed >= 1
+
+
+def test_addresses_of_rigs_of_another_certificate_are_ignored() -> None:
+    """A command or the console would show the address of the wrong edge."""
+    hub = MemoryHub()
+    lab = LAB.model_copy(update={"bus": BusConfig(tls=BusTlsConfig(edges={"east": ("rig1",), "west": ("rig3",)}))})
+    claimed = info("edge", "west", rigs=("rig1", "rig3", "rig2"))
+    claimed.addresses.extend(["10.0.0.9:502", "10.0.0.3:502"])
+    answer(hub, SERVICE_INFO.key(LAB.name, "edge", "west"), claimed, "edge/west")
+    [found] = list_services(MemoryBus(hub), lab)
+    assert (list(found.rigs), list(found.addresses)) == (["rig3"], ["10.0.0.3:502"])
 
 
 def test_wall_clock_at_a_limit_of_int64_is_dropped() -> None:

@@ -20,23 +20,28 @@ from hilrig_modbus_edge.server.event_loop import (
 )
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the loop of asyncio rounds the time-outs of epoll, on Linux")
 def test_timer_is_not_rounded_to_milliseconds() -> None:
-    delay_s, late_s = 0.000_25, list[float]()
+    delay_s = 0.000_25
 
-    async def body() -> None:
+    async def lateness_s() -> list[float]:
+        late_s = []
         loop = asyncio.get_running_loop()
         for _ in range(100):
             called: asyncio.Future[float] = loop.create_future()
             due_s = loop.time() + delay_s
             loop.call_at(due_s, lambda called=called: called.set_result(loop.time()))  # type: ignore[misc]
             late_s.append(await called - due_s)
+        return late_s
 
     with asyncio.Runner(loop_factory=DirectEventLoop) as runner:
-        runner.run(body())
+        exact_s = runner.run(lateness_s())
+    with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+        rounded_s = runner.run(lateness_s())
     # asyncio calls a timer that is due within the resolution of its clock.
-    assert min(late_s) > -1e-6
-    # At least one of a hundred is not delayed by other processes.
-    assert min(late_s) < 0.001 - delay_s
+    assert min(exact_s) > -1e-6
+    # At least one of a hundred is not delayed by other processes. A rounded one is late by the rest of a millisecond.
+    assert min(exact_s) < min(rounded_s) - 0.0002
 
 
 def test_timers_are_called_in_order() -> None:
@@ -182,7 +187,7 @@ async def connect() -> tuple[SocketTransport, Protocol, socket.socket]:
 async def until(is_true: object) -> None:
     async with asyncio.timeout(10):
         while not is_true():  # type: ignore[operator]
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(0.001)  # polls
 
 
 def test_internal_error_closes_one_connection_only(caplog: pytest.LogCaptureFixture) -> None:
@@ -229,7 +234,7 @@ def test_paused_reading_leaves_bytes_in_the_socket() -> None:
         with peer:
             transport.pause_reading()
             await loop.sock_sendall(peer, b"later")
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.01)  # the loop would read the socket in this time
             assert protocol.received == b""
             transport.resume_reading()
             await until(lambda: protocol.received == b"later")
@@ -253,13 +258,12 @@ def test_kernel_timestamp_precedes_a_stall_of_the_loop() -> None:
                 assert transport.received_ns(0, time.monotonic_ns()) == 0
                 sent_ns = time.monotonic_ns()
                 peer.sendall(b"hello")
-                received_ns = time.monotonic_ns()
-                time.sleep(0.05)
+                time.sleep(0.05)  # the stall of the event loop
+                ended_ns = time.monotonic_ns()
                 await until(lambda: protocol.received == b"hello")
                 now_ns = time.monotonic_ns()
                 stamp_ns = transport.received_ns(sent_ns, now_ns)
-                # Softirqs may deliver the segment to the receiver after the call of the sender has returned.
-                assert sent_ns <= stamp_ns <= received_ns + 20_000_000
+                assert sent_ns <= stamp_ns < ended_ns
                 # What lies outside the bounds was stamped on another wall clock.
                 assert transport.received_ns(stamp_ns + 1_000_000, now_ns) == 0
                 assert transport.received_ns(sent_ns, stamp_ns - 1_000_000) == 0

@@ -30,7 +30,11 @@ CASES = {
     "eight coils": ("0F 0000 0008 01 01", "wrote coils 1-8, only 1 is writable (exception 02): reduce the count to 1"),
     "nonexistent register": ("03 01F3 0001", "choose one of them; number n has address n - 1"),
     "second half of function 23": ("17 0000 0009 0000 0001 02 0000", "only 1-8 exist (exception 02): reduce the count"),
-    "write of function 23": ("17 0004 0004 0004 0001 02 0000", "wrote holding register 5"),
+    "write of function 23": (
+        "17 0004 0004 0004 0001 02 0000",
+        "wrote holding register 5 and read holding registers 5-8, only 1-4, 101-102, 301-302 are writable "
+        "(exception 02): choose one of them; number n has address n - 1\n",
+    ),
     "coil value": ("05 0000 0001", "wrote coil 1, the value is 0001 (exception 03): use FF00 for on and 0000 for off"),
     "quantity 0": ("03 0000 0000", "the quantity is 0 (exception 03): use 1 to 125"),
     "quantity 126": ("04 0000 007E", "the quantity is 126 (exception 03): use 1 to 125"),
@@ -50,7 +54,8 @@ def test_each_mistake_is_explained(name: str) -> None:
     pdu = bytes.fromhex(request)
     reply = execute(bench.device, bench.connect(), pdu, 0)
     assert reply[0] == pdu[0] | 0x80
-    assert expected in explain(1, 1, pdu, reply[1])
+    # A newline in an example is the end of the text.
+    assert expected in f"{explain(1, 1, pdu, reply[1])}\n"
 
 
 def test_unit_id_is_explained() -> None:

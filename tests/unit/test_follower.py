@@ -120,13 +120,18 @@ def test_commands_before_the_first_state_are_ignored(watched: Watched) -> None:
     assert watched.shown().rows("/position") == 50
 
 
-def test_undecodable_message_is_reported_and_skipped(watched: Watched) -> None:
+def test_invalid_messages_are_skipped_and_reported_rarely(watched: Watched) -> None:
+    watched.bus.declare_queryable(CONFIG.key("lab", "rig1"), lambda _: b"\xff")
     watched.serve()
     watched.follower.find(threading.Event())
-    watched.bus.publisher(KEYS["state"], Traffic.CONTROL).put(b"\xff\xff\xff")
+    for payload in (b"\xff\xff\xff", JointState(rig="rig2").SerializeToString(), b"\xff"):
+        watched.bus.publisher(KEYS["state"], Traffic.CONTROL).put(payload)
     watched.follower.step()
     assert len(watched.notices) == 1
-    assert "can't be decoded" in watched.notices[0]
+    assert "rig1/state: a message is invalid" in watched.notices[0]
+    watched.clock.advance(10_000_000_000)
+    watched.follower.step()
+    assert "(2 times)" in watched.notices[1]
 
 
 def test_pending_messages_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,15 +58,13 @@ def exit_code(command: Callable[[], None]) -> int:
     return 0
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-def test_each_list_isolates_any_error(
-    error: Exception,
+def test_each_list_isolates_an_error(
     recordings: list[Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    fail(monkeypatch, error)
+    fail(monkeypatch, MemoryError())
     assert exit_code(lambda: latency_command.latency(recordings, None, as_json=True)) == 1
     found = json.loads(capsys.readouterr().out)
     assert [Path(run["path"]).name for run in found["runs"]] == ["a.mcap", "c.mcap"]

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from hilrig_cli.commands.top import render
-from hilrig_monitoring.lab_view import SILENT_AFTER_S, WINDOW_S, LabView
+from hilrig_monitoring.lab_view import MAX_SERVICES, SILENT_AFTER_S, WINDOW_S, LabView
 from hilrig_monitoring.prometheus import exposition
 from hilrig_schemas import Health, RigReport
 
@@ -164,3 +164,21 @@ def test_silent_service_keeps_its_counters_only() -> None:
     assert f"hilrig_up{labels} 0\n" in later
     assert f"hilrig_overruns_total{labels} 3\n" in later
     assert f"hilrig_lateness_p99_seconds{labels}" not in later
+
+
+def test_reports_of_rigs_of_another_certificate_are_ignored() -> None:
+    made = LabView(("rig1", "rig2"), lambda source, rig: (source, rig) != ("edge/east", "rig1"))
+    forged = edge()
+    forged.rig_reports[1].loop_us.append(1)
+    made.update(forged, 1.0)
+    first, second = made.rigs(1.0)
+    assert (first.served, first.controller) == (False, "")
+    assert (second.served, second.watchdog_tripped) == (True, True)
+    assert second.loops_us == [], "the simulation reports latencies"
+
+
+def test_services_are_bounded() -> None:
+    made = LabView()
+    for number in range(MAX_SERVICES + 9):
+        made.update(Health(service="sim", instance=str(number)), 1.0)
+    assert len(made.services()) == MAX_SERVICES

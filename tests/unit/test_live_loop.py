@@ -1,7 +1,5 @@
 """The client of a live rig, and the measurement of its tick phase from its step counter."""
 
-import time
-
 import pytest
 from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.register_message import (
@@ -20,30 +18,36 @@ STEP_NS = 20_000_000
 
 
 class Counter:
-    """Step counter behind a simulated network that delays a request before each tick."""
+    """Step counter behind a simulated network that delays a request before each tick; it has the clock of the test."""
 
     def __init__(self, *, stopped: bool = False) -> None:
-        self.start_ns = time.monotonic_ns() - STEP_NS // 2
+        self.now_ns = 7 * STEP_NS + STEP_NS // 3
         self._stopped = stopped
         self._delayed = 0
 
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_ns += round(duration_s * 1e9)
+
     def step(self) -> int:
-        now_ns = time.monotonic_ns()
-        to_tick_ns = STEP_NS - (now_ns - self.start_ns) % STEP_NS
-        if 6_000_000 < to_tick_ns < 9_000_000:
-            # The request is sent long before a tick and answered after it.
+        self.now_ns += 100_000
+        to_tick_ns = STEP_NS - self.now_ns % STEP_NS
+        if 6_000_000 < to_tick_ns < 9_000_000 and self._delayed < 10:
             self._delayed += 1
-            time.sleep((to_tick_ns + 100_000) * 1e-9)
-        return 0 if self._stopped else (time.monotonic_ns() - self.start_ns) // STEP_NS
+            # The request is sent long before a tick and answered after it.
+            self.now_ns += to_tick_ns + 100_000
+        return 0 if self._stopped else self.now_ns // STEP_NS
 
 
-def test_delayed_request_does_not_shift_tick_phase() -> None:
+def test_delayed_request_does_not_shift_tick_phase(monkeypatch: pytest.MonkeyPatch) -> None:
     counter = Counter()
+    monkeypatch.setattr(live_loop, "time", counter)
     tick_ns = measure_tick_phase(counter, STEP_NS)  # type: ignore[arg-type]
-    assert counter._delayed > 3
-    after_ns = (tick_ns - counter.start_ns) % STEP_NS
-    # Never early; at least one of 25 ticks is observed promptly.
-    assert after_ns < STEP_NS // 4
+    assert counter._delayed == 10
+    # Never early; late at most by the spacing of the requests.
+    assert tick_ns % STEP_NS < 400_000
 
 
 class DeviceClient:
@@ -80,6 +84,8 @@ def test_rig_client_uses_the_register_map(monkeypatch: pytest.MonkeyPatch) -> No
     assert list(bench.commands[-1].effort) == [1.0, -2.0, 3.0, 0.5]
 
 
-def test_rejects_stopped_step_counter() -> None:
+def test_rejects_stopped_step_counter(monkeypatch: pytest.MonkeyPatch) -> None:
+    counter = Counter(stopped=True)
+    monkeypatch.setattr(live_loop, "time", counter)
     with pytest.raises(OperationError, match="does not step"):
-        measure_tick_phase(Counter(stopped=True), STEP_NS)  # type: ignore[arg-type]
+        measure_tick_phase(counter, STEP_NS)  # type: ignore[arg-type]

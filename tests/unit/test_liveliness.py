@@ -1,6 +1,6 @@
 """Lost peers are reported after a grace time, and their return too."""
 
-from hilrig_runtime.process.liveliness import PEER_DOWN_GRACE_NS, PeerDownTracker
+from hilrig_runtime.process.liveliness import MAX_PEERS, PEER_DOWN_GRACE_NS, PeerDownTracker
 
 
 def test_lost_peer_is_reported_once() -> None:
@@ -36,3 +36,11 @@ def test_peers_lost_together_are_reported_together() -> None:
     tracker.mark_down("recorder/1", 3)
     assert tracker.due_ns == PEER_DOWN_GRACE_NS
     assert tracker.overdue(PEER_DOWN_GRACE_NS + 5) == ["recorder/1", "sim/1"]
+
+
+def test_tracked_peers_are_bounded() -> None:
+    tracker = PeerDownTracker()
+    for number in range(2 * MAX_PEERS):
+        tracker.mark_down(f"sim/{number}", number)
+        tracker.overdue(PEER_DOWN_GRACE_NS + number // 2)
+    assert len(tracker._down_since_ns) + len(tracker._reported) == MAX_PEERS

@@ -38,6 +38,14 @@ def test_text_log_has_time_source_and_level(
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} edge east: WARNING: link lost\n", line)
 
 
+def test_text_log_escapes_control_characters(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = log_line("edge", "text", "lost sim/\x1b[2J\n2026-01-01T00:00:00.000 sim: ERROR: forged", monkeypatch, capsys)
+    assert r"lost sim/\x1b[2J\x0a2026" in line
+    assert line.count("\n") == 1
+
+
 def test_json_log_is_one_object_per_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     [line] = log_line("up", "json", "two\nlines", monkeypatch, capsys).splitlines()
     entry = json.loads(line)

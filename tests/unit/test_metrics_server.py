@@ -12,24 +12,25 @@ import pytest
 
 from hilrig_monitoring import metrics_server
 from hilrig_monitoring.metrics_server import MAX_CONNECTIONS, MetricsServer
+from hilrig_runtime.listen_address import ListenAddress
 from support.waiting import eventually
 
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[MetricsServer]:
     monkeypatch.setattr(metrics_server, "POLL_S", 0.02)
-    with MetricsServer(("127.0.0.1", 0), lambda: "a 1\n") as server:
+    with MetricsServer(ListenAddress("127.0.0.1", 0), lambda: "a 1\n") as server:
         yield server
     assert not server._open
 
 
 def scrape(server: MetricsServer) -> bytes:
-    with urlopen(f"http://127.0.0.1:{server.server_port}/metrics", timeout=3) as answer:
+    with urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=3) as answer:
         return bytes(answer.read())
 
 
 def connect(server: MetricsServer, source: str = "127.0.0.1") -> socket.socket:
-    return socket.create_connection(("127.0.0.1", server.server_port), timeout=3, source_address=(source, 0))
+    return socket.create_connection(("127.0.0.1", server.port), timeout=3, source_address=(source, 0))
 
 
 def is_closed(connection: socket.socket) -> bool:
@@ -44,9 +45,9 @@ def is_closed(connection: socket.socket) -> bool:
 
 def test_metrics_are_at_their_path_only(server: MetricsServer) -> None:
     assert scrape(server) == b"a 1\n"
-    with urlopen(f"http://127.0.0.1:{server.server_port}/metrics", timeout=3) as answer:
+    with urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=3) as answer:
         assert answer.headers["Content-Type"].split(";")[0] == "text/plain"
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=3)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=3)
     connection.request("GET", "/")
     assert connection.getresponse().status == 404
     connection.close()
@@ -75,7 +76,7 @@ def test_slow_request_ends_at_its_time(server: MetricsServer, monkeypatch: pytes
         with suppress(OSError):
             while time.monotonic() - start_s < 3:
                 slow.sendall(b"X")
-                time.sleep(0.05)
+                time.sleep(0.05)  # several bytes within the time-out
         assert time.monotonic() - start_s < 2
 
 

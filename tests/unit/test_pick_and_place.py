@@ -1,4 +1,9 @@
-"""Unit tests of the pick-and-place controller, also with a slow loop, and of the placement check."""
+"""Unit tests of the pick-and-place controller, also with a slow loop, and of the placement check.
+
+With HILRIG_LONG in the environment with more delays.
+"""
+
+import os
 
 import numpy as np
 import pytest
@@ -10,13 +15,15 @@ from hilrig_sim.arm.model import ArmParameters, RigParameters
 from support.recordings import PARAMETERS
 from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, run_controller
 
+LONG = bool(os.environ.get("HILRIG_LONG"))
+
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:
     state = next(state for state in reversed(states) if state.parts)
     return list(state.parts), state.held_part
 
 
-@pytest.mark.parametrize("extra_ms", [0, 20, 40, 60])
+@pytest.mark.parametrize("extra_ms", [0, 20, 40, 60] if LONG else [0, 60])
 def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     with VirtualRig() as rig:
         done_s = run_controller(rig, 20.0, state_delay_ms=extra_ms // 2, command_delay_ms=extra_ms - extra_ms // 2)
@@ -30,7 +37,7 @@ def test_every_part_is_placed_within_2_mm_at_any_latency(extra_ms: int) -> None:
     assert rig.kinds().count("PART_PICKED") == rig.kinds().count("PART_DROPPED") == 4
 
 
-@pytest.mark.parametrize("one_way_ms", [0.0, 3.0, 6.0, 9.5, 20.0, 30.0])
+@pytest.mark.parametrize("one_way_ms", [0.0, 3.0, 6.0, 9.5, 20.0, 30.0] if LONG else [9.5, 30.0])
 def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch: pytest.MonkeyPatch) -> None:
     example = pick_and_place()
     with VirtualRig() as rig:
@@ -45,7 +52,7 @@ def test_all_parts_are_placed_over_a_slow_network(one_way_ms: float, monkeypatch
 
 
 @pytest.mark.parametrize("one_way_ms", [0.0, 20.0])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2, 3] if LONG else [2])
 def test_stalls_delay_the_task_but_do_not_spoil_it(
     one_way_ms: float, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

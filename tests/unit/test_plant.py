@@ -179,7 +179,7 @@ def test_trajectory_is_bit_identical_for_any_number_of_rigs(count: int) -> None:
     together = Plant(rigs)
     watched = [0, count // 2, count - 1]
     alone = [Plant([rigs[index]]) for index in watched]
-    for step in range(150):
+    for step in range(75):
         if step % 25 == 0:
             effort = rng.uniform(-6, 6, (4, count))
         effort[2] = rng.uniform(-9, 3)

@@ -86,11 +86,9 @@ def test_report_counts_nothing_of_a_later_time() -> None:
     assert reports[3:] == [(10_001, 1)], "the cause has ended: this is a first occurrence"
 
 
-@given(
-    st.lists(st.tuples(st.sampled_from("abcde"), st.integers(0, 150), st.sampled_from(["record", "check", "flush"])))
-)
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 150), st.sampled_from(["record", "check", "flush"]))))
 def test_each_occurrence_is_in_one_report(steps: list[tuple[str, int, str]]) -> None:
-    reported: dict[str, int] = dict.fromkeys("abcde", 0)
+    reported: dict[str, int] = dict.fromkeys("abc", 0)
     recorded = dict(reported)
     last_ns: dict[str, int] = {}
     now = 0
@@ -111,6 +109,25 @@ def test_each_occurrence_is_in_one_report(steps: list[tuple[str, int, str]]) -> 
         else:
             reporter.flush()
             assert reported == recorded
+
+
+def test_further_keys_of_a_period_are_reported_together() -> None:
+    """The hosts of a flood may all differ."""
+    reports: list[tuple[int, int]] = []
+    reporter: RepeatReporter[int, int] = RepeatReporter(
+        PERIOD, lambda item, count: reports.append((item, count)), keys=3
+    )
+    for host in range(50):
+        reporter.record(host, host, host)
+    assert reports == [(0, 1), (1, 1), (2, 1), (3, 1)]
+    reporter.record(1, 1, 60)
+    reporter.check(PERIOD + 3)
+    assert reports[4:] == [(1, 1), (49, 46)]
+    # Their period has ended: new keys have places again.
+    reporter.record(70, 70, 3 * PERIOD)
+    assert reports[6:] == [(70, 1)]
+    reporter.flush()
+    assert sum(count for _, count in reports) == 52
 
 
 def test_repeat_suffix_is_empty_for_one_occurrence() -> None:

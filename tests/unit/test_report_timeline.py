@@ -6,7 +6,6 @@ import json
 import re
 import tomllib
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,11 +65,16 @@ def test_ages_are_at_the_steps_of_their_states(run: Run) -> None:
     assert np.isnan(ages[0])
 
 
-def test_page_values_are_json_and_can_not_end_their_element(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Report page of a run with a task whose title ends an element."""
     lab = "[task]\ntitle = '</script><b>'\n[[task.poses]]\nname = 'a'\nposition_mm = [400, 100, 50]\n"
     script = Script(seconds=2.0)
-    path = write(tmp_path / "run.mcap", make(script), script=script, lab_toml=lab)
-    page = build_report([path]).html
+    path = write(tmp_path_factory.mktemp("page") / "run.mcap", make(script), script=script, lab_toml=lab)
+    return build_report([path]).html
+
+
+def test_page_values_are_json_and_can_not_end_their_element(page: str) -> None:
     (values,) = re.findall(r'<script type="application/json" id="run-1-data">(.*?)</script>', page)
     assert json.loads(values)["goals"] == [{"name": "a", "time": None}]
     assert "</script><b>" not in page
@@ -84,17 +88,15 @@ def test_fields_that_the_script_reads_are_sent(run: Run) -> None:
     assert {"reach", "links", "shoulder"} <= scene <= found["scene"].keys()
 
 
-def test_vendored_files_are_unchanged_and_licensed(run: Run) -> None:
+def test_vendored_files_are_unchanged_and_licensed(page: str) -> None:
     for package in tomllib.loads((VENDOR / "VENDOR.toml").read_text())["packages"]:
         for name, digest in package["sha256"].items():
             assert hashlib.sha256((VENDOR / name).read_bytes()).hexdigest() == digest, name
         assert f"{package['name'].lower()}-{package['version']}" in {child.name for child in VENDOR.iterdir()}
-    page = build_report([run.path]).html
     assert "The MIT License (MIT)" in page
 
 
-def test_scripts_of_the_page_match_its_security_policy(run: Run) -> None:
-    page = build_report([run.path]).html
+def test_scripts_of_the_page_match_its_security_policy(page: str) -> None:
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None
     assert "default-src 'none'" in policy[1]

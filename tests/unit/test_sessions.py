@@ -413,6 +413,58 @@ def test_stream_that_stops_and_returns_is_reported() -> None:
     ]
 
 
+def test_loss_of_an_outage_of_an_hour_is_counted() -> None:
+    """The simulation is unreachable, but not the edge; its clock drifts by 100 ppm."""
+    bench = TrackerBench()
+    bench.start()
+    bench.states(50, every=400 * MS)
+    lost = 50 * 3600
+    bench.sim.sequence += lost
+    bench.sim._sequences[STATE.key(LAB, "rig1")] += lost
+    for _ in range(360):
+        bench.wait(10 * SECOND)
+        bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+    drift = 3600 * SECOND // 10_000
+    for _ in range(100):
+        bench.sim.state("rig1", bench.wall + drift)
+        bench.accept(bench.sim.batch())
+        bench.wait(20 * MS)
+    counters = bench.file.recording.counters
+    assert (counters.lost_transport, counters.lost_batches, counters.clock_steps) == (lost, lost, 0)
+    assert bench.store.losses == [(STATE.key(LAB, "rig1"), lost, 0)]
+    assert bench.store.outages[-1][0] == "messages of sim/1 received again"
+    assert bench.store.sources == [("edge/1", 1), ("sim/1", 1)]
+
+
+def test_restart_within_a_long_outage_loses_first_messages() -> None:
+    bench = TrackerBench()
+    bench.states(2)
+    bench.start()
+    bench.sim = FakeSource("sim/1", incarnation=2)
+    for _ in range(20):
+        bench.wait(10 * SECOND)
+        bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+        bench.sim.state("rig1", bench.wall)
+        bench.sim.batch()
+    bench.states(2)
+    assert bench.file.recording.counters.lost_transport == 20
+    bench.accept(bench.edge.batch([OpenSession(rig="rig1", session="s1")]))
+    bench.states(1, every=200 * SECOND)
+    assert list(bench.tracker._publishers._publishers) == [("edge/1", 1), ("sim/1", 2)], "one incarnation of each"
+
+
+def test_files_do_not_wait_for_a_dead_service() -> None:
+    bench = TrackerBench()
+    bench.states(2)
+    for _ in range(13):
+        bench.wait(10 * SECOND)
+        bench.accept(bench.edge.batch([]))
+    bench.start()
+    bench.end()
+    bench.wait(500 * MS)
+    assert bench.file.end == "ended"
+
+
 def test_event_of_a_long_outage_is_recorded() -> None:
     bench = TrackerBench()
     bench.start()
@@ -739,6 +791,18 @@ def test_rigs_and_sessions_of_another_certificate_are_dropped() -> None:
     assert [file.recording.session for file in bench.store.files] == ["own"]
 
 
+def test_messages_of_another_kind_of_service_are_dropped() -> None:
+    bench = TrackerBench()
+    bench.start()
+    forged = bench.edge.state("rig1", bench.wall)
+    event = bench.edge.put(EVENT, "sim", Event(kind=Event.OVERRUN, source="sim/1"), bench.wall)
+    bench.edge.put(EVENT, "edge", Event(kind=Event.OVERRUN, source="edge/1"), bench.wall)
+    bench.accept(bench.edge.batch())
+    assert not {forged.payload, event.payload} & set(bench.file.payloads)
+    assert bench.store.rejected == [f"edge/1: key {one.key} is of another service" for one in (forged, event)]
+    assert bench.tracker.has_received("edge")
+
+
 def test_session_is_ended_by_its_owner_only() -> None:
     bench = TrackerBench()
     bench.start()
@@ -761,7 +825,8 @@ def test_sessions_rigs_and_publishers_are_bounded() -> None:
     for number in range(MAX_PUBLISHERS + 50):
         bench.accept(LogBatch(source="edge/9", incarnation=number + 1, sequence=1))
         bench.wait(MS)
-    assert len(bench.tracker._publishers._publishers) <= MAX_PUBLISHERS + 2
+    assert len(bench.tracker._publishers._publishers) == MAX_PUBLISHERS
+    assert {"sim/1", "edge/1"} < bench.tracker.last_received().keys(), "it evicts its own incarnations"
 
 
 def test_unknown_input_is_reported_once() -> None:

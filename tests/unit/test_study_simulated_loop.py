@@ -220,7 +220,7 @@ def growth(outcome: Outcome, number: int, pose: tuple[float, float, float, float
 
 
 @pytest.mark.parametrize("pose", POSES)
-@pytest.mark.parametrize("gain", [0.6, 0.8, 1.0, 1.3])
+@pytest.mark.parametrize("gain", [0.6, 1.3])
 def test_simulation_and_theory_agree_on_stable_delays(pose: tuple[float, float, float, float], gain: float) -> None:
     """The same constant delays from 0 to 120 ms are stable in simulation and theory."""
     plant_model = linearize(ARM, pose)

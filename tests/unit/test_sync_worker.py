@@ -29,7 +29,7 @@ class FakeWriter:
     def sync(self) -> None:
         if self.failure is not None:
             raise self.failure
-        time.sleep(self.sync_s)
+        time.sleep(self.sync_s)  # a slow disk
         self.synced.append(self.size)
 
     def finish(self) -> None:
@@ -149,7 +149,7 @@ def test_shutdown_renames_every_file_without_sync_if_late() -> None:
 
     def finish_slowly() -> None:
         started.set()
-        time.sleep(0.3)
+        time.sleep(0.3)  # a slow disk: longer than the time-out of the shutdown
 
     worker.finish(slow, finish_slowly)  # type: ignore[arg-type]
     worker.finish(fast, fast.finish)  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ from google.protobuf.message import DecodeError, Message
 
 from hilrig_runtime.errors import OperationError
 from hilrig_schemas import ControlReply, ControlRequest
+from hilrig_schemas.bounds import check_bounds
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -37,12 +38,18 @@ def decode_request(message: type[MessageT], payload: bytes) -> MessageT:
     """Decode the request of a query.
 
     Raises:
-        OperationError: the payload is not a message of this type.
+        OperationError: the payload is not a message of this type, or a value is out of its bounds.
     """
+    name = message.DESCRIPTOR.name
     try:
-        return message.FromString(payload)
+        request = message.FromString(payload)
     except DecodeError as error:
-        raise OperationError(f"not a valid {message.DESCRIPTOR.name}: {len(payload)} bytes can't be decoded") from error
+        raise OperationError(f"not a valid {name}: {len(payload)} bytes can't be decoded") from error
+    try:
+        check_bounds(request)
+    except DecodeError as error:
+        raise OperationError(f"not a valid {name}: {error}") from error
+    return request
 
 
 def check_versions(services: str, command: str) -> None:

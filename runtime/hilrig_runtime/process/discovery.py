@@ -15,12 +15,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import zip_longest
 from queue import Empty, SimpleQueue
 from typing import Final
 
 from google.protobuf.message import DecodeError
 
 from hilrig_runtime.bus.api import Bus, Handle, Reply
+from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.errors import OperationError, list_names
 from hilrig_runtime.process.liveliness import PeerDownTracker
@@ -92,9 +94,10 @@ def offset_of(info: ServiceInfo, reply: Reply, wall_ns: Callable[[], int]) -> Cl
     return ClockOffset(f"{info.service}/{info.instance}", info.wall_ns - middle_wall_ns, half_ns)
 
 
-def list_services(bus: Bus, lab: str, service: str = "*", *, timeout_s: float = QUERY_TIMEOUT_S) -> list[ServiceInfo]:
+def list_services(bus: Bus, lab: LabConfig) -> list[ServiceInfo]:
     """Query the running services of a lab; sorted by service and instance."""
-    found = [info for info, _ in query_services(bus, lab, service, Counters(), timeout_s)]
+    replies = query_services(bus, lab.name, "*", Counters(), QUERY_TIMEOUT_S, may_serve=lab.bus.may_serve)
+    found = [info for info, _ in replies]
     return sorted(found, key=lambda info: (info.service, info.instance, info.incarnation))
 
 
@@ -105,12 +108,22 @@ def query_services(
     counters: Counters,
     timeout_s: float,
     wall_ns: Callable[[], int] = SYSTEM_CLOCK.wall_ns,
+    may_serve: Callable[[str, str], bool] = lambda _source, _rig: True,
 ) -> Iterator[tuple[ServiceInfo, ClockOffset]]:
-    """Query the running services of a lab; yield each with the offset of its clock from this host's, `wall_ns`."""
+    """Query the running services of a lab; yield each with the offset of its clock from this host's, `wall_ns`.
+
+    `may_serve` returns whether a service may serve a rig according to its certificate: its other rigs are removed.
+    """
     for reply in bus.query(SERVICE_INFO.key(lab, service, "*"), timeout_s=timeout_s):
         try:
             if not reply.error:
                 info = SERVICE_INFO.decode_from(reply.key, reply.payload)
+                source = source_of_key(reply.key)
+                rows = list(zip_longest(info.rigs, info.addresses[: len(info.rigs)], fillvalue=""))
+                allowed = [row for row in rows if may_serve(source, row[0])]
+                if len(allowed) < len(rows):
+                    counters.reject(reply.key, "rigs that its certificate excludes")
+                    info.rigs[:], info.addresses[:] = [rig for rig, _ in allowed], [address for _, address in allowed]
                 yield info, offset_of(info, reply, wall_ns)
         except DecodeError as error:
             counters.reject(reply.key, error)
@@ -209,7 +222,9 @@ class PeerRegistry:
 
     def _find_conflict(self) -> str:
         bus, lab, clock = self._bus, self._lab, self._clock
-        replies = list(query_services(bus, lab, "*", self._counters, CLAIM_TIMEOUT_S, clock.wall_ns))
+        replies = list(
+            query_services(bus, lab, "*", self._counters, CLAIM_TIMEOUT_S, clock.wall_ns, may_serve=self._may_serve)
+        )
         # The service itself replies too.
         self.clock_offset = worst_offset(
             offset for other, offset in replies if other.incarnation != self._own.incarnation
@@ -219,13 +234,6 @@ class PeerRegistry:
         self.hosts = dict(
             [*self.hosts.items(), *((f"{other.service}/{other.instance}", other.host) for other in others)][-MAX_HOSTS:]
         )
-        for other in others:
-            allowed = [rig for rig in other.rigs if self._may_serve(f"{other.service}/{other.instance}", rig)]
-            if len(allowed) < len(other.rigs):
-                self._counters.reject(
-                    SERVICE_INFO.key(self._lab, other.service, other.instance), "rigs that its certificate excludes"
-                )
-            other.rigs[:] = allowed
         reason = conflict(self._info(), others)
         if not reason:
             return ""
@@ -272,4 +280,4 @@ class PeerRegistry:
     def _log_lost_peers(self, now_ns: int) -> None:
         lost = self._peers_down.overdue(now_ns)
         if lost:
-            logger.warning("lost contact with %s (stopped, or network failure)", ", ".join(lost))
+            logger.warning("lost contact with %s (stopped, or network failure)", list_names(lost, 8))

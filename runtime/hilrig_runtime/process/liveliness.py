@@ -8,6 +8,8 @@ from typing import Final
 
 PEER_DOWN_GRACE_NS: Final = 2_000_000_000
 """Time that a peer must be down before it is reported, ns."""
+MAX_PEERS: Final = 256
+"""Maximum number of peers that are tracked while they are down; a peer may invent others."""
 
 
 class PeerDownTracker:
@@ -20,7 +22,8 @@ class PeerDownTracker:
 
     def mark_down(self, peer: str, now_ns: int) -> None:
         """Record that a peer is down."""
-        self._down_since_ns.setdefault(peer, now_ns)
+        if len(self._down_since_ns) + len(self._reported) < MAX_PEERS:
+            self._down_since_ns.setdefault(peer, now_ns)
 
     def mark_up(self, peer: str) -> bool:
         """Record that a peer is up; return whether it was reported as lost."""

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from hilrig_runtime.errors import InputError
+from hilrig_runtime.escaping import printable
 from hilrig_runtime.process.shutdown import ErrorOutput
 
 logger = logging.getLogger(__name__)
@@ -34,6 +35,19 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(entry, ensure_ascii=False)
 
 
+class TextFormatter(logging.Formatter):
+    """Formats a record as text; control characters in messages, which contain text of other hosts, are escaped."""
+
+    def __init__(self, service: str, instance: str) -> None:
+        source = service if instance == "1" else f"{service} {instance}"
+        super().__init__(f"%(asctime)s.%(msecs)03d {source}: %(levelname)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 (a method of logging)
+        """See `logging.Formatter.formatMessage`."""
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+
 def start_logging(service: str, instance: str, log_format: str) -> None:
     """Start logging to standard error in `log_format`, "text" or "json"; with "json" also warnings and final errors.
 
@@ -50,9 +64,7 @@ def start_logging(service: str, instance: str, log_format: str) -> None:
         sys.excepthook = lambda kind, error, trace: logger.critical(str(error), exc_info=(kind, error, trace))
         threading.excepthook = _log_crash
     else:
-        source = service if instance == "1" else f"{service} {instance}"
-        text = logging.Formatter(f"%(asctime)s.%(msecs)03d {source}: %(levelname)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
-        handler.setFormatter(text)
+        handler.setFormatter(TextFormatter(service, instance))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 

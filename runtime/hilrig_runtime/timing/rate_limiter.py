@@ -70,26 +70,28 @@ class RepeatReporter(Generic[KeyT, ItemT]):
     """Reports at most once per key and period: the newest occurrence and the number of them since the last report.
 
     Every occurrence is in exactly one report: those that were suppressed are reported when their period ends (`check`)
-    or their cause does (`flush`), never with a later occurrence. Time is passed in.
+    or their cause does (`flush`), never with a later occurrence. Beyond `keys` keys in a period, which a sender may
+    invent, the further ones are reported together, as the newest of them. Time is passed in.
     """
 
-    def __init__(self, period_ns: int, report: Callable[[ItemT, int], None], keys: int = 256) -> None:
+    def __init__(self, period_ns: int, report: Callable[[ItemT, int], None], keys: int = 32) -> None:
         self._period_ns = period_ns
         self._report = report
         self._keys = keys
-        self._reported: dict[KeyT, _Reported[ItemT]] = {}
-        """In the order of the reports."""
+        self._reported: dict[KeyT | None, _Reported[ItemT]] = {}
+        """In the order of the reports; None: the keys beyond the capacity."""
         self._suppressed = 0
 
     def record(self, key: KeyT, item: ItemT, now_ns: int) -> None:
         """Record one occurrence at `now_ns`, monotonic clock, and report it if no report was made within the period."""
         self.check(now_ns)
-        before = self._reported.get(key)
+        place = None if key not in self._reported and self._is_full(now_ns) else key
+        before = self._reported.get(place)
         if before is not None and now_ns - before.reported_ns < self._period_ns:
-            self._reported[key] = _Reported(before.reported_ns, before.suppressed + 1, item)
+            self._reported[place] = _Reported(before.reported_ns, before.suppressed + 1, item)
             self._suppressed += 1
             return
-        self._remember(key, item, now_ns)
+        self._remember(place, item, now_ns)
         self._report(item, 1)
 
     def check(self, now_ns: int) -> None:
@@ -112,15 +114,19 @@ class RepeatReporter(Generic[KeyT, ItemT]):
             if count:
                 self._report(newest, count)
 
-    def _remember(self, key: KeyT, item: ItemT, now_ns: int) -> None:
+    def _is_full(self, now_ns: int) -> bool:
+        """Return whether all keys of the table were reported within the period."""
+        return len(self._reported) >= self._keys and (
+            now_ns - next(iter(self._reported.values())).reported_ns < self._period_ns
+        )
+
+    def _remember(self, key: KeyT | None, item: ItemT, now_ns: int) -> None:
         # Inserted again: the oldest report is first.
         self._reported.pop(key, None)
         self._reported[key] = _Reported(now_ns, 0, item)
-        if len(self._reported) > self._keys:
-            _, count, newest = self._reported.pop(next(iter(self._reported)))
-            if count:
-                self._suppressed -= count
-                self._report(newest, count)
+        if len(self._reported) > self._keys + 1:
+            # Its period has ended without a suppressed occurrence.
+            del self._reported[next(iter(self._reported))]
 
 
 def repeat_suffix(count: int) -> str:

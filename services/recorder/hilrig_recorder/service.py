@@ -249,12 +249,14 @@ class Recorder:
 
     def _fetch_config(self, rig: str) -> None:
         config = None
+        key = CONFIG.key(self._service.lab.name, rig)
         try:
-            key = CONFIG.key(self._service.lab.name, rig)
             for reply in self._service.bus.query(key, timeout_s=_CONFIG_TIMEOUT_S):
                 if not reply.error:
                     config = CONFIG.decode_from(reply.key, reply.payload)
-        except (DecodeError, OperationError) as error:
+        except DecodeError as error:
+            self._service.counters.reject(key, error)
+        except OperationError as error:
             logger.warning("%s: configuration can't be read: %s", rig, error)
         finally:
             self._executor.post(lambda: self._accept_config(rig, config))

@@ -84,8 +84,13 @@ def task_mistakes(task: TaskConfig, parameters: RigParameters) -> Iterator[str]:
                 f"task.place.parts: no ferromagnetic part {name!r} in the scene; its ferromagnetic parts: "
                 f"{', '.join(known) or 'none'}"
             )
-    if task.place is not None and not any(tray.places for tray in parameters.scene.trays):
-        yield "task.place: the scene has no tray with places"
+    if task.place is not None:
+        required = len(task.place.parts or known)
+        places = sum(len(tray.places) for tray in parameters.scene.trays)
+        if not places:
+            yield "task.place: the scene has no tray with places"
+        elif places < required:
+            yield f"task.place: {required} parts are to be placed, but the trays have {places} places"
 
 
 def _arm(config: ArmConfig) -> ArmParameters:

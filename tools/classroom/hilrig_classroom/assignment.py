@@ -1,6 +1,7 @@
 """Assignments: a folder with the lab file, the hand-out, the starter code, deadline and rubric.
 
-`assignment.toml` has the settings of this module; `lab.toml` has the task; `handout.md` is the text for the students.
+`assignment.toml` has the settings of this module; `lab.toml` has the task; `handout.md` is the text for the students;
+`starter.py`, which may be missing, is the program from which they start.
 """
 
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from hilrig_runtime.errors import InputError
 SETTINGS_FILE: Final = "assignment.toml"
 LAB_FILE: Final = "lab.toml"
 HANDOUT_FILE: Final = "handout.md"
+STARTER_FILE: Final = "starter.py"
 
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
@@ -98,6 +100,11 @@ class Assignment:
     folder: Path
     config: AssignmentConfig
     task: TaskConfig
+
+    @property
+    def lab_file(self) -> Path:
+        """Its lab file."""
+        return self.folder / LAB_FILE
 
     def penalty(self, started: datetime | None) -> float | None:
         """Share of the points that an attempt loses, 0 to 1; None: it is not accepted.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilrig_classroom.roster import Roster, Student
+from hilrig_runtime.config.roster import Roster, Student
 
 _SEPARATORS = "-_. "
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_classroom.roster import Roster, delimiter_of
+from hilrig_runtime.config.roster import Roster, delimiter_of
 from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError
 from hilrig_runtime.escaping import csv_text
@@ -23,6 +23,8 @@ _CANVAS_FIRST: Final = "Student"
 _CANVAS_KEYS: Final = ("SIS User ID", "SIS Login ID", "ID")
 _CANVAS_RESERVED: Final = re.compile(r"\b(Current|Final|Override) (Score|Grade|Points)\b")
 """Canvas drops columns with such headers."""
+MAX_SIMILAR: Final = 5
+"""Number of similar students that a cell of `grades.csv` names."""
 _MOODLE_KEYS: Final = ("ID number", "Username", "Email address", "Identifier")
 
 
@@ -70,7 +72,7 @@ def grades_csv(document: dict[str, Any], roster: Roster) -> str:
                 str(len(row["attempts"])),
                 *("" if goal not in reached else "yes" if reached[goal] else "no" for goal in goals),
                 attempt.get("data_quality", ""),
-                "; ".join(row["similar"]),
+                similar_text(row),
             ]
         )
     return _as_csv(rows, ",")
@@ -151,6 +153,18 @@ def feedback(row: dict[str, Any], document: dict[str, Any]) -> str:
     return "; ".join(parts)
 
 
+def similar_text(row: dict[str, Any]) -> str:
+    """Other students with the same torques, the most similar ones first; empty: none."""
+    runs = sorted(row["similar"], key=lambda run: (not run["same_recording"], -run["share"]))
+    texts = [f"{run['student']} ({similarity(run)})" for run in runs[:MAX_SIMILAR]]
+    return ", ".join(texts) + (f" and {len(runs) - MAX_SIMILAR} more" if len(runs) > MAX_SIMILAR else "")
+
+
+def similarity(run: dict[str, Any]) -> str:
+    """Similarity of two runs as text."""
+    return "the same recording" if run["same_recording"] else f"{int(100 * run['share'])} % same torques"
+
+
 def used_attempt(row: dict[str, Any]) -> dict[str, Any] | None:
     """The attempt of a student that counts; None: no attempt counts."""
     return next((attempt for attempt in row["attempts"] if attempt["file"] == row["used"]), None)
@@ -191,9 +205,18 @@ def _canvas_title(title: str, header: Sequence[str]) -> str:
     for name in header:
         if re.fullmatch(re.escape(title) + r"\s*\(\d+\)", name.strip()):
             return name
+    check_title(title)
+    return title
+
+
+def check_title(title: str) -> None:
+    """Check that a title can be a column of the gradebooks.
+
+    Raises:
+        InputError: Canvas drops columns with such a title.
+    """
     if _CANVAS_RESERVED.search(title):
         raise InputError(f"title {title!r}: Canvas drops columns with such a name; choose another title")
-    return title
 
 
 def _column(header: list[str], name: str) -> int:

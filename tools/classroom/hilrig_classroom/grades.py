@@ -4,76 +4,27 @@ The result depends on the files only: the same files give the same bytes.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from datetime import datetime
+from dataclasses import asdict, dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
 from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.attempts import owner_of
-from hilrig_classroom.roster import Roster, Student, read_table
-from hilrig_replay.analysis.similarity import TorqueSketch, find_similar
-from hilrig_replay.analysis.summary import summarize
-from hilrig_replay.grading.overlap import Span, overlapping
+from hilrig_classroom.evaluation import Attempt, evaluate, identify, with_points
+from hilrig_replay.analysis.similarity import find_similar
+from hilrig_replay.grading.overlap import overlapping
 from hilrig_replay.io.isolation import isolated
 from hilrig_replay.io.paths import find_runs
 from hilrig_replay.io.run import open_run
 from hilrig_replay.io.segments import RunFiles
+from hilrig_runtime.config.roster import Roster, Student, read_table
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError, InputError
 from hilrig_runtime.process.process_pool import process_pool
 
-FORMAT: Final = "hilrig-grades-1"
+FORMAT: Final = "hilrig-grades-2"
 """Version of `grades.json`."""
-
-
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """One goal of the task in an attempt."""
-
-    name: str
-    reached: bool
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Attempt:
-    """One evaluated run."""
-
-    files: tuple[str, ...]
-    """Its files, relative to the graded folder: one, or the segments of a session."""
-    session: str
-    rig: str
-    started: str
-    """Start of the recording, UTC; empty: not recorded."""
-    goals: tuple[Goal, ...] = ()
-    score: float = 0.0
-    """Share of the goals that were reached, 0 to 1."""
-    latency_ms: float | None = None
-    """Age of the acting torque, 95th percentile, ms; None: no valid figure."""
-    work_j: float = 0.0
-    problem: str = ""
-    """Reason why the file can't be graded; empty: it is graded."""
-    data_quality: str = ""
-    """Reasons why its latency is not valid; empty: it is valid."""
-    raw: float = 0.0
-    """Points without a penalty."""
-    penalty: float | None = 0.0
-    """Share of the points that is lost because it is late; None: too late."""
-    span: Span | None = None
-    """Time of the run; None: it can't be read."""
-    torques: TorqueSketch = field(default_factory=TorqueSketch, repr=False, compare=False)
-
-    @property
-    def file(self) -> str:
-        """The first of its files."""
-        return self.files[0]
-
-    @property
-    def points(self) -> float:
-        """Points with the penalty; 0 for an attempt that is too late."""
-        return 0.0 if self.penalty is None else self.raw * (1.0 - self.penalty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +36,20 @@ class Override:
 
 
 @dataclass(frozen=True, slots=True)
+class SimilarRun:
+    """A run of another student with the same torques as one of this student."""
+
+    file: str
+    student: str
+    """Id of the other student."""
+    other_file: str
+    share: float
+    """Share of identical torques, 0 to 1."""
+    same_recording: bool
+    """Whether both files are recordings of the same session."""
+
+
+@dataclass(frozen=True, slots=True)
 class StudentGrade:
     """Grade of one student."""
 
@@ -93,8 +58,8 @@ class StudentGrade:
     """In the order of their start."""
     used: Attempt | None
     """The attempt that counts; None: no attempt counts."""
-    similar: tuple[str, ...] = ()
-    """Other students' runs with the same torques: to be compared by a person."""
+    similar: tuple[SimilarRun, ...] = ()
+    """Other students' runs with the same torques, at most one of each student: to be compared by a person."""
     override: Override | None = None
 
     @property
@@ -132,31 +97,13 @@ class ClassGrades:
                     if grade.override is None
                     else {"points": grade.override.points, "reason": grade.override.reason},
                     "used": None if grade.used is None else grade.used.file,
-                    "similar": list(grade.similar),
-                    "attempts": [_attempt_as_dict(attempt) for attempt in grade.attempts],
+                    "similar": [asdict(run) for run in grade.similar],
+                    "attempts": [attempt.as_dict() for attempt in grade.attempts],
                 }
                 for grade in self.grades
             ],
             "unassigned": [{"file": file, "reason": reason} for file, reason in self.unassigned],
         }
-
-
-def _attempt_as_dict(attempt: Attempt) -> dict[str, Any]:
-    return {
-        "file": attempt.file,
-        "files": list(attempt.files),
-        "session": attempt.session,
-        "rig": attempt.rig,
-        "started": attempt.started,
-        "goals": [{"name": goal.name, "reached": goal.reached, "text": goal.text} for goal in attempt.goals],
-        "score": round(attempt.score, 6),
-        "latency_ms": None if attempt.latency_ms is None else round(attempt.latency_ms, 4),
-        "work_j": round(attempt.work_j, 4),
-        "raw": round(attempt.raw, 4),
-        "penalty": attempt.penalty,
-        "data_quality": attempt.data_quality,
-        "problem": attempt.problem,
-    }
 
 
 def grade_class(
@@ -202,7 +149,7 @@ def grade_class(
             if owner.student is None:
                 unassigned.append((attempt.file, attempt.problem or owner.problem))
             elif not only or owner.student.id == only:
-                found[owner.student.id].append(_with_points(attempt, assignment))
+                found[owner.student.id].append(with_points(attempt, assignment))
     grades = [
         _grade(student, found[student.id], assignment, overrides.get(student.id))
         for student in roster.students
@@ -263,53 +210,18 @@ def _without_second_recordings(attempts: Sequence[Attempt | None]) -> list[Attem
 def _attempt(files: RunFiles, folder: Path, task: TaskConfig, roster: Roster, only: str) -> Attempt | None:
     """Evaluate one run; None: it is not one of the student to be graded."""
     path = files[0]
-    names = tuple(each.relative_to(folder).as_posix() for each in files)
-    rig = session = started = ""
+    attempt = Attempt(tuple(each.relative_to(folder).as_posix() for each in files), "", "", "")
     try:
         with isolated(path):
             run = open_run(files)
-            rig, session, started = run.rig, run.session, run.started
-            owner = owner_of(Path(names[0]), rig, roster).student
-            if owner is None or (only and owner.id != only):
-                return Attempt(names, session, rig, started) if owner is None else None
-            summary = summarize(run, task)
+            attempt = identify(attempt.files, run)
+            owner = owner_of(Path(attempt.file), run.rig, roster).student
+            if owner is None:
+                return attempt
+            return evaluate(attempt, run, task) if only in ("", owner.id) else None
     except HilrigError as error:
         text = str(error).removeprefix(f"{path}: ")
-        return Attempt(names, session, rig, started, problem=text, data_quality=text)
-    grade, latency = summary.grade, summary.latency
-    return Attempt(
-        files=names,
-        session=session,
-        rig=rig,
-        started=started,
-        goals=() if grade is None else tuple(Goal(*line) for line in grade.lines()),
-        score=0.0 if grade is None else grade.score,
-        latency_ms=latency.age_ms.p95 if latency.fit and latency.age_ms is not None else None,
-        work_j=summary.motion.work_j,
-        data_quality=latency.reason_text(),
-        span=summary.span,
-        torques=summary.torques,
-    )
-
-
-def _with_points(attempt: Attempt, assignment: Assignment) -> Attempt:
-    rubric = assignment.config.rubric
-    share = rubric.goals_weight * attempt.score
-    if rubric.latency_ms is not None:
-        share += rubric.latency_ms.weight * rubric.latency_ms.share(attempt.latency_ms)
-    if rubric.energy_j is not None:
-        # An arm that does not move uses no energy: the points are earned with the goals only.
-        share += rubric.energy_j.weight * rubric.energy_j.share(attempt.work_j) * attempt.score
-    raw = 0.0 if attempt.problem else rubric.points * share
-    return replace(attempt, raw=raw, penalty=assignment.penalty(_start(attempt.started)))
-
-
-def _start(text: str) -> datetime | None:
-    try:
-        start = datetime.fromisoformat(text)
-    except ValueError:
-        return None
-    return start if start.tzinfo is not None else None
+        return replace(attempt, problem=text, data_quality=text)
 
 
 def _grade(
@@ -327,15 +239,23 @@ def _grade(
 
 
 def _with_similar(grades: Sequence[StudentGrade]) -> list[StudentGrade]:
-    """Mark runs of different students with the same torques; members of a group hand in the same run."""
+    """Mark runs of different students with the same torques; members of a group hand in the same run.
+
+    Of each pair of students, only the two runs that are most similar are stored.
+    """
     owned = [(number, attempt) for number, grade in enumerate(grades) for attempt in grade.attempts]
-    similar: dict[int, list[str]] = {}
+    similar: dict[int, dict[int, SimilarRun]] = {}
     for one, other, share in find_similar([attempt.torques for _, attempt in owned]):
         (first, mine), (second, theirs) = owned[one], owned[other]
         groups = {grades[first].student.group, grades[second].student.group}
         if first == second or (len(groups) == 1 and "" not in groups):
             continue
         for number, own, friend, foreign in ((first, mine, second, theirs), (second, theirs, first, mine)):
-            same = "the same recording" if own.session == foreign.session else f"{int(100 * share)} % same torques"
-            similar.setdefault(number, []).append(f"{own.file}: {same} as {grades[friend].student.id}/{foreign.file}")
-    return [replace(grade, similar=tuple(sorted(similar.get(number, ())))) for number, grade in enumerate(grades)]
+            same = bool(own.session) and own.session == foreign.session
+            run = SimilarRun(own.file, grades[friend].student.id, foreign.file, 1.0 if same else share, same)
+            known = similar.setdefault(number, {})
+            known[friend] = max(known.get(friend, run), run, key=lambda each: (each.same_recording, each.share))
+    return [
+        replace(grade, similar=tuple(runs for _, runs in sorted(similar.get(number, {}).items())))
+        for number, grade in enumerate(grades)
+    ]

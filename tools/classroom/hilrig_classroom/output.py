@@ -10,8 +10,8 @@ from hilrig_classroom.assignment import Assignment
 from hilrig_classroom.gradebook import FilledExport, fill_export, grades_csv
 from hilrig_classroom.grades import FORMAT, grade_class, read_overrides
 from hilrig_classroom.pages import class_page, write_student_pages
-from hilrig_classroom.roster import Roster, Student
 from hilrig_replay.io.output_file import output_file
+from hilrig_runtime.config.roster import Roster, Student
 from hilrig_runtime.config.validation import read_text
 from hilrig_runtime.errors import InputError, OperationError
 
@@ -20,6 +20,8 @@ GRADES_CSV: Final = "grades.csv"
 CLASS_PAGE: Final = "class.html"
 OVERRIDES: Final = "overrides.csv"
 PAGES: Final = "students"
+SMALL_CLASS: Final = 8
+"""Students from which on several processes are faster than one: the start of a process takes a second."""
 
 Progress = Callable[[float], None]
 
@@ -27,7 +29,7 @@ Progress = Callable[[float], None]
 class GradeFolder:
     """The results of one assignment in a folder, which is created if it is missing.
 
-    `workers` is the number of processes; None: one per core.
+    `workers` is the number of processes; None: one per core, or one for a small class.
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class GradeFolder:
         self._folder = folder
         self._assignment = assignment
         self._roster = roster
-        self._workers = workers
+        self._workers = 1 if workers is None and len(roster.students) < SMALL_CLASS else workers
         self._page_names = {student.id: f"{_file_name(student, names)}.html" for student in roster.students}
         try:
             (out / PAGES).mkdir(parents=True, exist_ok=True)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from hilrig_classroom.assignment import Assignment
-from hilrig_classroom.gradebook import feedback, used_attempt
-from hilrig_classroom.roster import Roster, Student
+from hilrig_classroom.gradebook import feedback, similarity, used_attempt
 from hilrig_replay.io.segments import RunFiles
 from hilrig_replay.report import assets
 from hilrig_replay.report.report import build_report
+from hilrig_runtime.config.roster import Roster, Student
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import HilrigError
 from hilrig_runtime.escaping import as_html
@@ -33,9 +33,10 @@ def class_page(document: Mapping[str, Any], roster: Roster, page_names: Mapping[
     )
     graded = [row["points"] for row in by_id.values() if row["points"] is not None]
     mean = f"mean {sum(graded) / len(graded):.2f} of {document['points']:g} points" if graded else "no grades"
-    pairs = [f"{row['id']}/{text}" for row in document["students"] for text in row["similar"]]
     notes = _section(
-        "Runs to compare", pairs, "Similar runs are worth a look. No conclusion is drawn, and no points change."
+        "Runs to compare",
+        similar_groups(document),
+        "Similar runs are worth a look. No conclusion is drawn, and no points change.",
     )
     notes += _section(
         "Recordings without a student", [f"{each['file']}: {each['reason']}" for each in document["unassigned"]], ""
@@ -49,6 +50,23 @@ def class_page(document: Mapping[str, Any], roster: Roster, page_names: Mapping[
         f"</section>{notes}"
     )
     return _page(str(document["assignment"]), body)
+
+
+def similar_groups(document: Mapping[str, Any]) -> list[str]:
+    """One sentence for each group of students with similar runs: their files, and the range of the similarity."""
+    group_of: dict[str, set[str]] = {}
+    for row in document["students"]:
+        members = {row["id"], *(run["student"] for run in row["similar"])}
+        group = members.union(*(group_of.get(member, set()) for member in members))
+        group_of.update(dict.fromkeys(group, group))
+    sentences = []
+    for group in {id(group): group for group in group_of.values() if len(group) > 1}.values():
+        runs = [run for row in document["students"] if row["id"] in group for run in row["similar"]]
+        files = sorted({f"{run['student']}: {run['other_file']}" for run in runs})
+        kinds = dict.fromkeys(similarity(run) for run in sorted(runs, key=lambda run: -run["share"]))
+        texts = list(kinds)
+        sentences.append(f"{'; '.join(files)}: {texts[0] if len(texts) == 1 else f'{texts[0]} to {texts[-1]}'}")
+    return sorted(sentences)
 
 
 def write_student_pages(

@@ -3,7 +3,8 @@
 import sys
 from typing import Final
 
-from hilrig_runtime.errors import OperationError
+from hilrig_cli.extras import smallest_extra
+from hilrig_runtime.errors import OperationError, install_command
 from hilrig_runtime.process.shutdown import run_main
 
 _OWN_PACKAGE_PREFIX: Final = "hilrig"
@@ -24,11 +25,10 @@ def _command() -> None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith(_OWN_PACKAGE_PREFIX):
             raise
-        package = error.name.partition(".")[0]
-        raise OperationError(
-            f"this command needs {package!r}, which is not installed here (only some parts of hilrig are): "
-            "pip install 'hilrig[all]'"
-        ) from error
+        command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
+        missing = error.name.partition(".")[0]
+        fix = f"run in hilrig's folder: {install_command(smallest_extra(command))}"
+        raise OperationError(f"`hilrig {command}` needs {missing!r}, which is not installed: {fix}") from error
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from collections.abc import Sequence, Set
 from importlib.metadata import version
 from typing import Any, Final, TypeVar
 
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from hilrig_cli.service_kinds import RIG_SERVICES
 from hilrig_runtime.bus.acl import RULES
@@ -15,6 +15,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.bus.zenoh_config import own_identity
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
+from hilrig_runtime.escaping import printable
 from hilrig_runtime.process.control import check_versions
 from hilrig_runtime.process.discovery import list_services
 from hilrig_schemas import ControlReply, ControlRequest, ServiceInfo
@@ -35,7 +36,7 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
 
     Raises:
         InputError: the lab has no such rig.
-        OperationError: no edge replies, or the edge refuses the request.
+        OperationError: no edge replies, or the edge refuses the request, or its reply is invalid.
     """
     check_permission(lab, topic)
     payload = request.SerializeToString()
@@ -54,9 +55,11 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Me
     if not replies:
         raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
     positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
-    by_rig = {parse_rig_key(reply.key).rig: reply.payload for reply in replies}
-    order = sorted(by_rig, key=lambda rig: (positions.get(rig, len(positions)), rig))
-    return [topic.decode(by_rig[rig]) for rig in order]
+    try:
+        by_rig = {parse_rig_key(reply.key).rig: topic.decode_from(reply.key, reply.payload) for reply in replies}
+    except (DecodeError, ValueError) as error:
+        raise _invalid_reply("an edge", error) from error
+    return [by_rig[rig] for rig in sorted(by_rig, key=lambda rig: (positions.get(rig, len(positions)), rig))]
 
 
 def check_permission(lab: LabConfig, topic: Topic[Any]) -> None:
@@ -77,7 +80,7 @@ def send_control_request(bus: Bus, lab: LabConfig, info: ServiceInfo, request: C
     """Send a control request to a discovered service; return its reply.
 
     Raises:
-        OperationError: the service has another version, does not reply, or refuses the request.
+        OperationError: the service has another version, does not reply, refuses the request, or its reply is invalid.
     """
     check_permission(lab, CONTROL)
     request.software_version = version("hilrig")
@@ -89,7 +92,18 @@ def send_control_request(bus: Bus, lab: LabConfig, info: ServiceInfo, request: C
         raise OperationError(f"{name} does not reply within {QUERY_TIMEOUT_S:g} s: see its log")
     if replies[0].error:
         raise OperationError(f"{name} refused: {replies[0].error}")
-    return CONTROL.decode(replies[0].payload)
+    try:
+        reply = CONTROL.decode(replies[0].payload)
+    except DecodeError as error:
+        raise _invalid_reply(name, error) from error
+    reply.text, reply.session = printable(reply.text), printable(reply.session)
+    return reply
+
+
+def _invalid_reply(name: str, error: Exception) -> OperationError:
+    return OperationError(
+        f"{name} sent an invalid reply: {error}; compare the versions (hilrig doctor), and see its log"
+    )
 
 
 def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[ServiceInfo]:
@@ -98,7 +112,7 @@ def discover_services(bus: Bus, lab: LabConfig, required: Set[str]) -> list[Serv
     found: list[ServiceInfo] = []
     # Links are set up one after the other: discovery is complete when two successive queries return the same number.
     while time.monotonic() < deadline_s:
-        before, found = found, list_services(bus, lab.name)
+        before, found = found, list_services(bus, lab)
         if required <= {info.service for info in found} and len(found) == len(before):
             break
         time.sleep(0.05)
@@ -116,7 +130,7 @@ def check_rig(bus: Bus, lab: LabConfig, rig: str) -> None:
         return
     start_s, message_printed = time.monotonic(), False
     while True:
-        found = list_services(bus, lab.name)
+        found = list_services(bus, lab)
         if any(rig in info.rigs for info in found):
             return
         waited_s = time.monotonic() - start_s

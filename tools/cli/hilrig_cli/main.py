@@ -8,15 +8,15 @@ import inspect
 
 import typer
 
-from hilrig_cli.commands import record, rig
+from hilrig_cli.commands import assign, record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
 from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.example import example
 from hilrig_cli.commands.export import export
-from hilrig_cli.commands.figures import figures
 from hilrig_cli.commands.grade import grade
 from hilrig_cli.commands.ik import ik
 from hilrig_cli.commands.impair import impair
@@ -50,7 +50,23 @@ app = typer.Typer(
 )
 
 PANELS = {
-    "Run a lab": (up, demo, live, console, top, metrics, check, doctor, lease, impair, jitter, registers, ik, certs),
+    "Run a lab": (
+        up,
+        demo,
+        live,
+        console,
+        top,
+        metrics,
+        check,
+        doctor,
+        lease,
+        impair,
+        jitter,
+        registers,
+        ik,
+        certs,
+        example,
+    ),
     "Run a single service": (sim, edge, recorder, router),
     "Analyze recordings": (
         runs,
@@ -61,7 +77,6 @@ PANELS = {
         report,
         grade,
         verify,
-        figures,
         recover,
         join,
         play,
@@ -77,6 +92,7 @@ for _panel, _commands in PANELS.items():
         app.command(rich_help_panel=_panel, context_settings=_settings)(_command)
 app.add_typer(rig.app, name="rig", rich_help_panel="Run a lab")
 app.add_typer(record.app, name="record", rich_help_panel="Run a lab")
+app.add_typer(assign.app, name="assign", rich_help_panel="Analyze recordings")
 
 
 def _unwrap_help(group: typer.Typer) -> None:
@@ -86,7 +102,7 @@ def _unwrap_help(group: typer.Typer) -> None:
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-for _group in (app, rig.app, record.app):
+for _group in (app, rig.app, record.app, assign.app):
     _unwrap_help(_group)
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 from google.protobuf.message import DecodeError
 
 from hilrig_console.view_model import Frame, ViewModel
+from hilrig_monitoring.lab_view import LabView
 from hilrig_runtime.bus.api import Bus, Handle
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
@@ -44,7 +45,8 @@ class LabSubscriber:
 
     def __init__(self, lab: LabConfig) -> None:
         self._lab = lab
-        self._model = ViewModel(lab.name, tuple(rig.name for rig in lab.rigs), SYSTEM_CLOCK.wall_ns() // 1_000_000)
+        view = LabView(tuple(rig.name for rig in lab.rigs), lab.bus.may_serve)
+        self._model = ViewModel(lab.name, view, SYSTEM_CLOCK.wall_ns() // 1_000_000)
         self._states: deque[bytes] = deque(maxlen=_MAX_QUEUED_BATCHES)
         self._viewed_s = -VIEWER_TIMEOUT_S
         self._stopping = threading.Event()
@@ -106,7 +108,7 @@ class LabSubscriber:
                 states = None
             if is_viewed and self._is_service_query_due(now_s, now_s - queried_s):
                 queried_s = now_s
-                found = list_services(bus, self._lab.name)
+                found = list_services(bus, self._lab)
                 with self._model.lock:
                     self._model.set_addresses(found)
             self._query_configurations(bus)

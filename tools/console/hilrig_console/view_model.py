@@ -50,9 +50,9 @@ class Frame:
 class ViewModel:
     """State of a lab as shown on the page; hold `lock` while using it."""
 
-    def __init__(self, lab: str, rigs: tuple[str, ...], start: int) -> None:
+    def __init__(self, lab: str, view: LabView, start: int) -> None:
         self.lock = threading.Lock()
-        self.view = LabView(rigs)
+        self.view = view
         self.poses = PoseCache()
         self.events = EventBuffer(start)
         self._lab = lab

@@ -5,6 +5,7 @@ holder, the recorder the rigs that it records. No I/O: reports and time are pass
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -14,6 +15,8 @@ WINDOW_S: Final = 10.0
 """Window of the percentiles of loop latency and age."""
 SILENT_AFTER_S: Final = 3.5
 """Time without a report after which a service is shown as silent and its rig reports are discarded."""
+MAX_SERVICES: Final = 256
+"""Maximum number of services; the reports of others are ignored."""
 MAX_RIG_ALERTS: Final = 8
 """Number of rigs whose alerts are shown; the others are counted."""
 REMOVED_AFTER_S: Final = 600.0
@@ -90,10 +93,18 @@ def _percentile_ms(values_us: list[int], share: float) -> float | None:
 
 
 class LabView:
-    """Status of a lab, updated by health reports."""
+    """Status of a lab, updated by health reports.
 
-    def __init__(self, rigs: tuple[str, ...] = ()) -> None:
+    Args:
+        rigs: names of the rigs in the lab's file.
+        may_serve: whether a service may serve a rig according to its certificate; its other reports are ignored.
+    """
+
+    def __init__(
+        self, rigs: tuple[str, ...] = (), may_serve: Callable[[str, str], bool] = lambda _source, _rig: True
+    ) -> None:
         self._rigs = rigs
+        self._may_serve = may_serve
         self._services: dict[str, ServiceStatus] = {}
         self._loops: dict[str, deque[tuple[float, tuple[int, ...], tuple[int, ...]]]] = {}
         """By rig: times of the reports within the window, with loop latencies and ages, µs."""
@@ -103,12 +114,20 @@ class LabView:
         self._evict(now_s)
         status = ServiceStatus(health, now_s)
         before = self._services.get(status.name)
+        if before is None and len(self._services) >= MAX_SERVICES:
+            return
+        reports = [report for report in health.rig_reports if self._may_serve(status.name, report.rig)]
+        if len(reports) < len(health.rig_reports):
+            status.health = Health()
+            status.health.CopyFrom(health)
+            del status.health.rig_reports[:]
+            status.health.rig_reports.extend(reports)
         if before is not None and before.health.incarnation == health.incarnation:
             elapsed_ns = health.uptime_ns - before.health.uptime_ns
             cpu_ns = health.cpu_ns - before.health.cpu_ns
             status.cpu_share = cpu_ns / elapsed_ns if elapsed_ns > 0 else before.cpu_share
         self._services[status.name] = status
-        for report in health.rig_reports:
+        for report in reports if health.service == "sim" else ():
             if report.loop_us or report.age_us:
                 timing = (now_s, tuple(report.loop_us), tuple(report.age_us))
                 self._loops.setdefault(report.rig, deque()).append(timing)

@@ -23,7 +23,7 @@ class LabWatch(Handle):
 
     def __init__(self, lab: LabConfig) -> None:
         self.lab = lab
-        self.view = LabView(tuple(rig.name for rig in lab.rigs))
+        self.view = LabView(tuple(rig.name for rig in lab.rigs), lab.bus.may_serve)
         self.lock = threading.Lock()
         self._report_counts: dict[str, int] = {}
         self._bus = ZenohBus(lab.bus, "tool")
@@ -37,7 +37,7 @@ class LabWatch(Handle):
         """
         deadline_s = time.monotonic() + FIRST_REPORTS_TIMEOUT_S
         while time.monotonic() < deadline_s:
-            expected = {f"{info.service}/{info.instance}" for info in list_services(self._bus, self.lab.name)}
+            expected = {f"{info.service}/{info.instance}" for info in list_services(self._bus, self.lab)}
             with self.lock:
                 if expected and all(self._report_counts.get(name, 0) > 1 for name in expected):
                     return

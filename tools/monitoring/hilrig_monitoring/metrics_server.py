@@ -16,10 +16,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
 from hilrig_monitoring.prometheus import CONTENT_TYPE
+from hilrig_runtime.listen_address import ListenAddress
 from hilrig_runtime.pending_connections import PendingConnections
 
 REQUEST_TIMEOUT_S: Final = 10.0
 """Time in which a request must be received and its response read."""
+BACKLOG: Final = 128
+"""Connections that the system queues until they are accepted."""
 MAX_CONNECTIONS: Final = 64
 MAX_CONNECTIONS_PER_HOST: Final = 16
 POLL_S: Final = 0.25
@@ -32,17 +35,19 @@ class MetricsServer(ThreadingHTTPServer):
     """Server that answers GET /metrics with the result of `text`; a context manager.
 
     Raises:
-        OSError: the address is unavailable.
+        OperationError: the address is unavailable.
     """
 
     daemon_threads = True
-    request_queue_size = 128
 
-    def __init__(self, address: tuple[str, int], text: Callable[[], str]) -> None:
+    def __init__(self, address: ListenAddress, text: Callable[[], str]) -> None:
         self._lock = threading.Lock()
         self._open: PendingConnections[socket.socket] = PendingConnections(MAX_CONNECTIONS, MAX_CONNECTIONS_PER_HOST)
         self._deadlines_s: dict[socket.socket, float] = {}
-        super().__init__(address, _handler(text))
+        super().__init__(("", 0), _handler(text), bind_and_activate=False)
+        self.socket.close()
+        self.socket = address.open_socket(BACKLOG)
+        self.port: int = self.socket.getsockname()[1]
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL_S,), name="metrics", daemon=True)
 
     def __enter__(self) -> "MetricsServer":

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet
 from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
-from scipy.stats import binomtest, t
+from scipy.special import stdtrit
 
 from hilrig_replay.io.output_file import output_file
 from hilrig_sim.arm.joints import JOINT_NAMES
@@ -94,6 +94,8 @@ def settled_interval(swept: SweepResult, controller: int) -> tuple[float, float]
     rows = swept.cells["controller"] == controller
     if not _is_random(swept, controller):
         return None
+    from scipy.stats import binomtest
+
     found = binomtest(int(swept.results["settled"][rows].sum()), int(rows.sum())).proportion_ci(method="wilson")
     return float(found.low), float(found.high)
 
@@ -111,7 +113,7 @@ def cost_interval(study: StudyConfig, swept: SweepResult, controller: int) -> di
         deviation = cost - np.where(rows, mean[swept.cells["iy"], swept.cells["ix"]], 0.0)
         variance = swept.plane(study, controller, deviation**2)
     more = study.runs - 1
-    return {"mean": mean, "half_width": t.ppf(0.975, more) * np.sqrt(variance / more)}
+    return {"mean": mean, "half_width": stdtrit(more, 0.975) * np.sqrt(variance / more)}
 
 
 def summary(study: StudyConfig, swept: SweepResult, folder: Path = Path()) -> dict[str, Any]:

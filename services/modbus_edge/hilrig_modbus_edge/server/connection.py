@@ -67,6 +67,8 @@ class Connection(asyncio.Protocol):
 
     def __init__(self, server: ConnectionOwner, transport: asyncio.Transport, client: Client) -> None:
         self.client = client
+        self.peer = ("", 0)
+        """Host and port."""
         self.expiry_ns = 0
         """End of the validity of the client's certificate, ns since 1970-01-01 UTC; 0: it has none."""
         self.socket: socket.socket = transport.get_extra_info("socket")

@@ -84,7 +84,7 @@ def _wrong_address(function: FunctionCode, table: RegisterTable, request: bytes)
         name = TABLE_NAMES[table]
         return cause, f"{first - 1} is the traditional number of {name} {traditional}: use address {traditional - 1}"
     zeros = ""
-    if function.is_read and any(first <= end and begin <= last for begin, end in blocks_of(table)):
+    if not writes and any(first <= end and begin <= last for begin, end in blocks_of(table)):
         zeros = ', or set unmapped_reads = "zeros" in [edge] of lab.toml'
     for begin, end in blocks:
         if begin <= first <= end:

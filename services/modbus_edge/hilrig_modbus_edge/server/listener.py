@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import socket
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -90,7 +91,7 @@ class RigServer:
         """Serve an admitted client; `early`: data that it has already sent."""
         client = self.device.connect(host, port, may_write=certificate.may_write, certificate=certificate.name)
         connection = Connection(self, transport, client)
-        connection.expiry_ns = certificate.expiry_ns
+        connection.peer, connection.expiry_ns = (host, port), certificate.expiry_ns
         self.connections.add(connection)
         self.counters.connections += 1
         transport.set_protocol(connection)
@@ -141,20 +142,34 @@ class RigServer:
         return idle_ns if idle_ns >= self._idle_ns else 0
 
     def _make_room(self, host: str, close_now: bool) -> bool:
-        """Return whether a connection was idle for the idle timeout, and close the one that was for the longest time.
+        """Return whether a connection gives way to a new one, and close it.
+
+        Anybody can open connections and send nothing. So the oldest one without a valid request gives way, of the host
+        with most of them. Without one, the longest idle one gives way, if that is the idle timeout.
 
         Args:
             host: only connections of this host; empty: of all hosts.
             close_now: close it; otherwise it is only considered.
         """
-        now_ns = self.monotonic_ns()
-        candidates = [connection for connection in self.connections if host in ("", connection.client.host)]
-        longest = min(candidates, key=lambda connection: connection.client.last_request_ns, default=None)
-        if not self._idle_ns or longest is None or not self._idle_since(longest, now_ns):
+        connections = [connection for connection in self.connections if host in ("", connection.client.host)]
+        silent = [connection for connection in connections if connection.is_silent]
+        crowd = Counter(connection.client.host for connection in silent)
+        first = min(
+            silent or connections,
+            key=lambda connection: (-crowd[connection.client.host], connection.client.last_request_ns),
+            default=None,
+        )
+        if first is None:
+            return False
+        idle_ns = self._idle_since(first, self.monotonic_ns())
+        if not silent and not (self._idle_ns and idle_ns):
             return False
         if close_now:
-            idle_s = self._idle_since(longest, now_ns) / 1e9
-            longest.make_room(f"no request for {idle_s:.0f} s, and its place is needed")
+            reason = f"no request for {idle_ns / 1e9:.0f} s, and its place is needed"
+            if silent:
+                reason = "no request before its place was needed; send the first one when connected"
+                self._admission.refuse(*first.peer, reason)
+            first.make_room(reason)
         return True
 
     def close_certificate(self, name: str, reason: str) -> int:

@@ -17,6 +17,7 @@ from hilrig_recorder.ingest.queue import ReceivedBatch
 from hilrig_recorder.ingest.recording import SECOND_NS, LossCounters, Recording, RecordingStore
 from hilrig_recorder.ingest.sources import (
     MAX_GAP,
+    PUBLISHER_TIMEOUT_NS,
     SETTLE_TIME_NS,
     WALL_CLOCK_STEP_THRESHOLD_NS,
     KeyStream,
@@ -26,6 +27,7 @@ from hilrig_recorder.ingest.sources import (
 from hilrig_recorder.mcap_format.channels import CHANNEL_OF_TOPIC, EVENT_CHANNEL
 from hilrig_recorder.mcap_format.ending import Ending
 from hilrig_recorder.mcap_format.records import encode_message
+from hilrig_runtime.bus.acl import RULES
 from hilrig_runtime.counters import Counters
 from hilrig_runtime.messaging.recording_stream import entries_of
 from hilrig_runtime.process.outage import OutageDetector, describe_outage
@@ -208,6 +210,10 @@ class SessionTracker:
         if channel_id is None or parsed.lab != self._lab or not is_name(parsed.rig):
             self._reject(f"{publisher.name}: key {key} is not a recorded topic of lab {self._lab}")
             return None
+        service = publisher.name.partition("/")[0]
+        if service not in RULES[parsed.topic.name].publishers or parsed.rig in set(SERVICES) - {service}:
+            self._reject(f"{publisher.name}: key {key} is of another service")
+            return None
         if not self._may_serve(publisher.name, parsed.rig) and parsed.rig not in SERVICES:
             self._reject(f"{publisher.name}: its certificate excludes rig {parsed.rig!r}")
             return None
@@ -383,7 +389,7 @@ class SessionTracker:
         for session, until_ns in list(self._blocked_until.items()):
             if now_ns > until_ns:
                 del self._blocked_until[session]
-        for publisher in self._publishers.evict_silent(now_ns):
+        for publisher in self._publishers.evict_superseded(now_ns):
             for rig in self._rigs.values():
                 if rig.publishers.get(publisher.name) is publisher:
                     del rig.publishers[publisher.name]
@@ -422,9 +428,11 @@ class SessionTracker:
             return True
         end_wall_ns = recording.end_wall_ns or 0
         # A stream is in order. It has passed the end when its publish times have. A publisher without messages has
-        # passed the end when one of its batches arrived well after the end.
+        # passed the end when one of its batches arrived well after the end. Nothing is expected of one that is dead.
         return draining_ns >= DRAIN_MIN_NS and all(
-            publisher.passed_ns >= end_wall_ns or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            publisher.passed_ns >= end_wall_ns
+            or publisher.last_ns >= recording.ended_ns + IDLE_ANNOUNCEMENT_NS
+            or now_ns - publisher.last_ns > PUBLISHER_TIMEOUT_NS
             for publisher in self._rigs[recording.rig].publishers.values()
             if recording.rig in publisher.continuous_rigs
         )

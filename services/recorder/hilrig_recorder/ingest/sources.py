@@ -1,7 +1,6 @@
 """Tracks publishers: detects lost messages by sequence numbers, and wall clock steps by time stamps. Pure."""
 
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,9 +14,11 @@ SETTLE_TIME_NS: Final = 15_000_000_000
 MAX_GAP: Final = (1 << 32) - 1
 """Maximum number of messages that one gap may state, three years of one rig; a larger one is an invalid number."""
 MAX_PUBLISHERS: Final = 1024
-"""Maximum number of publishers; if one invents incarnations, the publisher that is silent for longest is evicted."""
+"""Maximum number of publishers; a service that invents incarnations evicts its own."""
 PUBLISHER_TIMEOUT_NS: Final = 120_000_000_000
-"""A publisher that is silent for this time is evicted."""
+"""Files no longer wait for a publisher that is silent for this time; it is evicted if its service was restarted."""
+MAX_DRIFT: Final = 2000
+"""Two clocks that are being slewed drift apart by at most 1 ns in this time, ns (500 ppm, the limit of the kernel)."""
 MAX_HELD_BATCHES: Final = 4096
 """Maximum number of batches of events of one publisher that wait for the batches before them."""
 
@@ -82,8 +83,8 @@ class PublisherState:
         else:
             self._first_batch = batch.sequence
         self._next_batch = max(self._next_batch, batch.sequence + 1)
-        self.last_ns = now_ns
         stepped = bool(batch.keys) and self._clock_stepped(batch.publish_wall_ns[-1], now_ns)
+        self.last_ns = now_ns
         return missing, stepped
 
     def next_events(self) -> LogBatch | None:
@@ -104,26 +105,26 @@ class PublisherState:
             self._offset_ns = offset_ns
             return before_ns is not None
         self._offset_ns = max(before_ns, offset_ns)
-        return offset_ns > before_ns + WALL_CLOCK_STEP_THRESHOLD_NS and now_ns - self.first_ns > SETTLE_TIME_NS
+        threshold_ns = WALL_CLOCK_STEP_THRESHOLD_NS + (now_ns - self.last_ns) // MAX_DRIFT
+        return offset_ns > before_ns + threshold_ns and now_ns - self.first_ns > SETTLE_TIME_NS
 
 
 class PublisherTracker:
-    """The publishers that were active recently, by source and incarnation."""
+    """The publishers by source and incarnation: the newest one of each source, and others that were active recently."""
 
     def __init__(self) -> None:
         self._publishers: dict[tuple[str, int], PublisherState] = {}
+        self._evicted: list[PublisherState] = []
 
     def publisher_of(self, received: ReceivedBatch, now_ns: int) -> PublisherState:
         """The publisher of a batch."""
-        identity = (received.batch.source, received.batch.incarnation)
+        name, incarnation = identity = received.batch.source, received.batch.incarnation
         publisher = self._publishers.get(identity)
         if publisher is None:
-            restarted = any(name == identity[0] for name, _ in self._publishers)
+            restarted = any(known == name for known, _ in self._publishers)
             if len(self._publishers) >= MAX_PUBLISHERS:
-                # Evicted at the next tick.
-                oldest = min(self._publishers.values(), key=lambda each: each.last_ns)
-                oldest.last_ns = -PUBLISHER_TIMEOUT_NS
-            publisher = PublisherState(*identity, first_ns=now_ns, restarted=restarted, last_ns=now_ns)
+                self._evict(min(self._publishers.values(), key=lambda each: (each.name != name, each.last_ns)))
+            publisher = PublisherState(name, incarnation, first_ns=now_ns, restarted=restarted, last_ns=now_ns)
             self._publishers[identity] = publisher
         return publisher
 
@@ -134,11 +135,20 @@ class PublisherTracker:
             last[publisher.name] = max(last.get(publisher.name, 0), publisher.last_ns)
         return last
 
-    def evict_silent(self, now_ns: int) -> Iterator[PublisherState]:
-        """Evict the publishers that exceed `PUBLISHER_TIMEOUT_NS`, and yield them; forget old events of the others."""
-        for identity, publisher in list(self._publishers.items()):
+    def evict_superseded(self, now_ns: int) -> list[PublisherState]:
+        """Evict silent publishers of restarted services, and return all that were evicted; forget old events.
+
+        The newest publisher of a source stays: after an outage of any length its numbers show the loss.
+        """
+        newest_ns = self.last_received()
+        for publisher in list(self._publishers.values()):
             if now_ns - publisher.first_ns > SETTLE_TIME_NS:
                 publisher.earlier_events.clear()
-            if now_ns - publisher.last_ns > PUBLISHER_TIMEOUT_NS:
-                del self._publishers[identity]
-                yield publisher
+            if publisher.last_ns < min(newest_ns[publisher.name], now_ns - PUBLISHER_TIMEOUT_NS):
+                self._evict(publisher)
+        evicted, self._evicted = self._evicted, []
+        return evicted
+
+    def _evict(self, publisher: PublisherState) -> None:
+        del self._publishers[publisher.name, publisher.incarnation]
+        self._evicted.append(publisher)

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Final
 
 MCAP_SUFFIX: Final = ".mcap"
+MAGIC: Final[bytes] = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file."""
 RECOVERED_SUFFIX: Final = ".recovered"
 PART_SUFFIX: Final = ".part"
 """Appended to the name of a recording while it is being written."""

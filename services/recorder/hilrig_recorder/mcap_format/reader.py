@@ -14,11 +14,11 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema, Statistics
 
+from hilrig_recorder.mcap_format.file_names import MAGIC
 from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.records import (
     CHUNK_HEAD_BYTES,
     FOOTER_BYTES,
-    MAGIC,
     MESSAGE,
     MESSAGE_FIXED_BYTES,
     MESSAGE_HEAD,

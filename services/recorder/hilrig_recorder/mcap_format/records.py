@@ -28,10 +28,9 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 
-MAGIC: Final = MCAP0_MAGIC
-"""First and last bytes of a file."""
+from hilrig_recorder.mcap_format.file_names import MAGIC
+
 COMPRESSION: Final = "zstd"
 """Compression of the chunks that hilrig writes; `chunk.compressor` makes it, `reader.decompress` reads it."""
 MAX_CHUNK_BYTES: Final = 128 << 20

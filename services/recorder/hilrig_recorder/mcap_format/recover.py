@@ -16,13 +16,13 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema
 
 from hilrig_recorder.mcap_format.ending import Ending
+from hilrig_recorder.mcap_format.file_names import MAGIC
 from hilrig_recorder.mcap_format.fsutil import lock_file, map_file, open_file
 from hilrig_recorder.mcap_format.metadata_checks import add_metadata
 from hilrig_recorder.mcap_format.new_file import new_file
 from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.records import (
     COPY_SUFFIX,
-    MAGIC,
     Chunk,
     DamagedError,
     Message,

@@ -11,10 +11,10 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
+from hilrig_recorder.mcap_format.file_names import MAGIC
 from hilrig_recorder.mcap_format.metadata_checks import check_numbers
 from hilrig_recorder.mcap_format.reader import Record, RecordReader, buffer_reader, chunk_records, decompress
 from hilrig_recorder.mcap_format.records import (
-    MAGIC,
     OPCODES,
     Buffer,
     Chunk,

@@ -23,10 +23,10 @@ from hilrig_recorder.mcap_format.chunk import (
     encode_chunk,
     split_into_chunks,
 )
-from hilrig_recorder.mcap_format.file_names import PART_SUFFIX, part_path
+from hilrig_recorder.mcap_format.file_names import MAGIC, PART_SUFFIX, part_path
 from hilrig_recorder.mcap_format.fsutil import lock_file, sync_folder
 from hilrig_recorder.mcap_format.reader import RecordReader
-from hilrig_recorder.mcap_format.records import COPY_SUFFIX, MAGIC, ChunkInfo, DamagedError, encode_records
+from hilrig_recorder.mcap_format.records import COPY_SUFFIX, ChunkInfo, DamagedError, encode_records
 from hilrig_recorder.mcap_format.summary_section import SummarySection
 
 LIBRARY: Final = "hilrig"

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from hilrig_cli.bench.cpu_stress import cpu_stress
 from hilrig_cli.bench.timing_benchmark import TimingResult
-from hilrig_cli.local.demo import free_ports
-from hilrig_cli.local.local_lab import running_lab
+from hilrig_cli.local.local_lab import free_ports, running_lab
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import encode_frame
 from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, TORQUE_ADDRESS

@@ -64,7 +64,7 @@ def certs(
         return
     now = datetime.now(UTC)
     clients = dict(_parse_client(text) for text in client or ["operator=operator", "observer=observer"])
-    loopback = ["localhost", "127.0.0.1"]
+    loopback = ["localhost", "127.0.0.1", "::1"]
 
     controllers = CertificateStore(folder, now, days, renew=renew)
     bus = CertificateStore(folder / "bus", now, days, renew=renew)

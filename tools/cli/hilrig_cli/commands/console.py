@@ -39,9 +39,10 @@ def console(
     import secrets
 
     from hilrig_console.auth import AccessPolicy, normalize_host_names
-    from hilrig_console.serving import ConsoleServer, ListenAddress, TlsFiles, check_health
+    from hilrig_console.serving import ConsoleServer, TlsFiles, check_health
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
+    from hilrig_runtime.listen_address import ListenAddress
     from hilrig_runtime.process.shutdown import force_exit_after, stop_on_signals, wait_for
     from hilrig_runtime.timing.realtime import lower_priority
 
@@ -63,7 +64,7 @@ def console(
     stopping = stop_on_signals()
     force_exit_after(stopping, 8.0)
     with server:
-        print(f"console of lab {lab.name}: {server.url}", flush=True)
+        print(f"console of lab {lab.name}: {server.urls}", flush=True)
         if generated:
             print(f"password: {password} (any user name)", flush=True)
         if tls is None and not address.is_loopback:

@@ -80,30 +80,21 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
 def _check_certificates(lab: "LabConfig") -> "list[CheckResult]":
     from datetime import UTC, datetime
 
-    from hilrig_cli.doctor import CheckResult
+    from hilrig_cli.doctor.certificates import check_certificates
 
-    try:
-        # The package that reads certificates is part of the edge's dependencies only; zenoh reads its own.
-        from hilrig_cli.doctor.certificates import check_certificates
-    except ModuleNotFoundError as error:
-        text = f"not checked: {error.name!r} is not installed on this host"
-        fix = "pip install 'hilrig[edge]', or check copies of the certificates on another host"
-        return [CheckResult.warning("certificates", text, fix)]
     return list(check_certificates(lab, datetime.now(UTC)))
 
 
 def _check_controllers(lab: "LabConfig", running: "Collection[str]") -> "list[CheckResult]":
     from hilrig_cli.doctor import CheckResult
+    from hilrig_runtime.errors import install_command
 
     try:
         from hilrig_cli.doctor.controllers import check_controllers
     except ModuleNotFoundError as error:
         text = f"not tested: {error.name!r} is not installed on this host"
-        return [
-            CheckResult.warning(
-                "controllers", text, "pip install 'hilrig[edge]', or run hilrig doctor on the edge's host"
-            )
-        ]
+        fix = f"in hilrig's folder: {install_command('rig')}, or run hilrig doctor on the edge's host"
+        return [CheckResult.warning("controllers", text, fix)]
     return list(check_controllers(lab, running))
 
 

@@ -42,8 +42,8 @@ def grade(
 
     from hilrig_classroom.assignment import load_assignment
     from hilrig_classroom.output import GradeFolder
-    from hilrig_classroom.roster import read_roster
     from hilrig_cli.terminal import TerminalConsole
+    from hilrig_runtime.config.roster import read_roster
     from hilrig_runtime.escaping import printable
 
     task, people = load_assignment(assignment), read_roster(roster)

@@ -22,14 +22,12 @@ def metrics(
     from hilrig_monitoring.metrics_server import MetricsServer
     from hilrig_monitoring.prometheus import exposition
     from hilrig_runtime.config.lab import load_lab
-    from hilrig_runtime.errors import InputError, OperationError
+    from hilrig_runtime.listen_address import ListenAddress
     from hilrig_runtime.process.shutdown import stop_on_signals, wait_for
     from hilrig_runtime.timing.realtime import lower_priority
 
     lab = load_lab(config)
-    host, colon, port = listen.rpartition(":")
-    if not colon or not port.isdigit() or int(port) > 65535:
-        raise InputError(f"--listen: expected HOST:PORT, for example 127.0.0.1:9464, got {listen!r}")
+    address = ListenAddress.parse(listen)
     lower_priority()
     stopping = stop_on_signals()
     with LabWatch(lab) as watch:
@@ -38,12 +36,6 @@ def metrics(
             with watch.lock:
                 return exposition(watch.view, lab.name, time.monotonic())
 
-        try:
-            server = MetricsServer((host.strip("[]"), int(port)), text)
-        except OSError as error:
-            raise OperationError(
-                f"can't listen on {listen}: {error.strerror}; choose another address with --listen"
-            ) from error
-        with server:
-            print(f"metrics of lab {lab.name}: http://{host or '0.0.0.0'}:{server.server_port}/metrics", flush=True)
+        with MetricsServer(address, text) as server:
+            print(f"metrics of lab {lab.name}: {address.urls(server.port, 'http', '/metrics')}", flush=True)
             wait_for(stopping)

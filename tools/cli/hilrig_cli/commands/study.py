@@ -94,8 +94,7 @@ def _sweep(file: Path, controllers: list[Path], out: Path, live: bool, console: 
         from collections.abc import Callable, Iterator
         from contextlib import contextmanager
 
-        from hilrig_cli.local.demo import free_ports
-        from hilrig_cli.local.local_lab import running_lab
+        from hilrig_cli.local.local_lab import free_ports, running_lab
         from hilrig_runtime.config.lab import LabConfig
         from hilrig_study.live.live_points import run_live_points
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,6 +16,9 @@ from hilrig_cli.options import Config
 
 
 def up(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="LAB.TOML", help="Configuration file of the lab, as with --config.")
+    ] = None,
     config: Config = None,
     edges: Annotated[int, typer.Option(help="Number of Modbus edges among which the rigs are divided.")] = 1,
     recorders: Annotated[int, typer.Option(help="Number of recorders among which the rigs are divided.")] = 1,
@@ -38,10 +42,14 @@ def up(
     from hilrig_cli.local.supervisor import lab_processes, own_process_group
     from hilrig_runtime.addresses import format_address, reachable_hosts
     from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.errors import InputError
     from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import call_on_hangup, stop_on_signals
     from hilrig_sim.parameters import lab_parameters
 
+    if file is not None and config is not None:
+        raise InputError(f"two configuration files: {file} and --config {config}; expected one")
+    config = file or config
     start_logging("up", "1", log_format)
     report: Callable[[str], None] = logging.getLogger(__name__).info
     say: Callable[[str], None] = partial(print, flush=True) if log_format == "text" else report

@@ -1,6 +1,5 @@
 """The demo: runs a lab with the example controller; measures, verifies and plots the recording."""
 
-import importlib.util
 import json
 import shutil
 import subprocess
@@ -12,7 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from hilrig_cli.local.local_lab import POLL_S, bind_error, running_lab
+from hilrig_cli.examples import example_path
+from hilrig_cli.local.local_lab import POLL_S, free_ports, running_lab
 from hilrig_cli.local.supervisor import own_process_group
 from hilrig_recorder.mcap_format.file_names import MCAP_PATTERN
 from hilrig_replay.analysis.latency import LatencyReport, measure
@@ -127,7 +127,7 @@ def _run_controller(
     on_progress: Callable[[float], None],
 ) -> dict[str, Any]:
     duration_s, overtime_s = (DURATION_S, OVERTIME_S) if requested_s is None else (requested_s, 0.0)
-    command = [sys.executable, str(controller_path()), "--host", lab.edge.host, "--port", str(_port(lab))]
+    command = [sys.executable, str(example_path(CONTROLLER)), "--host", lab.edge.host, "--port", str(_port(lab))]
     command += ["--duration", str(duration_s), "--overtime", str(overtime_s), "--scene", str(config), "--json"]
     start_s = time.monotonic()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **own_process_group()) as process:
@@ -149,29 +149,6 @@ def _run_controller(
         return {}
     # Exit code 1: the controller ran, but did not place every part.
     return result if isinstance(result, dict) and process.returncode in (0, 1) else {}
-
-
-def controller_path() -> Path:
-    """Path of the example controller: in this checkout, or as installed with the package.
-
-    Raises:
-        OperationError: the installation does not contain it.
-    """
-    in_checkout = Path(__file__).parents[4] / "examples" / CONTROLLER
-    if in_checkout.exists():
-        return in_checkout
-    spec = importlib.util.find_spec("hilrig_examples")
-    for folder in (spec.submodule_search_locations or []) if spec is not None else []:
-        if (path := Path(folder) / CONTROLLER).exists():
-            return path
-    raise OperationError(f"the example controller {CONTROLLER} is not part of this installation")
-
-
-def free_ports(first: int, count: int = 1) -> int:
-    """Find `count` consecutive free ports on loopback, starting at `first`; return the lowest."""
-    while any(bind_error("127.0.0.1", port) for port in range(first, first + count)):
-        first += count
-    return first
 
 
 @dataclass(frozen=True, slots=True)

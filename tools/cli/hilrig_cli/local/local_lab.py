@@ -116,3 +116,10 @@ def _wait_until_ready(
                     f"the lab is not ready after {READY_TIMEOUT_S:.0f} s; not on the bus: {', '.join(sorted(missing))}"
                 )
             time.sleep(POLL_S)
+
+
+def free_ports(first: int, count: int = 1) -> int:
+    """Find `count` consecutive free ports on loopback, starting at `first`; return the lowest."""
+    while any(bind_error("127.0.0.1", port) for port in range(first, first + count)):
+        first += count
+    return first

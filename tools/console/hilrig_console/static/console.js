@@ -6,6 +6,7 @@ const SVG = "http://www.w3.org/2000/svg";
 const MAX_EVENTS = 200;
 const TIMEOUT_MS = 4000;
 const MAX_CARDS = 60;
+const MAX_REFUSED = 50;
 const ANIMATION_MS = 200;
 const HOLDS_PART = 2, MAGNET_ON = 1;
 const LEVELS = {"in use": "good", "free": "", "no command": "warn", "watchdog tripped": "bad", "no edge": "bad", "no simulation": "bad"};
@@ -230,6 +231,7 @@ function showLab(lab) {
     list.replaceChildren(...alerts.map(([level, text]) => html("li", {"data-level": level}, text)));
   }
   showServices(lab.services);
+  showRefused(lab.rigs);
   arrange();
   if (lab.scenes !== scenesVersion) fetchScenes(lab.scenes);
   if (lab.runs !== runsVersion) fetchRuns(lab.runs);
@@ -246,6 +248,22 @@ function showServices(services) {
     const row = html("tr", service.silent || service.alert ? {"data-level": "bad"} : {},
       html("th", {scope: "row"}, `${service.service}/${service.instance}${service.silent ? " (silent)" : ""}`));
     row.append(...cells.map((cell, number) => html("td", number ? {class: "n"} : {}, String(cell))));
+    return row;
+  }));
+}
+
+// Modbus exception responses since the start of each edge, the most frequent ones first.
+function showRefused(rigs) {
+  const rows = rigs.flatMap((rig) => rig.exceptions.map((refused) => [rig.rig, refused]));
+  rows.sort(([, one], [, other]) => other.count - one.count);
+  byId("refused-panel").hidden = rows.length === 0;
+  const more = byId("refused-more");
+  more.hidden = rows.length <= MAX_REFUSED;
+  setText(more, `The ${MAX_REFUSED} most frequent of ${rows.length}`);
+  byId("refused").tBodies[0].replaceChildren(...rows.slice(0, MAX_REFUSED).map(([rig, refused]) => {
+    const row = html("tr", {}, html("th", {scope: "row"}, rig), html("td", {}, refused.host));
+    const code = refused.code.toString(16).toUpperCase().padStart(2, "0");
+    row.append(...[refused.function, code, refused.count].map((cell) => html("td", {class: "n"}, String(cell))));
     return row;
   }));
 }

@@ -18,7 +18,6 @@ from hilrig_recorder.mcap_format.reader import NoMcapError, Record, RecordReader
 from hilrig_recorder.mcap_format.records import DamagedError, decode_chunk_index
 from hilrig_recorder.mcap_format.scan import MAX_BEGIN_BYTES, session_metadata
 from hilrig_replay.analysis.data_quality import Reason
-from hilrig_replay.analysis.latency import measure
 from hilrig_replay.grading.overlap import NO_SPAN, Span, overlapping
 from hilrig_replay.io.extent import Extent, extent_of, state_range
 from hilrig_replay.io.isolation import EvaluationError, isolated
@@ -248,6 +247,9 @@ def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
 
 def measure_entry(entry: RunEntry, files: RunFiles) -> RunEntry:
     """Add the loop latency of a run to its entry; damage of a file is reported in `error`."""
+    # Imports of the evaluation take longer than listing an indexed folder.
+    from hilrig_replay.analysis.latency import measure
+
     try:
         with isolated(files[0]):
             report = measure(open_run(files))

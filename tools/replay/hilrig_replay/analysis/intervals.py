@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta, binom
+from scipy.special import bdtr, betaincinv
 
 from hilrig_replay.analysis.distribution import Floats, Statistics, percentiles
 from hilrig_replay.io.disk_table import Blocks
@@ -102,8 +102,8 @@ def share_interval(share: float, effective: float) -> Interval:
     """Clopper–Pearson interval of a share, 0 to 1, that was found in an effective number of values."""
     below, above = share * effective, (1 - share) * effective
     tail = (1 - CONFIDENCE) / 2
-    low = float(beta.ppf(tail, below, above + 1)) if below > 0 else 0.0
-    high = float(beta.ppf(1 - tail, below + 1, above)) if above > 0 else 1.0
+    low = float(betaincinv(below, above + 1, tail)) if below > 0 else 0.0
+    high = float(betaincinv(below + 1, above, 1 - tail)) if above > 0 else 1.0
     return low, high
 
 
@@ -114,8 +114,9 @@ def median_over_runs(values: Sequence[float]) -> tuple[float, Interval | None]:
     """
     ordered, count = np.sort(np.asarray(values, np.float64)), len(values)
     median = float(np.median(ordered))
-    below = int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5))
-    if not below or 2 * binom.cdf(below - 1, count, 0.5) > 1 - CONFIDENCE:
+    # A quantile of the binomial distribution.
+    below = int(np.searchsorted(bdtr(np.arange(count), count, 0.5), (1 - CONFIDENCE) / 2))
+    if not below:
         return median, None
     return median, (float(ordered[below - 1]), float(ordered[count - below]))
 

@@ -9,8 +9,7 @@ import secrets
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, PART_SUFFIX
-from hilrig_recorder.mcap_format.records import MAGIC
+from hilrig_recorder.mcap_format.file_names import MAGIC, MCAP_SUFFIX, PART_SUFFIX
 from hilrig_runtime.errors import InputError, OperationError
 
 

@@ -30,8 +30,8 @@ from hilrig_runtime.config.task import TaskConfig
 from hilrig_sim.arm.joints import JOINT_SCALE
 from hilrig_sim.arm.model import RigParameters
 
-MAX_ROWS: Final = 30_000
-"""Rows of a run: ten minutes at a step of 20 ms."""
+MAX_ROWS: Final = 33_000
+"""Rows of a run: eleven minutes at a step of 20 ms."""
 MAX_EVENTS: Final = 2000
 """Events of a run in its list."""
 

@@ -7,6 +7,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind as _Kind
 
+from hilrig_replay.analysis.stages import LOOP_STAGES
+from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, legend_in_words
 from hilrig_replay.rerun_view import entity_paths as paths
 from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
 
@@ -18,6 +20,9 @@ TRAIL_S: Final = 4.0
 """Length of the tool's trail, s."""
 LIVE_WINDOW_S: Final = 20.0
 """Time range of the plots of a running rig, s."""
+_JOINTS: Final = legend_in_words(JOINT_SYMBOLS, JOINT_COLORS)
+_EFFORTS: Final = legend_in_words(EFFORT_SYMBOLS, JOINT_COLORS)
+_STAGES: Final = legend_in_words([one.title for one in LOOP_STAGES], [one.color for one in LOOP_STAGES])
 _CAMERA_POSITION: Final = (0.80, -0.72, 0.50)
 _CAMERA_TARGET: Final = (0.14, 0.02, 0.02)
 _BACKGROUND: Final = (24, 28, 33)
@@ -45,7 +50,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
         overrides={entity_path(root, paths.TRAIL): [rrb.VisibleTimeRanges(trail)] for root in roots},
     )
 
-    def plot(name: str, *shown: str, legend: bool = True) -> rrb.TimeSeriesView:
+    def plot(name: str, *shown: str, legend: bool = False) -> rrb.TimeSeriesView:
         window = rrb.VisibleTimeRange(
             SIM_TIME,
             start=rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_WINDOW_S),
@@ -76,24 +81,25 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False) -> rrb.Blueprint
             contents=[f"+ {entity_path(root, paths.STATES)}/**" for root in roots],
         ),
     )
+    single = len(roots) == 1
     plots = rrb.Vertical(
-        # With several runs, color identifies the run: a legend in one plot is enough.
-        plot("Joint positions (θ in °, d3 in mm)", paths.POSITION, legend=len(roots) == 1),
-        # Event markers are only in plots without a legend, where each kind would take a line.
-        plot("Joint velocities (θ in °/s, d3 in mm/s) and events", paths.VELOCITY, paths.EVENT_MARKERS, legend=False),
-        plot("Joint efforts (τ1, τ2, τ4 in N·m; τ3 in N; thin: commanded)", paths.EFFORT, legend=False),
-        plot("Loop latency by stage, ms", paths.LATENCY_STAGES)
-        if len(roots) == 1
+        # Legends are in the titles: a box in a plot covers curves. Of several runs, color identifies the run, and the
+        # box in the first plot names them.
+        plot(f"Positions: {_JOINTS if single else 'θ'} (°; d3 mm)", paths.POSITION, legend=not single),
+        plot("Velocities (°/s; d3 mm/s) and events", paths.VELOCITY, paths.EVENT_MARKERS),
+        plot(f"Efforts: {_EFFORTS if single else 'τ'} (N·m; τ3 N; thin: commanded)", paths.EFFORT),
+        plot(f"Latency, ms: {_STAGES}", paths.LATENCY_STAGES)
+        if single
         else plot("Loop latency, ms", paths.LOOP_LATENCY),
         rrb.Tabs(
-            plot("Age of the acting torque's basis at each step, ms", paths.LOOP_AGE, legend=False),
-            plot("Tick lateness, ms, and events", paths.TICK_LATENESS, paths.EVENT_MARKERS, legend=False),
-            plot("Modbus requests per second", paths.MODBUS),
+            plot("Age of the acting torque, ms", paths.LOOP_AGE),
+            plot("Tick lateness, ms, and events", paths.TICK_LATENESS, paths.EVENT_MARKERS),
+            plot("Modbus requests per second", paths.MODBUS, legend=True),
         ),
-        row_shares=[1.1, 0.9, 1.0, 1.7, 0.9],
+        row_shares=[1.1, 0.9, 1.0, 1.5, 0.9],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), plots, column_shares=[1.45, 1.0]),
+        rrb.Horizontal(rrb.Vertical(scene, below, row_shares=[2.6, 1.0]), plots, column_shares=[1.0, 1.0]),
         rrb.TimePanel(
             timeline=SIM_TIME,
             state="collapsed",

@@ -7,6 +7,7 @@ The queue is bounded: when drawing falls behind, the oldest messages are dropped
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 import rerun as rr
@@ -20,6 +21,7 @@ from hilrig_runtime.bus.api import Bus
 from hilrig_runtime.config.task import TaskConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.timing.clock import Clock
+from hilrig_runtime.timing.rate_limiter import RepeatReporter, repeat_suffix
 from hilrig_schemas.topics import COMMAND, CONFIG, EVENT, RECORDED, STATE, TRAFFIC, parse_rig_key
 
 VIEWER_PERIOD_S: Final = 0.04
@@ -32,6 +34,8 @@ SILENCE_TIMEOUT_NS: Final = 2_000_000_000
 """Time without states after which the rig is reported as silent, ns."""
 _QUERY_TIMEOUT_S: Final = 0.5
 _MAX_PENDING_MESSAGES: Final = 20_000
+_MALFORMED_PERIOD_NS: Final = 10_000_000_000
+"""Shortest time between two reports of invalid messages of a topic, ns."""
 
 
 class Follower:
@@ -55,6 +59,10 @@ class Follower:
         self._log = log
         self._task = task
         self._pending: deque[tuple[str, bytes, int]] = deque(maxlen=_MAX_PENDING_MESSAGES)
+        self._malformed: RepeatReporter[str, str] = RepeatReporter(
+            _MALFORMED_PERIOD_NS,
+            lambda text, count: log(f"{text}{repeat_suffix(count)}; compare the versions (hilrig doctor)"),
+        )
         self._names, self._timebase = StringTable(), Timebase()
         self._decoder = Decoder(self._names, self._timebase)
         self._view: RerunRigWriter | None = None
@@ -95,10 +103,11 @@ class Follower:
         for _ in range(count):
             topic, payload, arrived_ns = self._pending.popleft()
             try:
-                RECORDED[topic].decode(payload)
+                RECORDED[topic].decode_from(RECORDED[topic].key(self._lab, self._rig), payload)
                 self._decoder.add(topic, payload, 0, arrived_ns)
-            except DecodeError:
-                self._log(f"{self._rig}/{topic}: a message can't be decoded; the sender runs another version of hilrig")
+            except DecodeError as error:
+                self._malformed.record(topic, f"{self._rig}/{topic}: a message is invalid: {error}", now_ns)
+        self._malformed.check(now_ns)
         records = self._decoder.drain()
         # Only states count: the edge keeps repeating its command after the simulation has stopped.
         if len(records.states):
@@ -129,8 +138,9 @@ class Follower:
     def _query_geometry(self) -> RigGeometry | None:
         for answer in self._bus.query(CONFIG.key(self._lab, self._rig), timeout_s=_QUERY_TIMEOUT_S):
             if answer.payload and not answer.error:
-                config = CONFIG.decode_from(answer.key, answer.payload)
-                return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)
+                with suppress(DecodeError):
+                    config = CONFIG.decode_from(answer.key, answer.payload)
+                    return RigGeometry.of(config.urdf, config.parameters_json, config.step_ns, self._task)
         return None
 
     def close(self) -> None:

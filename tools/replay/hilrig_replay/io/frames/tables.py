@@ -10,7 +10,7 @@ import pyarrow as pa
 from hilrig_replay.io.columns import Rows
 from hilrig_replay.io.records import Records
 from hilrig_replay.io.run import Run
-from hilrig_runtime.errors import InputError, OperationError
+from hilrig_runtime.errors import InputError, OperationError, install_command
 from hilrig_sim.arm.joints import JOINT_NAMES
 
 TABLES: Final[dict[str, Callable[[Records], Rows]]] = {
@@ -61,5 +61,6 @@ def frame(table: pa.Table, library: str) -> Any:
     try:
         module = import_module(library)
     except ImportError as error:
-        raise OperationError(f"{library} is not installed: pip install 'hilrig[frames]'") from error
+        fix = f"in hilrig's folder: {install_command('frames')}"
+        raise OperationError(f"{library} is not installed: {fix}") from error
     return table.to_pandas() if library == "pandas" else module.from_arrow(table)

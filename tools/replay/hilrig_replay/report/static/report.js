@@ -37,7 +37,8 @@ function indexAt(values, wanted) {
 const withGaps = (values) => Array.from(values, (value) => (Number.isNaN(value) ? null : value));
 const radians = (degrees) => (degrees * Math.PI) / 180;
 const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const fixed = (value, digits) => (value === null || Number.isNaN(value) ? "–" : value.toFixed(digits));
+// Without the sign of a negative value that is rounded to zero.
+const fixed = (value, digits) => (value === null || Number.isNaN(value) ? "–" : value.toFixed(digits).replace(/^-(?=0\.?0*$)/, ""));
 
 // ---- views of the arm
 
@@ -380,7 +381,7 @@ class Player {
     const views = element("div", {class: "views"}, ...this.arm.figures, element("div", {class: "panel"}, values, this.note));
     const hint = element("p", {class: "quiet"}, "Drag in a plot to zoom into a time range, double-click for the whole run, click to go to a time. " +
       "Dotted lines are events, solid green lines reached goals." +
-      (run.every > 1 ? ` Each ${run.every}th state is shown; age and latency are the largest of each group.` : ""));
+      (run.every > 1 ? ` One of ${run.every} states is shown; age and latency are the largest of each group.` : ""));
     this.root.replaceChildren(bar, views, hint, this.plots.container);
     this.buildEvents();
     this.button.addEventListener("click", () => this.toggle());
