@@ -25,7 +25,7 @@ class _Server(ModbusTcpServer):
 
 
 class _Handler(ServerRequestHandler):
-    """Sends what the fault of its owner makes of a response to a read."""
+    """Passes responses to reads through the fault of its owner."""
 
     def send(self, data: bytes, addr: Any = None) -> None:
         fault = self.server.owner.fault

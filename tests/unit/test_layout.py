@@ -7,8 +7,9 @@ import pytest
 import rerun.blueprint as rrb
 
 from hilrig_replay.io.run import Run, open_run
+from hilrig_replay.rerun_view import view
 from hilrig_replay.rerun_view.layout import layout
-from hilrig_replay.rerun_view.view import root_names, save_rrd
+from hilrig_replay.rerun_view.view import root_names, save_rrd, send_runs
 from support.recordings import Script, make, write
 from support.rrd_files import RrdFile
 
@@ -20,6 +21,7 @@ yaw_deg = 0
 [task.path]
 points_mm = [[300, 0, 100], [300, 100, 100]]
 """
+DATA = Path(__file__).parents[1] / "data"
 HIDDEN = {1: "/loop", 2: "/{root}/stages"}
 """Written, but not shown, by number of runs: stages are shown for one run, the loop of several runs in one plot."""
 
@@ -61,3 +63,15 @@ def test_views_show_exactly_the_written_entities(runs: list[Run], tmp_path: Path
     assert {path for path in written if not below(path, shown)} == {
         HIDDEN[count].format(root=run.session) for run in runs
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"), [("client-role", "position write yellow"), ("limit-cycle", "controller orange")]
+)
+def test_title_names_the_stages_of_the_role(monkeypatch: pytest.MonkeyPatch, name: str, stage: str) -> None:
+    shown: list[rrb.Blueprint] = []
+    monkeypatch.setattr(view, "to_viewer", lambda _port, _name, blueprint: shown.append(blueprint))
+    monkeypatch.setattr(view, "_write", lambda *_: None)
+    send_runs([open_run(DATA / f"{name}.mcap")], 0, lambda: True)
+    titles = [str(each.name) for each in views(shown[0].root_container)]
+    assert [title for title in titles if title.startswith("Latency, ms: register wait blue, ") and stage in title]

@@ -7,6 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilrig_replay.grading.task_loading import recorded_task
+from hilrig_replay.io.columns import written
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
@@ -65,7 +66,16 @@ def _name(runs: Sequence[Run]) -> str:
 
 
 def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
-    return layout(root_names(runs))
+    return layout(root_names(runs), client_role=len(runs) == 1 and _is_client(runs[0]))
+
+
+def _is_client(run: Run) -> bool:
+    """Whether the edge was the client of the controller when the first torques were written."""
+    for block in run.blocks(frozenset({"command"})):
+        commands = written(block.commands)
+        if len(commands):
+            return bool(commands["read_sent_ns"][0])
+    return False
 
 
 def _write(
