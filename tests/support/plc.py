@@ -24,6 +24,7 @@ class Plc:
 
     Args:
         scan_s: period of the program; 0: it answers each write of positions at once.
+        output_s: time from the inputs of a scan to its outputs.
         delay_s: delay of each direction of the network.
         law: the program.
         copies_step: whether the program copies the step number.
@@ -33,6 +34,7 @@ class Plc:
         self,
         *,
         scan_s: float = 0.0,
+        output_s: float = 0.0,
         delay_s: float = 0.0,
         law: Law = hold,
         copies_step: bool = True,
@@ -54,6 +56,7 @@ class Plc:
         self.closes_after_response = False
         self.connections = 0
         self._scan_s, self._delay_s, self._law, self._copies_step = scan_s, delay_s, law, copies_step
+        self._output_s = output_s
         self._lock = threading.Lock()
         self._host, self.port = host, port
         self._stopping = threading.Event()
@@ -109,6 +112,8 @@ class Plc:
         with self._lock:
             positions, step = self.positions, struct.unpack_from(">H", self.registers, 16)[0]
         torques = self._law(positions)
+        if self._output_s:
+            time.sleep(self._output_s)  # the program computes
         with self._lock:
             self.set_torques(*torques)
             if self._copies_step:
