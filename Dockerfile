@@ -12,6 +12,7 @@ COPY services services
 COPY tools tools
 COPY examples examples
 COPY compose compose
+COPY exercises exercises
 # The installers are not needed at run time.
 RUN python -m venv /opt/hilrig \
     && /opt/hilrig/bin/pip install --no-cache-dir --constraint constraints.txt ".[${PARTS}]" \

@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Bytecode files are always written: a lab has four processes, and tests start hundreds of processes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-long together real-time again coverage check gen bench system clean
+.PHONY: help demo test test-long together real-time again coverage check gen docs bench system clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -68,6 +68,7 @@ test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet
 	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_exercises.py tests/unit/test_assign_check.py tests/unit/test_class_of_30.py tests/rig/test_interactive_report.py
 	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py
 	$(BIN)/python tests/chaos.py
+	$(MAKE) --no-print-directory docs
 
 check: .venv/dev ## check format, lint rules, types and layers
 	$(BIN)/ruff format --check .
@@ -84,8 +85,15 @@ gen: .venv/dev ## generate code and documentation tables from their sources
 	$(BIN)/python scripts/generate_conformance.py > docs/modbus-conformance.md
 	$(BIN)/python scripts/draw_grading.py
 
+.venv/docs: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP_INSTALL) '.[docs]'
+	@touch $@
+
+docs: .venv/docs ## build the documentation site in build/docs/
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
+
 bench: .venv/dev system ## run all benchmarks (up to one hour); writes docs/performance.md
 	$(BIN)/python bench/run_all.py
 
 clean: ## remove everything that was built or installed here
-	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov dist
+	rm -rf .venv bench/build .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov dist build

@@ -40,7 +40,7 @@ def test_each_command_has_one_extra() -> None:
 
 def test_old_names_of_extras_are_aliases() -> None:
     found = PROJECT["optional-dependencies"]
-    assert set(found) == {"rig", "review", "console", "study", "frames", "all", "dev", *OLD_NAMES}
+    assert set(found) == {"rig", "review", "console", "study", "frames", "all", "dev", "docs", *OLD_NAMES}
     assert {name: found[name] for name in OLD_NAMES} == {
         "router": [],
         "sim": ["hilrig[rig]"],

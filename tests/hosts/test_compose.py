@@ -152,7 +152,7 @@ def test_plain_lab_file_and_compose_file_agree() -> None:
 
 def test_image_installs_the_extras_of_its_services() -> None:
     dockerfile = (ROOT / "Dockerfile").read_text()
-    for folder in ("schemas", "runtime", "services", "tools", "examples", "compose"):
+    for folder in ("schemas", "runtime", "services", "tools", "examples", "compose", "exercises"):
         assert f"COPY {folder} {folder}" in dockerfile
     assert "\nUSER 10001:10001\n" in dockerfile
     assert ":latest" not in dockerfile

@@ -25,6 +25,8 @@ from support.waiting import eventually
 pytestmark = [
     pytest.mark.rig,
     pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),
+    # Runtimes of PLCs are compiled.
+    pytest.mark.timeout(1500),
 ]
 
 GOAL = (30.0, -45.0, 50.0, 20.0)

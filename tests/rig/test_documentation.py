@@ -34,6 +34,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "hilrig console": "tests/rig/test_console.py",
     "hilrig router": "tests/hosts/test_compose.py",
     "hilrig demo": "tests/rig/test_demo.py",
+    "hilrig events --config": "tests/rig/test_events_command.py",
     "hilrig grade": "tests/unit/test_class_of_30.py",
     "hilrig jitter": "tests/rig/test_jitter.py",
     "hilrig join": "tests/unit/test_join.py",

@@ -44,7 +44,8 @@ def test_impairment_is_set_by_command_at_run_time(tmp_path: Path) -> None:
             (("rig1", "--trace", recording, "--command", "constant:1"), "--trace and --command both set the delay"),
             (("rig1", "--off", "--preset", "vpn"), "--off and --lab can't be combined"),
             (("rig9", "--off"), "unknown rig 'rig9'"),
-            (("--off",), "a rig is required to set an impairment"),
+            (("--off",), "no rig given; expected names of rigs, or --all"),
+            (("rig1", "--all", "--off"), "both rigs and --all given"),
         ):
             done = hilrig("impair", *options, "--config", config)
             assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr

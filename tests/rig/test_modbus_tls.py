@@ -276,7 +276,7 @@ def test_mutated_handshakes_have_no_effect_on_others(
     assert rig.service.counters.refused
     gc.collect()
     # The test publishes no states meanwhile.
-    expected = {"hilrig_modbus_edge.server.listener", "hilrig_runtime.process.outage"}
+    expected = {"hilrig_modbus_edge.server.listener", "hilrig_runtime.process.event_log"}
     assert {record.name for record in caplog.records} <= expected
 
 

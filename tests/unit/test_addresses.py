@@ -6,6 +6,8 @@ import socket
 import pytest
 
 from hilrig_runtime.addresses import format_address, listen_hint, plain_host, reachable_hosts
+from hilrig_runtime.bus.zenoh_config import mesh_endpoint
+from hilrig_runtime.config.bus import BusConfig
 
 
 def test_ipv6_hosts_are_bracketed() -> None:
@@ -45,3 +47,7 @@ def test_each_error_has_its_fix(number: int, port: int, expected: str) -> None:
     hint = listen_hint(OSError(number, "text"), port, "HOST", "PORT")
     assert expected in hint
     assert ("another hilrig" in hint) == (number == errno.EADDRINUSE)
+
+
+def test_mesh_on_ipv6_has_bracketed_endpoints() -> None:
+    assert mesh_endpoint(BusConfig(host="::1", first_port=7447), "sim") == "tcp/[::1]:7447"

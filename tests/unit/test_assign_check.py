@@ -91,3 +91,12 @@ def test_program_without_torques_is_an_error_with_its_output(tmp_path: Path) -> 
     done = hilrig("assign", "check", FIRST, "--solution", solution)
     assert done.returncode == 3
     assert "nothing was recorded: did it write torques? Its output: nothing to do --host" in done.stderr
+
+
+@pytest.mark.rig
+@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes two minutes; set HILRIG_LONG=1 to run it")
+@pytest.mark.parametrize("exercise", sorted((ROOT / "exercises").glob("*/")), ids=lambda exercise: exercise.name)
+def test_solution_of_each_exercise_passes_in_real_time(exercise: Path) -> None:
+    solution = ROOT / "tests/exercises" / f"{exercise.name[2:].replace('-', '_')}.py"
+    done = hilrig("assign", "check", exercise, "--solution", solution)
+    assert done.returncode == 0, done.stdout + done.stderr

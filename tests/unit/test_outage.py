@@ -5,16 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from hilrig_runtime.process.outage import (
-    OUTAGE_LOG_DELAY_NS,
-    OUTAGE_LOG_PERIOD_NS,
-    RETURN_NS,
-    STEADY_NS,
-    Outage,
-    OutageDetector,
-    OutageLog,
-    describe_outage,
-)
+from hilrig_runtime.process.event_log import DELAY_NS, OUTAGE_PERIOD_NS, EventLog
+from hilrig_runtime.process.outage import RETURN_NS, STEADY_NS, Outage, OutageDetector, describe_outage
 from hilrig_schemas import Event
 
 MS = 1_000_000
@@ -73,19 +65,29 @@ def test_source_that_never_sent_is_reported() -> None:
 
 
 def test_outages_of_all_rigs_are_one_log_message(caplog: pytest.LogCaptureFixture) -> None:
-    log = OutageLog()
+    log = EventLog()
     with caplog.at_level(logging.INFO):
         for rig in range(1, 9):
             log.record(Event(rig=f"rig{rig}", kind=Event.STATE_LOST, severity=Event.WARNING, text="no states"), rig)
         log.record(Event(rig="rig1", kind=Event.LIMIT_HIT, text="joint 1"), 9)
-        log.flush_if_due(OUTAGE_LOG_DELAY_NS // 2)
+        log.flush_if_due(DELAY_NS // 2)
         assert caplog.messages == []
-        log.flush_if_due(OUTAGE_LOG_DELAY_NS + 10)
+        log.flush_if_due(DELAY_NS + 10)
         assert caplog.messages == ["rig1, rig2, rig3 and 5 more: no states"]
-        for now_ns in range(SECOND, OUTAGE_LOG_PERIOD_NS, SECOND // 2):
+        for now_ns in range(SECOND, OUTAGE_PERIOD_NS, SECOND // 2):
             log.record(Event(rig="rig1", kind=Event.STATE_LOST, severity=Event.WARNING, text="no states"), now_ns)
             log.flush_if_due(now_ns)
         assert len(caplog.messages) == 1
-        log.flush_if_due(2 * OUTAGE_LOG_PERIOD_NS)
+        log.flush_if_due(2 * OUTAGE_PERIOD_NS)
     assert caplog.messages[1:] == ["rig1: no states"]
     assert {record.levelname for record in caplog.records} == {"WARNING"}
+
+
+def test_different_events_of_a_kind_are_counted_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    log = EventLog()
+    with caplog.at_level(logging.INFO):
+        for client in ("a", "b", "b"):
+            log.record(Event(rig="rig1", kind=Event.LEASE_REFUSED, severity=Event.WARNING, text=f"{client} refused"), 0)
+        log.record(Event(kind=Event.OVERRUN, severity=Event.WARNING, text="late"), 0)
+        log.flush()
+    assert caplog.messages == ["rig1: a refused (and 1 more of this kind: hilrig events)", "late"]

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import zenoh
 
+from hilrig_runtime.addresses import format_address
 from hilrig_runtime.bus.acl import TOOL_ROLES, access_control, identities
 from hilrig_runtime.config.bus import BusConfig, BusTlsConfig
 from hilrig_runtime.errors import InputError
@@ -34,7 +35,7 @@ _CERTS_HINT: Final = "create certificates with hilrig certs on the host that has
 
 def mesh_endpoint(bus: BusConfig, service: str) -> str:
     """Return the endpoint on which a service listens in the mesh."""
-    return f"{_protocol(bus)}/{bus.host}:{bus.first_port + MESH_ORDER.index(service)}"
+    return f"{_protocol(bus)}/{format_address(bus.host, bus.first_port + MESH_ORDER.index(service))}"
 
 
 def finds_others_by_gossip(bus: BusConfig, service: str, instance: str) -> bool:
@@ -57,7 +58,7 @@ def zenoh_config(bus: BusConfig, service: str, instance: str = FIRST_INSTANCE) -
         earlier = MESH_ORDER.index(service) if has_port else len(MESH_ORDER)
         connect = [mesh_endpoint(bus, other) for other in MESH_ORDER[:earlier]]
         if service in MESH_ORDER:
-            listen = [mesh_endpoint(bus, service) if has_port else f"{_protocol(bus)}/{bus.host}:0"]
+            listen = [mesh_endpoint(bus, service) if has_port else f"{_protocol(bus)}/{format_address(bus.host, 0)}"]
     settings = _COMMON | {
         "mode": mode,
         "listen/endpoints": listen,

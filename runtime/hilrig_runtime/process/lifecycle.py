@@ -53,10 +53,10 @@ def run_service(
         return
     with Service(name, lab, bus, instance=instance, rigs=rigs, stopping=stopping) as service:
         running.append(service)
-        logger.debug("running as %s", service.source)
         with _stop_on_thread_crash(service):
             run(service)
         service.check()
+    logger.info("stopped")
 
 
 @contextlib.contextmanager

@@ -1,25 +1,15 @@
-"""Outages: detects that messages stop arriving, and logs outages of many rigs together. Pure: time is passed in."""
+"""Outages: detects that messages stop arriving. Pure: time is passed in."""
 
-import logging
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
-
-from hilrig_runtime.errors import list_names
-from hilrig_schemas import Event
 
 RETURN_NS: Final = 1_000_000_000
 """Time that messages must arrive again before an outage has ended, ns."""
 STEADY_NS: Final = 5_000_000_000
 """The same for an outage that begins within this time after the last one: a source that flaps has one long outage."""
-OUTAGE_LOG_DELAY_NS: Final = 250_000_000
-"""Time in which the outages of all rigs are collected for one log message, ns."""
-OUTAGE_LOG_PERIOD_NS: Final = 5_000_000_000
-"""Shortest time between two log messages about outages of one kind, ns."""
 STALL_NS: Final = 500_000_000
 """Time without a tick after which a process is stalled, ns: it was stopped, or its host was overloaded."""
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,33 +79,6 @@ class OutageDetector:
             self._since_ns, self._ended_ns = None, now_ns
             return ended
         return None
-
-
-_KINDS: Final = (Event.STATE_LOST, Event.STATE_BACK, Event.COMMAND_LOST, Event.COMMAND_BACK)
-
-
-class OutageLog:
-    """Logs the events that begin or end outages: one message for all rigs, at most one a period for each kind."""
-
-    def __init__(self) -> None:
-        self._pending: dict[Event.Kind, list[Event]] = {}
-        self._due_ns: dict[Event.Kind, int] = {}
-
-    def record(self, event: Event, now_ns: int) -> None:
-        """Collect an event if it begins or ends an outage; ns, monotonic clock."""
-        if event.kind in _KINDS:
-            if event.kind not in self._pending:
-                self._due_ns[event.kind] = max(self._due_ns.get(event.kind, 0), now_ns + OUTAGE_LOG_DELAY_NS)
-            self._pending.setdefault(event.kind, []).append(event)
-
-    def flush_if_due(self, now_ns: int) -> None:
-        """Log the collected events, if that is due; ns, monotonic clock."""
-        for kind in [kind for kind in self._pending if now_ns >= self._due_ns[kind]]:
-            events = self._pending.pop(kind)
-            self._due_ns[kind] = now_ns + OUTAGE_LOG_PERIOD_NS
-            rigs = list_names(sorted({event.rig for event in events}))
-            level = logging.INFO if events[0].severity == Event.INFO else logging.WARNING
-            logger.log(level, "%s: %s", rigs, events[0].text)
 
 
 def describe_outage(what: str, outage: Outage, wall_offset_ns: int) -> str:

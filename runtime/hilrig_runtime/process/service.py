@@ -9,6 +9,7 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from importlib.metadata import version
 from types import MappingProxyType
 from typing import Final, TypeVar
 
@@ -16,14 +17,15 @@ from google.protobuf.message import Message
 
 from hilrig_runtime.bus.api import Bus, Handle, Publisher
 from hilrig_runtime.config.lab import LabConfig, RigSettings
-from hilrig_runtime.errors import OperationError
+from hilrig_runtime.errors import OperationError, list_names
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.messaging.publisher import RigPublisher
 from hilrig_runtime.messaging.recording_stream import RecordingStream, batch_cache_depth
 from hilrig_runtime.messaging.rig_batch import BatchPublisher
 from hilrig_runtime.process.discovery import PeerRegistry
+from hilrig_runtime.process.event_log import EventLog
 from hilrig_runtime.process.health import HealthReporter
-from hilrig_runtime.process.outage import STALL_NS, OutageLog
+from hilrig_runtime.process.outage import STALL_NS
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
 from hilrig_schemas import Event, PeerReport, RigBatch, ServiceInfo
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, source_of_key
@@ -74,7 +76,8 @@ class Service(Handle):
         self.recording_stream = RecordingStream(messages, events, self.source, self.incarnation)
         self.health = HealthReporter(self.publisher(HEALTH), name, instance, self.incarnation, clock)
         self.counters = self.health.counters
-        self._outage_log = OutageLog()
+        self._event_log = EventLog()
+        self._closing.callback(self._event_log.flush)
         self._beat_ns = clock.monotonic_ns()
         self._token: Handle | None = None
         self._failure = ""
@@ -118,6 +121,10 @@ class Service(Handle):
             self.claim()
             token = self.bus.declare_token(alive_key(self.lab.name, self.name, self.instance))
             self._token = self._closing.enter_context(token)
+            rigs = [
+                f"{rig.name} at {address}" if (address := self.addresses(rig.name)) else rig.name for rig in self.rigs
+            ]
+            logger.info("ready: hilrig %s, lab %s, %s", version("hilrig"), self.lab.name, list_names(rigs) or "no rig")
 
     def set_rigs(self, rigs: tuple[RigSettings, ...]) -> None:
         """Replace the rigs of this service, because one was added or removed."""
@@ -167,7 +174,7 @@ class Service(Handle):
         if publisher is None:
             publisher = self._event_publishers[rig] = self.rig_publisher(EVENT, rig)
         publisher.publish(event)
-        self._outage_log.record(event, self.clock.monotonic_ns())
+        self._event_log.record(event, self.clock.monotonic_ns())
 
     def beat(self, now_ns: int) -> None:
         """Once per tick: publish the recording batch and the health report if due; `now_ns`: monotonic clock."""
@@ -175,7 +182,7 @@ class Service(Handle):
             text = "stalled for %.1f s until now: this process was stopped, or its host was overloaded"
             logger.warning(text, (now_ns - self._beat_ns) / 1e9)
         self._beat_ns = now_ns
-        self._outage_log.flush_if_due(now_ns)
+        self._event_log.flush_if_due(now_ns)
         self.recording_stream.flush_if_due(now_ns)
         self.health.report_if_due(now_ns)
 

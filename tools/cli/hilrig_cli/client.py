@@ -29,31 +29,35 @@ WAIT_MESSAGE_AFTER_S: Final = 0.5
 """Waiting time after which a message is printed."""
 
 
-def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rig: str, request: Message) -> list[MessageT]:
-    """Query a rig's topic, or that of every rig if `rig` is empty; return at least one reply, in the lab's order.
+def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rigs: Sequence[str], request: Message) -> list[MessageT]:
+    """Query a topic of rigs, or of every rig if `rigs` is empty; return at least one reply, in the lab's order.
 
     Rigs that were added since the lab started come last.
 
     Raises:
         InputError: the lab has no such rig.
-        OperationError: no edge replies, or the edge refuses the request, or its reply is invalid.
+        OperationError: no edge replies, an edge refuses the request, or a reply is invalid; the other rigs are done
+            nevertheless.
     """
     check_permission(lab, topic)
     payload = request.SerializeToString()
     deadline_s = time.monotonic() + QUERY_TIMEOUT_S
     with ZenohBus(lab.bus, "tool") as bus:
-        if rig:
+        for rig in rigs:
             check_rig(bus, lab, rig)
-        else:
+        if not rigs:
             # Without a link to every edge, the reply of the first edge would be taken for that of all.
             discover_services(bus, lab, {"edge"})
-        while not (replies := bus.query(topic.key(lab.name, rig or "*"), payload)) and time.monotonic() < deadline_s:
-            time.sleep(0.05)
-    for reply in replies:
-        if reply.error:
-            raise OperationError(f"rig {rig!r}: the edge refused: {reply.error}")
-    if not replies:
-        raise OperationError(f"no edge answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?")
+        replies = []
+        for rig in rigs or ["*"]:
+            while not (found := bus.query(topic.key(lab.name, rig), payload)) and time.monotonic() < deadline_s:
+                time.sleep(0.05)
+            if not found:
+                rest = f"rig {rig!r}" if rigs else f"lab {lab.name!r}"
+                raise OperationError(f"no edge answers for {rest}: is it running (hilrig up), with this lab.toml?")
+            replies += found
+    if refused := [f"rig {parse_rig_key(reply.key).rig!r}: {reply.error}" for reply in replies if reply.error]:
+        raise OperationError(f"the edge refused: {'; '.join(refused)}")
     positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
     try:
         by_rig = {parse_rig_key(reply.key).rig: topic.decode_from(reply.key, reply.payload) for reply in replies}

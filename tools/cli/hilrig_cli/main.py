@@ -15,6 +15,7 @@ from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
 from hilrig_cli.commands.doctor import doctor
+from hilrig_cli.commands.events import events
 from hilrig_cli.commands.example import example
 from hilrig_cli.commands.export import export
 from hilrig_cli.commands.grade import grade
@@ -60,6 +61,7 @@ PANELS = {
         check,
         doctor,
         lease,
+        events,
         impair,
         jitter,
         registers,

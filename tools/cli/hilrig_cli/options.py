@@ -16,6 +16,8 @@ Config = Annotated[
         help="Configuration file of the lab; default: one rig with default settings.",
     ),
 ]
+Rigs = Annotated[list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs.")]
+AllRigs = Annotated[bool, typer.Option("--all", help="All rigs of the running lab.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
 
 
@@ -23,6 +25,19 @@ def config_for_commands(context: typer.Context, config: Config = None) -> None:
     """Callback of a command group: accepts `-c` before the command too; `-c` after the command takes precedence."""
     if config is not None and isinstance(context.command, TyperGroup):
         context.default_map = {name: {"config": str(config)} for name in context.command.commands}
+
+
+def check_rigs(rigs: list[str] | None, every: bool, command: str) -> None:
+    """Check that a command that changes rigs names them.
+
+    Raises:
+        InputError: neither rigs nor `--all`, or both.
+    """
+    from hilrig_runtime.errors import InputError
+
+    if bool(rigs) == every:
+        found = "both rigs and --all" if rigs else "no rig"
+        raise InputError(f"{command}: {found} given; expected names of rigs, or --all")
 
 
 def log(line: str) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AllRigs, AsJson, Config, check_rigs
 
 if TYPE_CHECKING:
     from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -15,11 +15,14 @@ if TYPE_CHECKING:
 DELAY_SYNTAX = (
     "constant:MS, uniform:LOW,HIGH, normal:MEAN,STD, gamma:MEAN,STD[,OFFSET], exponential:MEAN[,OFFSET], trace:FILE"
 )
-LOSS_SYNTAX = "none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
+LOSS_SYNTAX = "RATE (as bernoulli:RATE), none, bernoulli:RATE or gilbert:TO_BAD,TO_GOOD[,RATE_BAD[,RATE_GOOD]]"
 
 
 def impair(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig; default: show all rigs of the lab.")] = "",
+    rigs: Annotated[
+        list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs; default: show all rigs of the lab.")
+    ] = None,
+    every: AllRigs = False,
     preset: Annotated[
         str,
         typer.Option(metavar="NAME", help="Preset: none, wired, busy-wifi, vpn, mobile or paper-25-100ms."),
@@ -42,7 +45,7 @@ def impair(
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Add delay and loss to the loop of a running rig, or show the active impairment.
+    """Add delay and loss to the loop of running rigs, or show the active impairment.
 
     The setting stays active until changed or until the edge restarts. The watchdog's zero torque is never delayed or
     lost. Each change is recorded as an event, and each delay with its command.
@@ -55,17 +58,17 @@ def impair(
     setting = any((preset, state, command, loss, trace))
     if setting + off + lab > 1:
         raise InputError("--off and --lab can't be combined with each other or with an impairment: use one of them")
-    if (setting or off or lab) and not rig:
-        raise InputError("a rig is required to set an impairment: hilrig impair RIG …")
+    if setting or off or lab:
+        check_rigs(rigs, every, "hilrig impair")
     if trace is not None and command:
         raise InputError("--trace and --command both set the delay of the command link: use one of them")
     request = ImpairmentRequest(restore_lab=lab)
     if setting or off:
         request.set_json = _impairment(preset, state, command, loss, trace, seed).model_dump_json()
-    statuses = query_edges(load_lab(config), topics.IMPAIRMENT, rig, request)
+    statuses = query_edges(load_lab(config), topics.IMPAIRMENT, rigs or [], request)
     if as_json:
         rows = [_row(status) for status in statuses]
-        print(json.dumps(rows[0] if rig else rows))
+        print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
     else:
         _print_table(statuses)
 
@@ -89,6 +92,8 @@ def _impairment(preset: str, state: str, command: str, loss: str, trace: Path | 
 
         with isolated(trace):
             delays["command"] = delay_trace(open_run(find_run(trace)))
+    if loss and loss.replace(".", "", 1).isdigit():
+        loss = f"bernoulli:{loss}"
     losses = {"state": loss or base.state.loss, "command": loss or base.command.loss}
     links = {link: {"delay": delays[link], "loss": losses[link]} for link in delays}
     return validate(ImpairmentConfig, {"preset": preset or "none", "seed": seed, **links})

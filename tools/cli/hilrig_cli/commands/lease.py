@@ -5,39 +5,38 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilrig_cli.options import AsJson, Config
+from hilrig_cli.options import AllRigs, AsJson, Config, check_rigs
 
 if TYPE_CHECKING:
     from hilrig_schemas import LeaseStatus
 
 
 def lease(
-    rig: Annotated[
-        str,
-        typer.Argument(metavar="RIG", help="Name of the rig; default: all rigs of the lab. Required with --release."),
-    ] = "",
+    rigs: Annotated[
+        list[str] | None, typer.Argument(metavar="RIG...", help="Names of the rigs; default: all rigs of the lab.")
+    ] = None,
+    every: AllRigs = False,
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the lease holder of a rig, or revoke its lease: the next other controller that writes acquires it.
+    """Show the lease holder of each rig, or revoke leases: the next other controller that writes acquires the rig.
 
-    Exit code 1: with --release, the rig had no lease holder.
+    Exit code 1: with --release, a rig had no lease holder.
     """
     from hilrig_cli.client import query_edges
     from hilrig_runtime.config.lab import load_lab
-    from hilrig_runtime.errors import InputError
     from hilrig_schemas import LeaseRequest, topics
 
-    if release and not rig:
-        raise InputError("--release requires a rig: hilrig lease RIG --release")
-    statuses = query_edges(load_lab(config), topics.LEASE, rig, LeaseRequest(release=release))
+    if release:
+        check_rigs(rigs, every, "hilrig lease --release")
+    statuses = query_edges(load_lab(config), topics.LEASE, rigs or [], LeaseRequest(release=release))
     if as_json:
         rows = [_row(status) for status in statuses]
-        print(json.dumps(rows[0] if rig else rows))
+        print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
     else:
         _print_table(statuses, release)
-    if release and not statuses[0].released:
+    if release and not all(status.released for status in statuses):
         raise typer.Exit(1)
 
 

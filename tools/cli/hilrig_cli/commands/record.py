@@ -1,10 +1,12 @@
 """`hilrig record start RIG`, `hilrig record stop RIG`: manual recording sessions."""
 
-from typing import TYPE_CHECKING, Annotated
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import typer
 
-from hilrig_cli.options import AsJson, Config, config_for_commands
+from hilrig_cli.options import AllRigs, AsJson, Config, Rigs, check_rigs, config_for_commands
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,56 +19,61 @@ app = typer.Typer(
     callback=config_for_commands,
 )
 
-Rig = Annotated[str, typer.Argument(metavar="RIG", help="Name of the rig.")]
-
 
 @app.command()
-def start(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
-    """Start a manual recording of a rig."""
+def start(rigs: Rigs = None, every: AllRigs = False, config: Config = None, as_json: AsJson = False) -> None:
+    """Start a manual recording of each rig."""
     from hilrig_schemas import ControlRequest, StartSession
 
-    session = _request(config, rig, ControlRequest(start_session=StartSession(rig=rig)))
-    _print(rig, session, f"recording {session}; stop it with `hilrig record stop {rig}`", as_json)
+    sessions = _request(config, rigs, every, lambda rig: ControlRequest(start_session=StartSession(rig=rig)))
+    _print(sessions, "recording {session}; stop it with `hilrig record stop {rig}`", as_json)
 
 
 @app.command()
-def stop(rig: Rig, config: Config = None, as_json: AsJson = False) -> None:
-    """Stop the manual recording of a rig."""
+def stop(rigs: Rigs = None, every: AllRigs = False, config: Config = None, as_json: AsJson = False) -> None:
+    """Stop the manual recording of each rig."""
     from hilrig_schemas import ControlRequest, StopSession
 
-    session = _request(config, rig, ControlRequest(stop_session=StopSession(rig=rig)))
-    _print(rig, session, f"recorded {session}", as_json)
+    sessions = _request(config, rigs, every, lambda rig: ControlRequest(stop_session=StopSession(rig=rig)))
+    _print(sessions, "recorded {session}", as_json)
 
 
-def _request(config: "Path | None", rig: str, request: "ControlRequest") -> str:
-    """Send a request to the recorder of a rig; return the id of the session."""
+def _request(
+    config: "Path | None", rigs: list[str] | None, every: bool, request: "Callable[[str], ControlRequest]"
+) -> dict[str, str]:
+    """Send a request to the recorder of each rig; return the id of each rig's session."""
     from hilrig_cli.client import check_rig, discover_services, send_control_request
     from hilrig_runtime.bus.zenoh_bus import ZenohBus
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import OperationError
 
+    check_rigs(rigs, every, "hilrig record")
     lab = load_lab(config)
+    sessions: dict[str, str] = {}
     with ZenohBus(lab.bus, "tool") as bus:
         recorders = [one for one in discover_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
             raise OperationError(
                 f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
             )
+        owners = {rig: one for one in recorders for rig in one.rigs}
         # Rigs that were added at run time belong to the recorder of the first rig in the lab's file.
-        owner = next((one for one in recorders if rig in one.rigs), None)
-        owner = owner or next((one for one in recorders if lab.rigs[0].name in one.rigs), recorders[0])
-        try:
-            return send_control_request(bus, lab, owner, request).session
-        except OperationError:
-            # The recorder also knows removed rigs, so it is queried first and an unknown name reported after that.
-            check_rig(bus, lab, rig)
-            raise
+        default = owners.get(lab.rigs[0].name, recorders[0])
+        for rig in rigs or owners:
+            try:
+                sessions[rig] = send_control_request(bus, lab, owners.get(rig, default), request(rig)).session
+            except OperationError as error:
+                # The recorder also knows removed rigs, so it is queried first and an unknown name reported after that.
+                check_rig(bus, lab, rig)
+                done = f"; done for {', '.join(sessions)}" if sessions else ""
+                raise OperationError(f"{error}{done}") from error
+    return sessions
 
 
-def _print(rig: str, session: str, text: str, as_json: bool) -> None:
+def _print(sessions: dict[str, str], text: str, as_json: bool) -> None:
+    rows = [{"rig": rig, "session": session} for rig, session in sessions.items()]
     if as_json:
-        import json
-
-        print(json.dumps({"rig": rig, "session": session}))
+        print(json.dumps(rows[0] if len(rows) == 1 else rows))
     else:
-        print(text)
+        for row in rows:
+            print(text.format_map(row))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilrig_cli.options import AsJson, Config, config_for_commands
+from hilrig_cli.options import AllRigs, AsJson, Config, Rigs, check_rigs, config_for_commands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -106,19 +106,20 @@ def remove(rig: Name, config: Config = None) -> None:
 
 
 @app.command()
-def reset(rig: Name, config: Config = None) -> None:
-    """Reset a rig's arm and parts to their start; the controller that holds the lease stays connected."""
+def reset(rigs: Rigs = None, every: AllRigs = False, config: Config = None) -> None:
+    """Reset the arm and parts of rigs to their start; the controller that holds the lease stays connected."""
     from hilrig_cli.client import check_rig, send_control_request
     from hilrig_runtime.errors import OperationError
     from hilrig_schemas import ControlRequest, ResetRig
 
+    check_rigs(rigs, every, "hilrig rig reset")
     with _join(config) as (lab, bus, found):
-        for info in found:
-            if info.service == "edge" and rig in info.rigs:
-                print(send_control_request(bus, lab, info, ControlRequest(reset_rig=ResetRig(rig=rig))).text)
-                return
-        check_rig(bus, lab, rig)
-    raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
+        edges = {rig: info for info in found if info.service == "edge" for rig in info.rigs}
+        for rig in rigs or sorted(edges):
+            if rig not in edges:
+                check_rig(bus, lab, rig)
+                raise OperationError(f"no edge serves rig {rig!r}; hilrig rig list shows the existing rigs")
+            print(send_control_request(bus, lab, edges[rig], ControlRequest(reset_rig=ResetRig(rig=rig))).text)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Layout of the viewer: the arm on the left, plots on the right, events and states below the arm."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 import rerun as rr
@@ -11,6 +12,7 @@ from hilrig_replay.analysis.stages import stages_of_role
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, legend_in_words
 from hilrig_replay.rerun_view import entity_paths as paths
 from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
+from hilrig_replay.rerun_view.value_axes import Range
 
 SIM_TIME: Final = "sim_time"
 WALL: Final = "wall"
@@ -27,13 +29,20 @@ _CAMERA_TARGET: Final = (0.14, 0.02, 0.02)
 _BACKGROUND: Final = (24, 28, 33)
 
 
-def layout(roots: Sequence[str] = ("",), *, live: bool = False, client_role: bool = False) -> rrb.Blueprint:
+def layout(
+    roots: Sequence[str] = ("",),
+    *,
+    live: bool = False,
+    client_role: bool = False,
+    ranges: Mapping[str, Range] = MappingProxyType({}),
+) -> rrb.Blueprint:
     """Blueprint for the rigs under the entity paths `roots`: one scene with all arms, and common plots.
 
     Args:
         roots: root paths of the rigs.
         live: whether they run now.
         client_role: whether the only rig is the client of its controller.
+        ranges: of value axes, by the path of the first entity of a plot; the others are chosen by the viewer.
     """
     trail = [
         rrb.VisibleTimeRange(
@@ -67,6 +76,7 @@ def layout(roots: Sequence[str] = ("",), *, live: bool = False, client_role: boo
             contents=[f"+ {entity_path(root, path)}/**" for root in roots for path in shown],
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
             axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+            axis_y=rrb.ScalarAxis(range=ranges[shown[0]]) if shown[0] in ranges else None,
             time_ranges=[window] if live else None,
         )
 

@@ -110,8 +110,10 @@ class RerunRigWriter:
         self._source_colors = {_SAFE: "#e45756", _NO_CONTROLLER: "#3a424c"}
         self._rates = RequestRates(names)
         self._known_clients: set[str] = set()
+        self.client_role = False
+        """Whether the edge is the client of the controller; known with the first loop latency."""
         self._stages: tuple[Stage, ...] = ()
-        """Stages of the role of the edge; empty: not known yet."""
+        """Stages of the role; empty: not known yet."""
         self._last_tip: NDArray[np.float64] | None = None
         self._known_parts: set[str] = set()
         self._known_event_kinds: set[str] = set()
@@ -306,7 +308,8 @@ class RerunRigWriter:
         times = self._times(samples)
         self._scalars(paths.LOOP_LATENCY, times, samples["loop"][:, None] / 1e6)
         if not self._stages:
-            self._stages = stages_of_role(bool(samples["polled"].mean() >= 0.5))
+            self.client_role = bool(samples["polled"].mean() >= 0.5)
+            self._stages = stages_of_role(self.client_role)
             names = ["state sampled", *(f"+ {stage.title}" for stage in self._stages)]
             names[-1] += " = loop"
             self._legend(paths.LATENCY_STAGES, names, [_BASELINE_COLOR, *(stage.color for stage in self._stages)])

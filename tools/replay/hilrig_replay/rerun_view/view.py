@@ -4,16 +4,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rerun as rr
-import rerun.blueprint as rrb
 
 from hilrig_replay.grading.task_loading import recorded_task
-from hilrig_replay.io.columns import written
 from hilrig_replay.io.output_file import output_file
 from hilrig_replay.io.run import Run
 from hilrig_replay.plots.palette import RUN_COLORS
 from hilrig_replay.rerun_view.layout import layout
 from hilrig_replay.rerun_view.rig_view import RerunRigWriter, RigGeometry
 from hilrig_replay.rerun_view.sinks import flush_file, to_file, to_viewer
+from hilrig_replay.rerun_view.value_axes import ValueRanges
 from hilrig_runtime.errors import InputError
 
 
@@ -38,7 +37,7 @@ def save_rrd(runs: Run | Sequence[Run], path: Path) -> None:
     """
     chosen = [runs] if isinstance(runs, Run) else list(runs)
     with output_file(path, [path for run in chosen for path in run.file.paths]) as temporary:
-        _write(to_file(temporary, _name(chosen), _layout(chosen)), chosen, file=path)
+        _write(to_file(temporary, _name(chosen), layout(root_names(chosen))), chosen, file=path)
 
 
 def send_runs(runs: Sequence[Run], grpc_port: int, is_closed: Callable[[], bool]) -> None:
@@ -50,7 +49,7 @@ def send_runs(runs: Sequence[Run], grpc_port: int, is_closed: Callable[[], bool]
     Raises:
         InputError: a run can't be read.
     """
-    _write(to_viewer(grpc_port, _name(runs), _layout(runs)), runs, is_closed)
+    _write(to_viewer(grpc_port, _name(runs), layout(root_names(runs))), runs, is_closed)
 
 
 def root_names(runs: Sequence[Run]) -> list[str]:
@@ -65,19 +64,6 @@ def _name(runs: Sequence[Run]) -> str:
     return "+".join(run.session for run in runs)
 
 
-def _layout(runs: Sequence[Run]) -> rrb.Blueprint:
-    return layout(root_names(runs), client_role=len(runs) == 1 and _is_client(runs[0]))
-
-
-def _is_client(run: Run) -> bool:
-    """Whether the edge was the client of the controller when the first torques were written."""
-    for block in run.blocks(frozenset({"command"})):
-        commands = written(block.commands)
-        if len(commands):
-            return bool(commands["read_sent_ns"][0])
-    return False
-
-
 def _write(
     stream: rr.RecordingStream,
     runs: Sequence[Run],
@@ -89,8 +75,9 @@ def _write(
 
     rerun encodes and writes on its own threads and holds every block that is not written yet. A file is flushed after
     each block, so the memory depends neither on the length of the run nor on the scheduling of these threads. A viewer
-    is not flushed, because it may close at any time.
+    is not flushed, because it may close at any time. The ranges of the plots and the role are known at the end.
     """
+    ranges, client_role = ValueRanges(), False
     with stream:
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
@@ -99,7 +86,10 @@ def _write(
                 if is_closed():
                     return
                 view.add(block)
+                ranges.add(block)
                 if file is not None:
                     flush_file(stream, file)
             view.end()
+            client_role = view.client_role
+        stream.send_blueprint(layout(root_names(runs), client_role=client_role, ranges=ranges.ranges()))
     stream.disconnect()

@@ -17,6 +17,7 @@ from pymodbus.pdu import ModbusPDU
 
 from hilrig_modbus_edge.registers import codec
 from hilrig_modbus_edge.registers.map import POSITION_ADDRESS, REGISTERS, TORQUE_ADDRESS
+from hilrig_runtime.addresses import format_address
 from hilrig_runtime.errors import OperationError
 from hilrig_study.controllers.control_laws import Controller, Measurement
 from hilrig_study.simulation.simulated_loop import Scenario
@@ -37,7 +38,7 @@ class RigClient:
         Raises:
             OperationError: no rig accepts the connection.
         """
-        self._address = f"{host}:{port}"
+        self._address = format_address(host, port)
         # Some methods of pymodbus have no type annotations.
         self._client = cast(Any, ModbusTcpClient(host, port=port, timeout=3))
         if not self._client.connect():
