@@ -92,7 +92,7 @@ gen: .venv/dev ## generate code and documentation tables from their sources
 docs: .venv/docs ## build the documentation site in build/docs/
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs build/docs
 
-bench: .venv/dev system ## run all benchmarks (up to one hour); writes docs/performance.md
+bench: .venv/dev system ## run all benchmarks (up to one hour); writes bench/results/ and docs/performance.md
 	$(BIN)/python bench/run_all.py
 
 clean: ## remove everything that was built or installed here

@@ -3,7 +3,7 @@
     pip install "pymodbus>=3.16"
     python pick_one_part.py --host 127.0.0.1 --port 5020
 
-PART is the position of the part. Coil 101 (`client.write_coil(100, True)`) moves arm and parts back to their start.
+PART is the position of the part. Each run begins with a reset, which moves arm and parts back to their start.
 """
 
 import argparse
@@ -22,8 +22,7 @@ PERIOD = 0.02  # period of the control cycle, s
 KP = (0.25, 0.25, 0.03, 0.004)  # N·m per degree of error; joint 3: N per mm
 KD = (0.04, 0.03, 0.002, 0.0005)  # N·m per degree/s of speed; joint 3: N per mm/s
 MAX_ERROR = (30.0, 30.0, 40.0, 60.0)  # a larger error counts as this, so that the arm stays slow
-QUILL = 0.5 * 9.81  # weight of the quill, N
-PART_WEIGHT = 0.2 * 9.81  # weight of the red part, N
+QUILL, PART_WEIGHT = 0.5 * 9.81, 0.2 * 9.81  # weights of the quill and of the red part, N
 
 
 def joints_for(x: float, y: float, z: float) -> tuple[float, float, float, float]:
@@ -102,6 +101,8 @@ def main() -> None:
     client = ModbusTcpClient(options.host, port=options.port)
     if not client.connect():
         raise RuntimeError(f"can't connect to a rig at {options.host}:{options.port}: is hilrig up running?")
+    checked(client.write_coil(100, True))  # coil 101: reset
+    time.sleep(0.1)
     arm = Arm(client)
     for what, point, on in (("the part", PART, True), ("the tray", PLACE, False)):
         arm.move_to(f"over {what}", *point[:2], SAFE_Z)

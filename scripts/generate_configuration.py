@@ -50,6 +50,14 @@ name = "teacher"
 allow = ["192.168.7.2/32"]
 ```
 
+A class ([classroom.md](classroom.md)): rigs are claimed with codes by the students of a roster.
+
+```toml
+[classroom]
+roster = "roster.csv"
+claims = "claims"
+```
+
 A task that `hilrig report` uses to grade the runs of the lab (see [review.md](review.md)): two poses, then a triangle,
 and two parts in the tray, all within one minute. A task needs at least one of these three kinds of goals.
 

@@ -80,7 +80,7 @@ def test_pymodbus_is_imported_by_the_edge_and_live_studies() -> None:
         for path in modules(package)
         if re.search(r"^ *(from|import) pymodbus", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     }
-    assert users == {"protocol", "device", "server", "client", "live"}
+    assert users == {"protocol", "device", "classroom", "server", "client", "live"}
 
 
 def test_test_names_have_at_most_sixty_characters() -> None:

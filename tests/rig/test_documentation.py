@@ -29,6 +29,8 @@ OPENS_A_VIEWER = ("hilrig replay", "hilrig live")
 """Commands that are run with --save, because there is no display."""
 TESTED_ELSEWHERE: dict[str, str] = {
     "docker compose run --rm demo": "tests/hosts/test_compose.py",
+    "hilrig claim": "tests/rig/test_claims.py",
+    "hilrig rig codes": "tests/rig/test_claims.py",
     "docker compose up": "tests/hosts/test_compose.py",
     "hilrig assign": "tests/unit/test_class_of_30.py",
     "hilrig console": "tests/rig/test_console.py",

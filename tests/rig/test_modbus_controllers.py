@@ -138,12 +138,14 @@ def test_examples_hold_and_move_the_arm(
 
 def test_first_program_of_each_guide_moves_the_arm(lab: RunningLab, in_c: Path, tmp_path: Path) -> None:
     write_programs("python", tmp_path, lab.lab.ports["rig8"])
-    python = subprocess.run([sys.executable, tmp_path / "first.py"], check=True, capture_output=True, text=True)
-    begin, end = (int(line.split("[")[1].split(",")[0]) for line in python.stdout.splitlines())
+    programs: list[list[str | Path]] = [[sys.executable, tmp_path / "first.py"], [in_c.with_name("first")]]
+    running = [subprocess.Popen(program, stdout=subprocess.PIPE, text=True) for program in programs]
+    python, c = (process.communicate(timeout=30)[0] for process in running)
+    assert [process.returncode for process in running] == [0, 0]
+    begin, end = (int(line.split("[")[1].split(",")[0]) for line in python.splitlines())
     assert begin == 0
     assert 1000 < end < 10_000
-    c = subprocess.run([in_c.with_name("first")], check=True, capture_output=True, text=True)
-    assert 10 < float(c.stdout.split()[-2]) < 100
+    assert 10 < float(c.split()[-2]) < 100
 
 
 @pytest.mark.parametrize("name", ["Python", "C", "Node.js"])
@@ -195,7 +197,7 @@ def test_libmodbus_holds_the_lease_and_mbpoll_is_denied(in_c: Path) -> None:
     require_mbpoll()
     with running_edge() as rig, moving(rig):
         with subprocess.Popen(
-            [in_c, "127.0.0.1", str(rig.port), "3"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            [in_c, "127.0.0.1", str(rig.port), "60"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         ) as holder:
             eventually(lambda: "LEASE_GRANTED" in rig.kinds())
             assert len(mbpoll_read(rig.port, 5, 4)) == 4
@@ -203,7 +205,8 @@ def test_libmodbus_holds_the_lease_and_mbpoll_is_denied(in_c: Path) -> None:
                 mbpoll_write(rig.port, 1, 1000)
             assert "busy" in refusal.value.stderr.lower()
             assert all(command.controller == rig.commands[1].controller for command in rig.commands[1:])
-            assert holder.wait(30) in (0, 1)
+            assert holder.poll() is None
+            holder.terminate()
         # It has disconnected: mbpoll acquires the lease.
         eventually(lambda: rig.kinds().count("LEASE_GRANTED") == rig.kinds().count("LEASE_LOST"))
         mbpoll_write(rig.port, 1, 1000)

@@ -12,12 +12,10 @@ from pathlib import Path
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hilrig_recorder.mcap_format.reader import decompress
-from hilrig_recorder.mcap_format.records import Chunk
-from hilrig_recorder.mcap_format.scan import scan
 from hilrig_replay.io.run import open_run
 from support.clients import build_c_client, mbpoll_read, mbpoll_write, require_mbpoll
 from support.labs import RunningLab, free_ports, hilrig, write_lab
+from support.recordings import content_of
 from support.waiting import eventually
 
 pytestmark = pytest.mark.rig
@@ -52,12 +50,6 @@ def next_recording(lab: RunningLab) -> Iterator[list[Path]]:
 def registers(*values: int) -> list[int]:
     """Signed values as Modbus registers."""
     return [value & 0xFFFF for value in values]
-
-
-def content_of(path: Path) -> bytes:
-    """All bytes of a recording, and those of its chunks."""
-    data = path.read_bytes()
-    return data + b"".join(decompress(item) for _, item in scan(data) if isinstance(item, Chunk))
 
 
 def alive(pid: int) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 from hilrig_modbus_edge.device.client import Client
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.device.ports import Ownership
 from hilrig_modbus_edge.device.settings import DeviceSettings
 from hilrig_modbus_edge.protocol.functions import RegisterTable
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -44,7 +45,7 @@ class Timer:
 class Bench:
     """A device and its recorded output: it replaces scheduler, publisher, state cache and output port."""
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, ownership: Ownership | None = None, **settings: Any) -> None:
         self.clock = ManualClock()
         self.commands: list[TorqueCommand] = []
         self.repeats: list[TorqueCommand] = []
@@ -57,7 +58,8 @@ class Bench:
         self.rejected: list[str] = []
         values = replace(DeviceSettings.of(EDGE, ImpairmentConfig()), **settings)
         sender = CommandSender("rig1", self, self, self.clock, values.repeat_ns)  # type: ignore[arg-type]
-        self.device = Device("rig1", values, self.clock, self, self, sender, random.Random(4))  # type: ignore[arg-type]
+        rng, port = random.Random(4), self
+        self.device = Device("rig1", values, self.clock, port, port, sender, rng, ownership)  # type: ignore[arg-type]
 
     def send(self, rig: str, payload: bytes, now_ns: int) -> None:
         assert rig == "rig1"

@@ -16,6 +16,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
+from hilrig_recorder.mcap_format.reader import decompress
+from hilrig_recorder.mcap_format.records import Chunk
+from hilrig_recorder.mcap_format.scan import scan
 from hilrig_runtime.config.lab import LabConfig, RigSettings
 from hilrig_schemas import Event, JointState, ModbusKind, ModbusTraffic, PartState, TorqueCommand
 from hilrig_schemas.topics import RECORDED
@@ -367,3 +370,9 @@ def _descriptors(message: type[Message]) -> bytes:
     files = FileDescriptorSet()
     message.DESCRIPTOR.file.CopyToProto(files.file.add())
     return files.SerializeToString()
+
+
+def content_of(path: Path) -> bytes:
+    """All bytes of a recording, and those of its chunks."""
+    data = path.read_bytes()
+    return data + b"".join(decompress(item) for _, item in scan(data) if isinstance(item, Chunk))

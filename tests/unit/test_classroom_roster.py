@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 import time
 import unicodedata
 from pathlib import Path
@@ -161,6 +162,27 @@ def test_owner_of_a_recording(tmp_path: Path, file: str, rig: str, owner: str) -
     found = owner_of(Path(file), rig, roster)
     assert found.student is not None
     assert found.student.id == owner
+
+
+@pytest.mark.parametrize(
+    ("file", "recorded", "owner", "problem"),
+    [
+        ("20261130T141219Z-rig1-c-ab12.mcap", ["c"], "c", ""),
+        ("d.mcap", ["c"], "", "recorded for c, but named after d: ask both"),
+        ("b.mcap", ["a"], "b", ""),
+        ("x.mcap", ["a", "b"], "", r"recorded for a group \(a, b\): name the file after one of them"),
+        ("b.mcap", ["a", "b"], "b", ""),
+        ("d.mcap", ["unknown"], "d", ""),
+    ],
+)
+def test_recorded_student_owns_a_recording(
+    tmp_path: Path, file: str, recorded: list[str], owner: str, problem: str
+) -> None:
+    text = "id,name,group,rig\na,A,team,rig1\nb,B,team,rig1\nc,C,,rig2\nd,D,,rig3\n"
+    roster = read_roster(roster_file(tmp_path / "r.csv", text))
+    found = owner_of(Path(file), "rig3", roster, recorded)
+    assert (found.student.id if found.student else "") == owner
+    assert re.fullmatch(problem, found.problem)
 
 
 def test_recording_without_a_student_has_a_reason(tmp_path: Path) -> None:

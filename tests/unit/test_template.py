@@ -35,8 +35,9 @@ def test_page_is_up_to_date_and_examples_are_valid() -> None:
     text = (DOCS / "configuration.md").read_text()
     assert text == generate_configuration.page(), "run `make gen` and commit the result"
     examples = [block.partition("```")[0] for block in text.split("```toml\n")[1:]]
-    assert len(examples) == 4
+    assert len(examples) == 5
     assert [rig.name for rig in parse_lab(examples[1]).rigs] == ["left", "right"]
     assert len(parse_lab(examples[2]).rigs) == 65
-    assert len(parse_lab(examples[3]).task.poses) == 2
+    assert parse_lab(examples[3]).classroom.claims == Path("claims")
+    assert len(parse_lab(examples[4]).task.poses) == 2
     assert tomllib.loads(examples[0])

@@ -112,14 +112,14 @@ def _checked(block: RegisterBlock) -> RegisterBlock:
     return block
 
 
-def parse_controller(address: str) -> tuple[str, int]:
-    """Return host and port of "HOST", "HOST:PORT" or "[IPv6]:PORT"; the default port is 502.
+def parse_controller(address: str, default_port: int = DEFAULT_PORT) -> tuple[str, int]:
+    """Return host and port of "HOST", "HOST:PORT" or "[IPv6]:PORT".
 
     Raises:
         ValueError: it is no address.
     """
     match = _HOST.fullmatch(address)
-    port = DEFAULT_PORT if match is None or match[3] is None else int(match[3])
+    port = default_port if match is None or match[3] is None else int(match[3])
     if match is None or not 1 <= port <= 0xFFFF:
         raise ValueError(f'{address!r} is no address of a controller; expected "HOST", "HOST:PORT" or "[IPv6]:PORT"')
     return match[1] or match[2], port

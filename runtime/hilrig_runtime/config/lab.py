@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model
 
 from hilrig_runtime.addresses import WILDCARDS
 from hilrig_runtime.config.bus import BusConfig
+from hilrig_runtime.config.classroom import ClassroomConfig
 from hilrig_runtime.config.controller import ClientConfig, ControllerAddress, RegistersConfig, parse_controller
 from hilrig_runtime.config.edge_tls import TlsConfig
 from hilrig_runtime.config.impairment import ImpairmentConfig
@@ -253,6 +254,8 @@ class LabConfig(Section):
     scene: SceneConfig = SceneConfig()
     task: TaskConfig | None = None
     """Task by which runs are graded."""
+    classroom: ClassroomConfig | None = None
+    """Owners of the rigs."""
     impairment: ImpairmentConfig = ImpairmentConfig()
     rigs: Annotated[
         tuple[RigSettings, ...], BeforeValidator(_expand_group), TableForm(RigsTable), Field(min_length=1)

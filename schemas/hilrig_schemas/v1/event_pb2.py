@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dhilrig_schemas/v1/event.proto\x12\thilrig.v1\"\x9f\t\n\x05\x45vent\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07session\x18\x02 \x01(\t\x12#\n\x04kind\x18\x03 \x01(\x0e\x32\x15.hilrig.v1.Event.Kind\x12+\n\x08severity\x18\x04 \x01(\x0e\x32\x19.hilrig.v1.Event.Severity\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x0f\n\x07wall_ns\x18\x06 \x01(\x03\x12\x0e\n\x06source\x18\x07 \x01(\t\x12\x0c\n\x04step\x18\x08 \x01(\x04\x12.\n\x0csession_data\x18\x10 \x01(\x0b\x32\x16.hilrig.v1.SessionDataH\x00\x12\x34\n\x0f\x63ontroller_data\x18\x11 \x01(\x0b\x32\x19.hilrig.v1.ControllerDataH\x00\x12\x30\n\rwatchdog_data\x18\x12 \x01(\x0b\x32\x17.hilrig.v1.WatchdogDataH\x00\x12*\n\nlimit_data\x18\x13 \x01(\x0b\x32\x14.hilrig.v1.LimitDataH\x00\x12(\n\tpart_data\x18\x14 \x01(\x0b\x32\x13.hilrig.v1.PartDataH\x00\x12.\n\x0coverrun_data\x18\x15 \x01(\x0b\x32\x16.hilrig.v1.OverrunDataH\x00\x12:\n\x12\x63onfiguration_data\x18\x17 \x01(\x0b\x32\x1c.hilrig.v1.ConfigurationDataH\x00\x12\x36\n\x10integration_data\x18\x18 \x01(\x0b\x32\x1a.hilrig.v1.IntegrationDataH\x00\"\xef\x03\n\x04Kind\x12\x14\n\x10KIND_UNSPECIFIED\x10\x00\x12\x11\n\rSESSION_START\x10\x01\x12\x0f\n\x0bSESSION_END\x10\x02\x12\x11\n\rLEASE_GRANTED\x10\x03\x12\x11\n\rLEASE_REFUSED\x10\x04\x12\x0e\n\nLEASE_LOST\x10\x05\x12\x11\n\rWATCHDOG_TRIP\x10\x06\x12\x12\n\x0eWATCHDOG_REARM\x10\x07\x12\r\n\tLIMIT_HIT\x10\x08\x12\x0f\n\x0bPART_PICKED\x10\t\x12\x10\n\x0cPART_DROPPED\x10\n\x12\x0b\n\x07OVERRUN\x10\x0b\x12\x16\n\x12IMPAIRMENT_CHANGED\x10\r\x12\x11\n\rCONFIGURATION\x10\x0e\x12\x10\n\x0c\x43OMMAND_LOST\x10\x0f\x12\x10\n\x0c\x43OMMAND_BACK\x10\x10\x12\t\n\x05RESET\x10\x11\x12\x16\n\x12\x43ONNECTION_REFUSED\x10\x12\x12\r\n\tRECORDING\x10\x13\x12\r\n\tRIG_ADDED\x10\x14\x12\x0f\n\x0bRIG_REMOVED\x10\x15\x12\x13\n\x0fINACCURATE_STEP\x10\x16\x12\x0e\n\nSTATE_LOST\x10\x17\x12\x0e\n\nSTATE_BACK\x10\x18\x12\x14\n\x10\x43ONTROLLER_FAULT\x10\x19\x12\x13\n\x0f\x43ONTROLLER_BACK\x10\x1a\"\x04\x08\x0c\x10\x0c*\nSATURATION\"F\n\x08Severity\x12\x18\n\x14SEVERITY_UNSPECIFIED\x10\x00\x12\x08\n\x04INFO\x10\x01\x12\x0b\n\x07WARNING\x10\x02\x12\t\n\x05\x45RROR\x10\x03\x42\x06\n\x04\x64\x61taJ\x04\x08\x16\x10\x17R\x0fsaturation_data\"F\n\x0bSessionData\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x12\n\ncontroller\x18\x02 \x01(\t\x12\x13\n\x0b\x63\x65rtificate\x18\x03 \x01(\t\"Y\n\x0e\x43ontrollerData\x12\x12\n\ncontroller\x18\x01 \x01(\t\x12\x0e\n\x06holder\x18\x02 \x01(\t\x12\x0e\n\x06reason\x18\x03 \x01(\t\x12\x13\n\x0b\x63\x65rtificate\x18\x04 \x01(\t\"5\n\x0cWatchdogData\x12\x11\n\tsilent_ns\x18\x01 \x01(\x03\x12\x12\n\ntimeout_ns\x18\x02 \x01(\x03\"8\n\tLimitData\x12\r\n\x05joint\x18\x01 \x01(\r\x12\r\n\x05upper\x18\x02 \x01(\x08\x12\r\n\x05speed\x18\x03 \x01(\x01\"G\n\x08PartData\x12\x0c\n\x04part\x18\x01 \x01(\t\x12\t\n\x01x\x18\x02 \x01(\x01\x12\t\n\x01y\x18\x03 \x01(\x01\x12\t\n\x01z\x18\x04 \x01(\x01\x12\x0c\n\x04mass\x18\x05 \x01(\x01\"H\n\x0bOverrunData\x12\x13\n\x0blateness_ns\x18\x01 \x01(\x03\x12\x14\n\x0cmissed_steps\x18\x02 \x01(\r\x12\x0e\n\x06stalls\x18\x03 \x01(\r\"!\n\x11\x43onfigurationData\x12\x0c\n\x04text\x18\x01 \x01(\t\"/\n\x0fIntegrationData\x12\r\n\x05\x65rror\x18\x01 \x03(\x01\x12\r\n\x05steps\x18\x02 \x01(\rb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dhilrig_schemas/v1/event.proto\x12\thilrig.v1\"\xaa\t\n\x05\x45vent\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0f\n\x07session\x18\x02 \x01(\t\x12#\n\x04kind\x18\x03 \x01(\x0e\x32\x15.hilrig.v1.Event.Kind\x12+\n\x08severity\x18\x04 \x01(\x0e\x32\x19.hilrig.v1.Event.Severity\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x0f\n\x07wall_ns\x18\x06 \x01(\x03\x12\x0e\n\x06source\x18\x07 \x01(\t\x12\x0c\n\x04step\x18\x08 \x01(\x04\x12.\n\x0csession_data\x18\x10 \x01(\x0b\x32\x16.hilrig.v1.SessionDataH\x00\x12\x34\n\x0f\x63ontroller_data\x18\x11 \x01(\x0b\x32\x19.hilrig.v1.ControllerDataH\x00\x12\x30\n\rwatchdog_data\x18\x12 \x01(\x0b\x32\x17.hilrig.v1.WatchdogDataH\x00\x12*\n\nlimit_data\x18\x13 \x01(\x0b\x32\x14.hilrig.v1.LimitDataH\x00\x12(\n\tpart_data\x18\x14 \x01(\x0b\x32\x13.hilrig.v1.PartDataH\x00\x12.\n\x0coverrun_data\x18\x15 \x01(\x0b\x32\x16.hilrig.v1.OverrunDataH\x00\x12:\n\x12\x63onfiguration_data\x18\x17 \x01(\x0b\x32\x1c.hilrig.v1.ConfigurationDataH\x00\x12\x36\n\x10integration_data\x18\x18 \x01(\x0b\x32\x1a.hilrig.v1.IntegrationDataH\x00\"\xfa\x03\n\x04Kind\x12\x14\n\x10KIND_UNSPECIFIED\x10\x00\x12\x11\n\rSESSION_START\x10\x01\x12\x0f\n\x0bSESSION_END\x10\x02\x12\x11\n\rLEASE_GRANTED\x10\x03\x12\x11\n\rLEASE_REFUSED\x10\x04\x12\x0e\n\nLEASE_LOST\x10\x05\x12\x11\n\rWATCHDOG_TRIP\x10\x06\x12\x12\n\x0eWATCHDOG_REARM\x10\x07\x12\r\n\tLIMIT_HIT\x10\x08\x12\x0f\n\x0bPART_PICKED\x10\t\x12\x10\n\x0cPART_DROPPED\x10\n\x12\x0b\n\x07OVERRUN\x10\x0b\x12\x16\n\x12IMPAIRMENT_CHANGED\x10\r\x12\x11\n\rCONFIGURATION\x10\x0e\x12\x10\n\x0c\x43OMMAND_LOST\x10\x0f\x12\x10\n\x0c\x43OMMAND_BACK\x10\x10\x12\t\n\x05RESET\x10\x11\x12\x16\n\x12\x43ONNECTION_REFUSED\x10\x12\x12\r\n\tRECORDING\x10\x13\x12\r\n\tRIG_ADDED\x10\x14\x12\x0f\n\x0bRIG_REMOVED\x10\x15\x12\x13\n\x0fINACCURATE_STEP\x10\x16\x12\x0e\n\nSTATE_LOST\x10\x17\x12\x0e\n\nSTATE_BACK\x10\x18\x12\x14\n\x10\x43ONTROLLER_FAULT\x10\x19\x12\x13\n\x0f\x43ONTROLLER_BACK\x10\x1a\x12\t\n\x05\x43LAIM\x10\x1b\"\x04\x08\x0c\x10\x0c*\nSATURATION\"F\n\x08Severity\x12\x18\n\x14SEVERITY_UNSPECIFIED\x10\x00\x12\x08\n\x04INFO\x10\x01\x12\x0b\n\x07WARNING\x10\x02\x12\t\n\x05\x45RROR\x10\x03\x42\x06\n\x04\x64\x61taJ\x04\x08\x16\x10\x17R\x0fsaturation_data\"W\n\x0bSessionData\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x12\n\ncontroller\x18\x02 \x01(\t\x12\x13\n\x0b\x63\x65rtificate\x18\x03 \x01(\t\x12\x0f\n\x07student\x18\x04 \x01(\t\"j\n\x0e\x43ontrollerData\x12\x12\n\ncontroller\x18\x01 \x01(\t\x12\x0e\n\x06holder\x18\x02 \x01(\t\x12\x0e\n\x06reason\x18\x03 \x01(\t\x12\x13\n\x0b\x63\x65rtificate\x18\x04 \x01(\t\x12\x0f\n\x07student\x18\x05 \x01(\t\"5\n\x0cWatchdogData\x12\x11\n\tsilent_ns\x18\x01 \x01(\x03\x12\x12\n\ntimeout_ns\x18\x02 \x01(\x03\"8\n\tLimitData\x12\r\n\x05joint\x18\x01 \x01(\r\x12\r\n\x05upper\x18\x02 \x01(\x08\x12\r\n\x05speed\x18\x03 \x01(\x01\"G\n\x08PartData\x12\x0c\n\x04part\x18\x01 \x01(\t\x12\t\n\x01x\x18\x02 \x01(\x01\x12\t\n\x01y\x18\x03 \x01(\x01\x12\t\n\x01z\x18\x04 \x01(\x01\x12\x0c\n\x04mass\x18\x05 \x01(\x01\"H\n\x0bOverrunData\x12\x13\n\x0blateness_ns\x18\x01 \x01(\x03\x12\x14\n\x0cmissed_steps\x18\x02 \x01(\r\x12\x0e\n\x06stalls\x18\x03 \x01(\r\"!\n\x11\x43onfigurationData\x12\x0c\n\x04text\x18\x01 \x01(\t\"/\n\x0fIntegrationData\x12\r\n\x05\x65rror\x18\x01 \x03(\x01\x12\r\n\x05steps\x18\x02 \x01(\rb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,25 +32,25 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.event_pb2
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_EVENT']._serialized_start=45
-  _globals['_EVENT']._serialized_end=1228
+  _globals['_EVENT']._serialized_end=1239
   _globals['_EVENT_KIND']._serialized_start=630
-  _globals['_EVENT_KIND']._serialized_end=1125
-  _globals['_EVENT_SEVERITY']._serialized_start=1127
-  _globals['_EVENT_SEVERITY']._serialized_end=1197
-  _globals['_SESSIONDATA']._serialized_start=1230
-  _globals['_SESSIONDATA']._serialized_end=1300
-  _globals['_CONTROLLERDATA']._serialized_start=1302
-  _globals['_CONTROLLERDATA']._serialized_end=1391
-  _globals['_WATCHDOGDATA']._serialized_start=1393
-  _globals['_WATCHDOGDATA']._serialized_end=1446
-  _globals['_LIMITDATA']._serialized_start=1448
-  _globals['_LIMITDATA']._serialized_end=1504
-  _globals['_PARTDATA']._serialized_start=1506
-  _globals['_PARTDATA']._serialized_end=1577
-  _globals['_OVERRUNDATA']._serialized_start=1579
-  _globals['_OVERRUNDATA']._serialized_end=1651
-  _globals['_CONFIGURATIONDATA']._serialized_start=1653
-  _globals['_CONFIGURATIONDATA']._serialized_end=1686
-  _globals['_INTEGRATIONDATA']._serialized_start=1688
-  _globals['_INTEGRATIONDATA']._serialized_end=1735
+  _globals['_EVENT_KIND']._serialized_end=1136
+  _globals['_EVENT_SEVERITY']._serialized_start=1138
+  _globals['_EVENT_SEVERITY']._serialized_end=1208
+  _globals['_SESSIONDATA']._serialized_start=1241
+  _globals['_SESSIONDATA']._serialized_end=1328
+  _globals['_CONTROLLERDATA']._serialized_start=1330
+  _globals['_CONTROLLERDATA']._serialized_end=1436
+  _globals['_WATCHDOGDATA']._serialized_start=1438
+  _globals['_WATCHDOGDATA']._serialized_end=1491
+  _globals['_LIMITDATA']._serialized_start=1493
+  _globals['_LIMITDATA']._serialized_end=1549
+  _globals['_PARTDATA']._serialized_start=1551
+  _globals['_PARTDATA']._serialized_end=1622
+  _globals['_OVERRUNDATA']._serialized_start=1624
+  _globals['_OVERRUNDATA']._serialized_end=1696
+  _globals['_CONFIGURATIONDATA']._serialized_start=1698
+  _globals['_CONFIGURATIONDATA']._serialized_end=1731
+  _globals['_INTEGRATIONDATA']._serialized_start=1733
+  _globals['_INTEGRATIONDATA']._serialized_end=1780
 # @@protoc_insertion_point(module_scope)

@@ -37,6 +37,7 @@ class Event(_message.Message):
         STATE_BACK: _ClassVar[Event.Kind]
         CONTROLLER_FAULT: _ClassVar[Event.Kind]
         CONTROLLER_BACK: _ClassVar[Event.Kind]
+        CLAIM: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     SESSION_START: Event.Kind
     SESSION_END: Event.Kind
@@ -63,6 +64,7 @@ class Event(_message.Message):
     STATE_BACK: Event.Kind
     CONTROLLER_FAULT: Event.Kind
     CONTROLLER_BACK: Event.Kind
+    CLAIM: Event.Kind
     class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         SEVERITY_UNSPECIFIED: _ClassVar[Event.Severity]
@@ -108,26 +110,30 @@ class Event(_message.Message):
     def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., severity: _Optional[_Union[Event.Severity, str]] = ..., text: _Optional[str] = ..., wall_ns: _Optional[int] = ..., source: _Optional[str] = ..., step: _Optional[int] = ..., session_data: _Optional[_Union[SessionData, _Mapping]] = ..., controller_data: _Optional[_Union[ControllerData, _Mapping]] = ..., watchdog_data: _Optional[_Union[WatchdogData, _Mapping]] = ..., limit_data: _Optional[_Union[LimitData, _Mapping]] = ..., part_data: _Optional[_Union[PartData, _Mapping]] = ..., overrun_data: _Optional[_Union[OverrunData, _Mapping]] = ..., configuration_data: _Optional[_Union[ConfigurationData, _Mapping]] = ..., integration_data: _Optional[_Union[IntegrationData, _Mapping]] = ...) -> None: ...
 
 class SessionData(_message.Message):
-    __slots__ = ("reason", "controller", "certificate")
+    __slots__ = ("reason", "controller", "certificate", "student")
     REASON_FIELD_NUMBER: _ClassVar[int]
     CONTROLLER_FIELD_NUMBER: _ClassVar[int]
     CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
+    STUDENT_FIELD_NUMBER: _ClassVar[int]
     reason: str
     controller: str
     certificate: str
-    def __init__(self, reason: _Optional[str] = ..., controller: _Optional[str] = ..., certificate: _Optional[str] = ...) -> None: ...
+    student: str
+    def __init__(self, reason: _Optional[str] = ..., controller: _Optional[str] = ..., certificate: _Optional[str] = ..., student: _Optional[str] = ...) -> None: ...
 
 class ControllerData(_message.Message):
-    __slots__ = ("controller", "holder", "reason", "certificate")
+    __slots__ = ("controller", "holder", "reason", "certificate", "student")
     CONTROLLER_FIELD_NUMBER: _ClassVar[int]
     HOLDER_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
+    STUDENT_FIELD_NUMBER: _ClassVar[int]
     controller: str
     holder: str
     reason: str
     certificate: str
-    def __init__(self, controller: _Optional[str] = ..., holder: _Optional[str] = ..., reason: _Optional[str] = ..., certificate: _Optional[str] = ...) -> None: ...
+    student: str
+    def __init__(self, controller: _Optional[str] = ..., holder: _Optional[str] = ..., reason: _Optional[str] = ..., certificate: _Optional[str] = ..., student: _Optional[str] = ...) -> None: ...
 
 class WatchdogData(_message.Message):
     __slots__ = ("silent_ns", "timeout_ns")

@@ -93,7 +93,7 @@ class PeerReport(_message.Message):
     def __init__(self, service: _Optional[str] = ..., host: _Optional[str] = ..., silent_ns: _Optional[int] = ...) -> None: ...
 
 class RigReport(_message.Message):
-    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us", "exceptions", "alert")
+    __slots__ = ("rig", "loop_us", "safe", "controller", "session", "watchdog_tripped", "connections", "recording", "age_us", "exceptions", "alert", "student")
     RIG_FIELD_NUMBER: _ClassVar[int]
     LOOP_US_FIELD_NUMBER: _ClassVar[int]
     SAFE_FIELD_NUMBER: _ClassVar[int]
@@ -105,6 +105,7 @@ class RigReport(_message.Message):
     AGE_US_FIELD_NUMBER: _ClassVar[int]
     EXCEPTIONS_FIELD_NUMBER: _ClassVar[int]
     ALERT_FIELD_NUMBER: _ClassVar[int]
+    STUDENT_FIELD_NUMBER: _ClassVar[int]
     rig: str
     loop_us: _containers.RepeatedScalarFieldContainer[int]
     safe: bool
@@ -116,7 +117,8 @@ class RigReport(_message.Message):
     age_us: _containers.RepeatedScalarFieldContainer[int]
     exceptions: _containers.RepeatedCompositeFieldContainer[ExceptionCount]
     alert: str
-    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ..., exceptions: _Optional[_Iterable[_Union[ExceptionCount, _Mapping]]] = ..., alert: _Optional[str] = ...) -> None: ...
+    student: str
+    def __init__(self, rig: _Optional[str] = ..., loop_us: _Optional[_Iterable[int]] = ..., safe: _Optional[bool] = ..., controller: _Optional[str] = ..., session: _Optional[str] = ..., watchdog_tripped: _Optional[bool] = ..., connections: _Optional[int] = ..., recording: _Optional[bool] = ..., age_us: _Optional[_Iterable[int]] = ..., exceptions: _Optional[_Iterable[_Union[ExceptionCount, _Mapping]]] = ..., alert: _Optional[str] = ..., student: _Optional[str] = ...) -> None: ...
 
 class ExceptionCount(_message.Message):
     __slots__ = ("host", "function", "code", "count")

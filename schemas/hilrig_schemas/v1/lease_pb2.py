@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dhilrig_schemas/v1/lease.proto\x12\thilrig.v1\"\x1f\n\x0cLeaseRequest\x12\x0f\n\x07release\x18\x01 \x01(\x08\"\xf1\x01\n\x0bLeaseStatus\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0e\n\x06holder\x18\x02 \x01(\t\x12\x10\n\x08released\x18\x03 \x01(\t\x12\x11\n\tsilent_ns\x18\x04 \x01(\x03\x12\x0f\n\x07session\x18\x05 \x01(\t\x12\x13\n\x0b\x63onnections\x18\x06 \x01(\r\x12\x18\n\x10watchdog_tripped\x18\x07 \x01(\x08\x12\x1b\n\x13watchdog_timeout_ns\x18\x08 \x01(\x03\x12\x11\n\tclient_of\x18\t \x01(\t\x12\x18\n\x10\x63ontroller_fault\x18\n \x01(\t\x12\x16\n\x0eskipped_states\x18\x0b \x01(\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dhilrig_schemas/v1/lease.proto\x12\thilrig.v1\"2\n\x0cLeaseRequest\x12\x0f\n\x07release\x18\x01 \x01(\x08\x12\x11\n\tend_claim\x18\x02 \x01(\x08\"\xad\x02\n\x0bLeaseStatus\x12\x0b\n\x03rig\x18\x01 \x01(\t\x12\x0e\n\x06holder\x18\x02 \x01(\t\x12\x10\n\x08released\x18\x03 \x01(\t\x12\x11\n\tsilent_ns\x18\x04 \x01(\x03\x12\x0f\n\x07session\x18\x05 \x01(\t\x12\x13\n\x0b\x63onnections\x18\x06 \x01(\r\x12\x18\n\x10watchdog_tripped\x18\x07 \x01(\x08\x12\x1b\n\x13watchdog_timeout_ns\x18\x08 \x01(\x03\x12\x11\n\tclient_of\x18\t \x01(\t\x12\x18\n\x10\x63ontroller_fault\x18\n \x01(\t\x12\x16\n\x0eskipped_states\x18\x0b \x01(\x04\x12\x0f\n\x07student\x18\x0c \x01(\t\x12\x14\n\x0c\x63laimed_from\x18\r \x01(\t\x12\x13\n\x0b\x63laim_ended\x18\x0e \x01(\tb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,7 +32,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'hilrig_schemas.v1.lease_pb2
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_LEASEREQUEST']._serialized_start=44
-  _globals['_LEASEREQUEST']._serialized_end=75
-  _globals['_LEASESTATUS']._serialized_start=78
-  _globals['_LEASESTATUS']._serialized_end=319
+  _globals['_LEASEREQUEST']._serialized_end=94
+  _globals['_LEASESTATUS']._serialized_start=97
+  _globals['_LEASESTATUS']._serialized_end=398
 # @@protoc_insertion_point(module_scope)

@@ -33,15 +33,17 @@ class LogBatch(_message.Message):
     def __init__(self, source: _Optional[str] = ..., incarnation: _Optional[int] = ..., sequence: _Optional[int] = ..., sessions: _Optional[_Iterable[_Union[OpenSession, _Mapping]]] = ..., complete_sessions: _Optional[bool] = ..., keys: _Optional[_Iterable[str]] = ..., sequences: _Optional[_Iterable[int]] = ..., publish_wall_ns: _Optional[_Iterable[int]] = ..., payloads: _Optional[_Iterable[bytes]] = ..., events: _Optional[bool] = ..., checksum: _Optional[int] = ...) -> None: ...
 
 class OpenSession(_message.Message):
-    __slots__ = ("rig", "session", "controller", "start_wall_ns", "certificate")
+    __slots__ = ("rig", "session", "controller", "start_wall_ns", "certificate", "student")
     RIG_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     CONTROLLER_FIELD_NUMBER: _ClassVar[int]
     START_WALL_NS_FIELD_NUMBER: _ClassVar[int]
     CERTIFICATE_FIELD_NUMBER: _ClassVar[int]
+    STUDENT_FIELD_NUMBER: _ClassVar[int]
     rig: str
     session: str
     controller: str
     start_wall_ns: int
     certificate: str
-    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ..., certificate: _Optional[str] = ...) -> None: ...
+    student: str
+    def __init__(self, rig: _Optional[str] = ..., session: _Optional[str] = ..., controller: _Optional[str] = ..., start_wall_ns: _Optional[int] = ..., certificate: _Optional[str] = ..., student: _Optional[str] = ...) -> None: ...

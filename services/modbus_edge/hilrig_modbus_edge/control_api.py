@@ -14,8 +14,9 @@ def handle_lease_query(device: Device, payload: bytes) -> bytes:
     """Handle a `LeaseRequest`; return a `LeaseStatus`."""
     request = decode_request(LeaseRequest, payload)
     released = device.release("revoked by an operator (hilrig lease --release)") if request.release else ""
+    ended = device.end_claim("ended by an operator (hilrig lease --end-claim)") if request.end_claim else ""
     status = device.lease_status()
-    status.released = released
+    status.released, status.claim_ended = released, ended
     return status.SerializeToString()
 
 

@@ -10,6 +10,7 @@ from hilrig_modbus_edge.client.exchange import Exchange, ExchangeSettings
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.device import Device
+from hilrig_modbus_edge.device.ports import Ownership
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.request_log import MAX_REQUESTS_PER_MESSAGE
 from hilrig_modbus_edge.server.admission import Limits
@@ -70,6 +71,7 @@ class RigEndpoint:
         states: LatestValueCache,
         scheduler: CommandScheduler,
         sessions_changed: Callable[[], None],
+        ownership: Ownership | None = None,
     ) -> None:
         lab = service.lab
         self._clock = service.clock
@@ -81,7 +83,7 @@ class RigEndpoint:
             settings = settings.of_reserved_rig(round(rig.client.timeout_ms * MS))
         publisher = service.rig_publisher(topics.COMMAND, rig.name)
         sender = CommandSender(rig.name, scheduler, publisher, service.clock, settings.repeat_ns)
-        self.device = Device(rig.name, settings, service.clock, self._output, states, sender)
+        self.device = Device(rig.name, settings, service.clock, self._output, states, sender, ownership=ownership)
         limits = Limits(
             lab.edge.max_connections,
             lab.edge.max_connections_per_host,
@@ -172,6 +174,7 @@ class RigEndpoint:
                 for host, function, code, count in server.exceptions.counts()
             ],
             alert=server.alert(),
+            student=status.student,
         )
 
     def stop(self, reason: str) -> None:

@@ -12,6 +12,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Final
 
+from hilrig_modbus_edge.classroom.owners import ClassOwners
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.control_api import handle_impairment_query, handle_lease_query
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
@@ -70,6 +71,7 @@ class EdgeService:
             service.clock,
             loop.call_at,
         )
+        self._owners = ClassOwners(service.lab.classroom, [rig.name for rig in service.lab.rigs])
         self._endpoints: dict[str, RigEndpoint] = {rig.name: self._new_endpoint(rig) for rig in service.rigs}
         now_ns = service.clock.monotonic_ns()
         for number, endpoint in enumerate(self._endpoints.values()):
@@ -92,7 +94,9 @@ class EdgeService:
                 endpoint.exchange.on_states()
 
     def _new_endpoint(self, rig: RigSettings) -> RigEndpoint:
-        endpoint = RigEndpoint(rig, self._service, self._states, self._scheduler, self._announce_sessions)
+        endpoint = RigEndpoint(
+            rig, self._service, self._states, self._scheduler, self._announce_sessions, self._owners.of(rig.name)
+        )
         self._permit(endpoint)
         return endpoint
 
@@ -172,6 +176,7 @@ class EdgeService:
         rig = request.rig
         self._endpoint_of(rig).stop("rig removed")
         del self._endpoints[rig]
+        self._owners.remove(rig)
         self._announce_sessions()
         self._service.set_rigs(tuple(other for other in self._service.rigs if other.name != rig))
         return self._emit_result(Event.RIG_REMOVED, rig, f"{rig} is no longer served")
@@ -314,6 +319,7 @@ class EdgeService:
         self._closing.close()
         for endpoint in self._endpoints.values():
             endpoint.stop("edge stopped")
+        self._owners.close()
         self._scheduler.flush()
         self._announce_sessions()
         self._service.recording_stream.flush(self._service.clock.monotonic_ns())

@@ -31,6 +31,8 @@ class Attempt:
     rig: str
     started: str
     """Start of the recording, UTC; empty: not recorded."""
+    recorded: tuple[str, ...] = ()
+    """Ids of the students who owned the rig, as recorded; empty: the lab had no roster."""
     goals: tuple[Goal, ...] = ()
     score: float = 0.0
     """Share of the goals that were reached, 0 to 1."""
@@ -80,7 +82,7 @@ class Attempt:
 
 def identify(names: tuple[str, ...], run: Run) -> Attempt:
     """Attempt of a run that is not evaluated: its files, as given, and the metadata of the run."""
-    return Attempt(names, run.session, run.rig, run.started)
+    return Attempt(names, run.session, run.rig, run.started, run.students)
 
 
 def evaluate(attempt: Attempt, run: Run, task: TaskConfig) -> Attempt:

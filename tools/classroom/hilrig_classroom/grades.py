@@ -145,7 +145,7 @@ def grade_class(
             on_progress(done / len(runs))
     for attempt in _without_second_recordings(attempts):
         if attempt is not None:
-            owner = owner_of(Path(attempt.file), attempt.rig, roster)
+            owner = owner_of(Path(attempt.file), attempt.rig, roster, attempt.recorded)
             if owner.student is None:
                 unassigned.append((attempt.file, attempt.problem or owner.problem))
             elif not only or owner.student.id == only:
@@ -215,7 +215,7 @@ def _attempt(files: RunFiles, folder: Path, task: TaskConfig, roster: Roster, on
         with isolated(path):
             run = open_run(files)
             attempt = identify(attempt.files, run)
-            owner = owner_of(Path(attempt.file), run.rig, roster).student
+            owner = owner_of(Path(attempt.file), run.rig, roster, attempt.recorded).student
             if owner is None:
                 return attempt
             return evaluate(attempt, run, task) if only in ("", owner.id) else None

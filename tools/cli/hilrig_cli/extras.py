@@ -3,7 +3,7 @@
 from typing import Final
 
 COMMANDS: Final = {
-    "": "certs check example ik registers",
+    "": "certs check claim example ik registers",
     "rig": "doctor edge events impair lease metrics record recorder rig router sim top up",
     "review": "compare export grade join latency live play recover replay report runs verify",
     "console": "console",

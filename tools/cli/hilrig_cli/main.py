@@ -11,6 +11,7 @@ import typer
 from hilrig_cli.commands import assign, record, rig
 from hilrig_cli.commands.certs import certs
 from hilrig_cli.commands.check import check
+from hilrig_cli.commands.claim import claim
 from hilrig_cli.commands.compare import compare
 from hilrig_cli.commands.console import console
 from hilrig_cli.commands.demo import demo
@@ -60,6 +61,7 @@ PANELS = {
         metrics,
         check,
         doctor,
+        claim,
         lease,
         events,
         impair,

@@ -17,9 +17,9 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from hilrig_console.login_throttle import LoginThrottle
 from hilrig_replay.report.assets import content_policy
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
+from hilrig_runtime.timing.guess_throttle import GuessThrottle
 
 MIN_PASSWORD_CHARS: Final = 8
 PAGE_POLICY: Final = (
@@ -75,7 +75,7 @@ class AuthMiddleware:
     def __init__(self, app: ASGIApp, policy: AccessPolicy, clock: Clock = SYSTEM_CLOCK) -> None:
         self._app = app
         self._policy = policy
-        self._throttle = LoginThrottle()
+        self._throttle = GuessThrottle()
         self._monotonic_ns = clock.monotonic_ns
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -354,6 +354,8 @@ class Exchange:
         try:
             self._device.command(self._client, torque, self._magnet, *basis, now_ns)
         except ModbusError:
+            if denial := self._device.owner_denial(self._client):
+                raise ControllerError(FaultKind.NOT_OWNED, denial, closes=False) from None
             text = "its lease was revoked by an operator; it is acquired again after edge.lease_timeout_ms"
             raise ControllerError(FaultKind.REVOKED, text, closes=False) from None
         self._note_working(now_ns)

@@ -38,6 +38,7 @@ class FaultKind(StrEnum):
     NOT_RUNNING = "program not running"
     WRONG_ECHO = "no step number in the echo register"
     REVOKED = "lease revoked"
+    NOT_OWNED = "rig not claimed"
 
 
 class ControllerError(Exception):

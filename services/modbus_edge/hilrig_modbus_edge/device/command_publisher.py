@@ -11,7 +11,7 @@ from typing import Final
 from hilrig_modbus_edge.device.client import NO_STATE, Client, ServedState
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.delayed_commands import DelayedCommands
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.impairment.delay_line import ImpairmentSamples
 from hilrig_modbus_edge.registers import codec

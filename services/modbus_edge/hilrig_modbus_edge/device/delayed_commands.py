@@ -1,7 +1,7 @@
 """The impaired command link of one rig: sends each command of a client after its delay, or drops it."""
 
 from hilrig_modbus_edge.device.command_sender import CommandSender
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput
 from hilrig_modbus_edge.impairment.delay_line import DelayLine, ImpairmentSamples
 from hilrig_runtime.timing.clock import Clock
 from hilrig_schemas import TorqueCommand

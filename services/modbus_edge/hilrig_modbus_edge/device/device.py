@@ -22,7 +22,7 @@ from hilrig_modbus_edge.device.command_publisher import CommandPublisher
 from hilrig_modbus_edge.device.command_sender import CommandSender
 from hilrig_modbus_edge.device.events import STATE_TIMEOUT_NS, EventEmitter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput, NoOwner, Ownership
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.state_reader import StateReader
@@ -51,6 +51,7 @@ from hilrig_modbus_edge.registers.map import (
     struct_of,
 )
 from hilrig_runtime.addresses import format_address
+from hilrig_runtime.config.claim_codes import CLAIM_ADDRESS, CLAIM_REGISTERS
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.process.outage import OutageDetector
 from hilrig_runtime.timing.clock import Clock
@@ -91,8 +92,10 @@ class Device:
         states: LatestValueCache,
         sender: CommandSender,
         rng: random.Random | None = None,
+        ownership: Ownership | None = None,
     ) -> None:
         self.rig = rig
+        self._ownership: Ownership = NoOwner() if ownership is None else ownership
         self.clients: set[Client] = set()
         self._controllers: dict[str, ConnectedController] = {}
         self._lease_setting = settings.lease
@@ -118,6 +121,7 @@ class Device:
             self._events,
             self._session,
             self.clients,
+            self._ownership,
             rng,
         )
         self.lease = self._write_access.lease
@@ -294,6 +298,9 @@ class Device:
             self._commands.torque[2 * address : 2 * end] = words
             self._publish_write(client, arrived_ns, received_ns)
             return
+        if (address, end) == (CLAIM_ADDRESS, CLAIM_ADDRESS + CLAIM_REGISTERS) and self._ownership.takes_codes:
+            self._claim(client, words.decode("ascii", "replace"), arrived_ns)
+            return
         self.check_writable(address, len(words) // 2)
         if address >= SWITCH_ADDRESS:
             self._write_switches(client, address, words, arrived_ns, received_ns)
@@ -394,6 +401,9 @@ class Device:
         outage = self._state_outages.check(self._states.last_arrived_ns, now_ns)
         if outage is not None:
             self._events.emit_state_outage(outage, self._wall_ns() - now_ns)
+        ends_wall_ns = self._ownership.ends_wall_ns
+        if ends_wall_ns is not None and self._wall_ns() >= ends_wall_ns:
+            self.end_claim("the lab slot has ended")
         self._write_access.check(now_ns)
         self._sender.repeat_if_due(now_ns)
         self.impairment.check(now_ns)
@@ -431,6 +441,19 @@ class Device:
         """Revoke the lease; return the previous holder, empty: none. See `WriteAccess.release`."""
         return self._write_access.release(reason)
 
+    def end_claim(self, reason: str) -> str:
+        """End the claim of a student, with lease and session; return the student, empty: the rig was not claimed."""
+        student = self._ownership.end()
+        if student:
+            text = f"claim of {self.rig} by {student} has ended: {reason}"
+            self._events.emit_for_controller(Event.CLAIM, Event.INFO, text, "", reason=reason, student=student)
+            self._write_access.owner_changed(f"the claim of {student} has ended: {reason}")
+        return student
+
+    def owner_denial(self, client: Client) -> str:
+        """Return why a client may not write because the rig has another owner, or none yet; empty: it may."""
+        return self._write_access.owner_denial(client)
+
     def reset(self) -> None:
         """Move the arm to its start pose with zero torque; the lease holder continues from there."""
         self._commands.reset()
@@ -443,6 +466,19 @@ class Device:
         return status
 
     # -- inside
+
+    def _claim(self, client: Client, code: str, now_ns: int) -> None:
+        """Claim the rig for the student with this code; its torque registers stay as they are."""
+        in_use = self.lease.holder not in (None, client.controller)
+        refusal = self._ownership.claim(client, code, in_use=in_use, now_ns=now_ns, wall_ns=self._wall_ns())
+        if refusal is not None:
+            self._write_access.deny(client, refusal, now_ns)
+        student, machine = self._ownership.student, self._ownership.claimed_from
+        text = f"{self.rig} claimed by {student} from {machine}"
+        self._events.emit_for_controller(
+            Event.CLAIM, Event.INFO, text, client.address, certificate=client.certificate, student=student
+        )
+        self._write_access.owner_changed(f"claimed by {student}")
 
     def _serve_state(self, client: Client) -> StateImage:
         """Return the newest state and record that `client` is served it."""

@@ -1,11 +1,9 @@
 """Events of a rig: each has the session and the simulation step; those that may occur in bursts are rate-limited."""
 
-from typing import Final, NamedTuple
-
-from pymodbus.constants import ExcCodes
+from typing import Final
 
 from hilrig_modbus_edge.device.client import Client
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput, Refusal
 from hilrig_modbus_edge.device.session import SessionState
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.registers.image import StateImage
@@ -49,13 +47,19 @@ class EventEmitter:
         certificate: str = "",
         reason: str = "",
         holder: str = "",
+        student: str = "",
     ) -> None:
-        """Publish an event about a controller, "host:port"; `holder`: the lease holder, if that is another client."""
+        """Publish an event about a controller, "host:port".
+
+        `holder`: the lease holder, if that is another client; `student`: the owner of the rig, if the event is about
+        that.
+        """
         event = self.event(kind, severity, text)
         event.controller_data.controller = controller
         event.controller_data.certificate = certificate
         event.controller_data.reason = reason
         event.controller_data.holder = holder
+        event.controller_data.student = student
         self.emit(event)
 
     def emit_state_outage(self, outage: Outage, wall_offset_ns: int) -> None:
@@ -68,18 +72,6 @@ class EventEmitter:
             event = self.event(Event.STATE_LOST, Event.WARNING, text)
         event.watchdog_data.silent_ns, event.watchdog_data.timeout_ns = outage.silent_ns, STATE_TIMEOUT_NS
         self.emit(event)
-
-
-class Refusal(NamedTuple):
-    """A write that is refused."""
-
-    cause: str
-    """Name of the cause: the reasons of one cause differ in times and addresses only."""
-    reason: str
-    """Human-readable."""
-    code: ExcCodes
-    holder: str = ""
-    """Address of the connection for which it is refused; empty: none."""
 
 
 class LeaseEventReporter:
@@ -149,6 +141,7 @@ class LeaseEventReporter:
             certificate=client.certificate,
             reason=refusal.reason,
             holder=refusal.holder,
+            student=refusal.student,
         )
 
     def _emit_acquired(self, client: Client, count: int = 1) -> None:

@@ -25,6 +25,8 @@ class Session:
     controller: ConnectedController
     """The controller of that client."""
     start_wall_ns: int
+    student: str = ""
+    """Id of the student who owns the rig, several ones with commas; empty: none."""
     released_ns: int | None = None
     """Time at which the lease was released, ns, monotonic clock; None: the lease is held."""
 
@@ -40,6 +42,7 @@ class Session:
             controller=self.address,
             certificate=self.certificate,
             start_wall_ns=self.start_wall_ns,
+            student=self.student,
         )
 
 

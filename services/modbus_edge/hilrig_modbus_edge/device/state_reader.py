@@ -1,6 +1,6 @@
 """Reads the newest state of one rig into its register image."""
 
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput
 from hilrig_modbus_edge.impairment.delay_line import DelayedStates, ImpairmentSamples
 from hilrig_modbus_edge.registers.image import StateImage
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache, TimestampedPayload

@@ -8,16 +8,16 @@ lease and ends a grace time after it. Time is passed in or read from the given c
 
 import random
 from collections.abc import Set as AbstractSet
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, NoReturn, Protocol, TypeVar
 
 from pymodbus.constants import ExcCodes
 
 from hilrig_modbus_edge.command_scheduler import TimerHandle
 from hilrig_modbus_edge.device.client import Client, ConnectedController
 from hilrig_modbus_edge.device.command_publisher import CommandPublisher
-from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, Refusal, StallReporter
+from hilrig_modbus_edge.device.events import EventEmitter, LeaseEventReporter, StallReporter
 from hilrig_modbus_edge.device.impairment_controller import ImpairmentController
-from hilrig_modbus_edge.device.output import DeviceOutput
+from hilrig_modbus_edge.device.ports import DeviceOutput, Ownership, Refusal
 from hilrig_modbus_edge.device.session import Session, SessionState
 from hilrig_modbus_edge.device.settings import MS, DeviceSettings
 from hilrig_modbus_edge.device.watchdog import Watchdog
@@ -80,12 +80,14 @@ class WriteAccess:
         events: EventEmitter,
         session: SessionState,
         clients: AbstractSet[Client],
+        ownership: Ownership,
         rng: random.Random | None,
     ) -> None:
         self.lease: Lease[ConnectedController] = Lease(settings.lease_ns)
         self.watchdog = Watchdog(settings.watchdog_ns)
         self._session = session
         self._clients = clients
+        self._ownership = ownership
         self._rig = rig
         self._settings = settings
         self._monotonic_ns = clock.monotonic_ns
@@ -126,8 +128,7 @@ class WriteAccess:
             return
         refusal = self.authorize(client, begin, end, now_ns)
         if refusal is not None:
-            self._lease_events.lease_denied(client, refusal, now_ns)
-            raise ModbusError(refusal.code)
+            self.deny(client, refusal, now_ns)
         if self.lease.holder not in (None, client.controller):
             self._release_lease(f"the watchdog has tripped, and {client.label} writes")
         if self.lease.holder is None:
@@ -136,12 +137,33 @@ class WriteAccess:
         client.writes = True
         self._last_writer = client
 
+    def deny(self, client: Client, refusal: Refusal, now_ns: int) -> NoReturn:
+        """Report a refused write, rate-limited; ns, monotonic clock.
+
+        Raises:
+            ModbusError: always, with the code of the refusal.
+        """
+        self._lease_events.lease_denied(client, refusal, now_ns)
+        raise ModbusError(refusal.code)
+
     def permit(self, names: AbstractSet[str] | None) -> None:
         """Set the certificates (names) whose clients may write; None: all clients. Others lose the lease at once."""
         self._permitted = names
         holder = self.lease.holder
         if holder is not None and not any(self.may_write(client) for client in holder.clients):
             self._release_lease("it may no longer write to the rig ([edge.tls.clients])")
+
+    def owner_denial(self, client: Client) -> str:
+        """Return why a client may not write because the rig has another owner, or none yet; empty: it may."""
+        return self._ownership.denial(client, reserved=client is self._reserved_for)
+
+    def owner_changed(self, reason: str) -> None:
+        """Set the torque to zero and end lease and session, if they are those of another owner."""
+        session = self._session.current
+        if session is not None and session.student != self._ownership.student:
+            self._commands.zero()
+            self._release_lease(reason)
+            self._end_session(reason)
 
     def may_write(self, client: Client) -> bool:
         """Return whether a client may write if the rig is free: by the role and the name in its certificate."""
@@ -174,6 +196,8 @@ class WriteAccess:
             )
         if not self.may_write(client):
             return Refusal("not listed", self._not_listed(client), ExcCodes.ILLEGAL_FUNCTION)
+        if denial := self.owner_denial(client):
+            return Refusal("owner", denial, ExcCodes.DEVICE_BUSY, student=self._ownership.student)
         if now_ns < client.lease_cooldown_until_ns:
             wait_s = (client.lease_cooldown_until_ns - now_ns) / 1e9
             return Refusal("revoked", f"its lease was revoked; write again in {wait_s:.1f} s", ExcCodes.DEVICE_BUSY)
@@ -297,6 +321,8 @@ class WriteAccess:
             client_of="" if self._reserved_for is None else self._reserved_for.address,
             controller_fault="" if self._reserved_for is None else self._reserved_for.fault,
             skipped_states=0 if self._reserved_for is None else self._reserved_for.skipped_states,
+            student=self._ownership.student,
+            claimed_from=self._ownership.claimed_from,
         )
 
     @property
@@ -352,10 +378,11 @@ class WriteAccess:
         self._lease_events.flush_denials()
         self._session_count += 1
         wall_ns = self._wall_ns()
-        identity = session_id(self._rig, wall_ns, self._rng)
+        student = self._ownership.student
+        identity = session_id(self._rig, wall_ns, self._rng, student)
         number = self._session_count
         self._session.current = Session(
-            self._rig, identity, number, client.address, client.certificate, client.controller, wall_ns
+            self._rig, identity, number, client.address, client.certificate, client.controller, wall_ns, student
         )
         # What another connection read before the session is no basis in it: it may have been another program.
         client.controller.clear_served()
@@ -373,6 +400,7 @@ class WriteAccess:
         event = self._events.event(Event.SESSION_START, Event.INFO, text)
         event.session_data.controller = client.address
         event.session_data.certificate = client.certificate
+        event.session_data.student = student
         event.session_data.reason = reason
         self._events.emit(event)
         self._output.sessions_changed()
@@ -390,6 +418,7 @@ class WriteAccess:
         event = self._events.event(Event.SESSION_END, Event.INFO, f"session {session.id} ended: {reason}")
         event.session_data.controller = session.address
         event.session_data.certificate = session.certificate
+        event.session_data.student = session.student
         event.session_data.reason = reason
         # This command tells the simulation that the session has ended. It is a new one, because it has no session.
         self._session.current = None

@@ -29,7 +29,8 @@ whole or not at all. A read or write of an address that is not in these tables g
 a read-only register; with `unmapped_reads = "zeros"` in `[edge]`, the missing addresses of a block read 0. For
 controllers with functions 3, 6, 16 and 23 only, holding registers 201-236 repeat the input registers, 301 the magnet
 and 302 the reset. A watchdog timeout outside the bounds of the lab gets exception 04. A read of a position gets
-exception 04 until the simulation has published its first state.
+exception 04 until the simulation has published its first state. In a class with claims, holding registers 401-405 take
+a student's code ([classroom](classroom.md)).
 """
 
 

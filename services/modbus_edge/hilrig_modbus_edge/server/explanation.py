@@ -1,5 +1,6 @@
 """Explains an exception response: the request, the cause of its refusal, and the fix. Pure functions."""
 
+import struct
 from typing import Final
 
 from pymodbus.constants import ExcCodes
@@ -11,10 +12,13 @@ from hilrig_modbus_edge.registers.export import TABLE_NAMES
 from hilrig_modbus_edge.registers.map import rows_of
 from hilrig_modbus_edge.request_log import kind_of
 from hilrig_modbus_edge.server.pdu import MAX_QUANTITY
+from hilrig_runtime.config.claim_codes import CLAIM_ADDRESS
 
 Block = tuple[int, int]
 """First and last number of consecutive registers or bits."""
 
+_CLAIM: Final = struct.pack(">BH", FunctionCode.WRITE_MULTIPLE_REGISTERS, CLAIM_ADDRESS)
+"""Begin of a request that claims a rig."""
 _TRADITIONAL: Final = 10_000
 """Numbers per table in the traditional numbering, where 40001 is holding register 1."""
 
@@ -63,6 +67,8 @@ def _cause_and_fix(transaction: int, unit: int, request: bytes, code: int) -> tu
     if function is not None and code == ExcCodes.ILLEGAL_VALUE:
         return _wrong_value(function, request)
     if function is not None and code == ExcCodes.DEVICE_FAILURE:
+        if request[:3] == _CLAIM:
+            return "and the code is not valid for this rig now", "check code and rig; hilrig rig codes makes new codes"
         if function.is_write and function is not FunctionCode.READ_WRITE_MULTIPLE_REGISTERS:
             return "the watchdog timeout is out of bounds", "see edge.watchdog_min_ms and edge.watchdog_max_ms"
         return "the simulation has sent no state yet", "check with hilrig top that it runs"

@@ -52,6 +52,7 @@ class RigServer:
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters, self._make_room)
         self._malformed: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
+        self._not_owned: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
         self.exceptions = ExceptionLog(self._warn)
         self._alert = ("", 0)
         """The last log message, and its time, ns."""
@@ -107,6 +108,9 @@ class RigServer:
         """See `ConnectionOwner.record_exception`."""
         if code == ExcCodes.DEVICE_BUSY or (code == ExcCodes.ILLEGAL_FUNCTION and request[0] in WRITES):
             self.counters.refused += 1
+            if denial := self.device.owner_denial(client):
+                text = f"{client.label}: write denied: {denial}"
+                self._not_owned.record((client.host, denial), text, self.monotonic_ns())
         self.exceptions.record(client, transaction, unit, request, code, self.monotonic_ns())
 
     def alert(self) -> str:
@@ -129,6 +133,7 @@ class RigServer:
     def check(self, now_ns: int) -> None:
         """Do everything that is due, twice a second: reports, connections without a request; ns, monotonic clock."""
         self._malformed.check(now_ns)
+        self._not_owned.check(now_ns)
         self.exceptions.check(now_ns)
         self._admission.check(now_ns)
         for connection in list(self.connections):

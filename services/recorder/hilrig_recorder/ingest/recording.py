@@ -46,6 +46,8 @@ class Recording:
     """When the recording was opened, monotonic clock, ns."""
     certificate: str = ""
     """Name in the controller's certificate; empty: it has none."""
+    student: str = ""
+    """Id of the student who owns the rig, several ones with commas; empty: none."""
     file: "RecordingOutput | None" = field(default=None, repr=False)
     """Its open file, set by the store; None: it has failed or is closed."""
     counters: LossCounters = field(default_factory=LossCounters)

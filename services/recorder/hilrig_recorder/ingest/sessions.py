@@ -280,6 +280,7 @@ class SessionTracker:
                 session=event.session,
                 controller=data.controller,
                 certificate=data.certificate,
+                student=data.student,
                 start_wall_ns=event.wall_ns,
             )
             self._open(publisher.name, session, now_ns)
@@ -338,6 +339,7 @@ class SessionTracker:
             opened.start_wall_ns,
             now_ns,
             certificate=opened.certificate,
+            student=opened.student,
         )
         if not self._store.open(recording):
             self._block(session, now_ns + RETRY_PERIOD_NS)

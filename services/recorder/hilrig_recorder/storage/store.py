@@ -233,6 +233,7 @@ class FileStore:
             "lab": self._lab,
             "controller": recording.controller,
             "certificate": recording.certificate,
+            **({"student": recording.student} if recording.student else {}),
             "keeper": recording.owner,
             "start": start.strftime("%Y-%m-%dT%H:%M:%SZ"),
             "start_wall_ns": str(recording.start_wall_ns),

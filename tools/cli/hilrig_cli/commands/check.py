@@ -20,13 +20,14 @@ def check(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Validate a lab's configuration file: report every error, and print the rigs with their addresses."""
+    """Validate a lab's configuration file and roster: report every error, and print the rigs with their addresses."""
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.addresses import format_address
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.config.template import lab_template
+    from hilrig_runtime.escaping import printable
     from hilrig_sim.accuracy import accuracy_warnings
     from hilrig_sim.arm.model import describe_substeps
     from hilrig_sim.parameters import lab_parameters
@@ -36,6 +37,7 @@ def check(
         return
     lab = load_lab(file)
     rigs = lab_parameters(lab, str(file or "defaults"))
+    roster = None if lab.classroom is None else lab.classroom.students([rig.name for rig in lab.rigs])
     if as_json:
         print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
         return
@@ -53,5 +55,8 @@ def check(
     for rig in lab.rigs:
         if rig.controller is not None:
             print(f"{rig.name}: {rig.describe_controller()}")
+    if roster is not None and lab.classroom is not None:
+        how = "fixed by the roster" if lab.classroom.claims is None else "claimed with codes (hilrig rig codes)"
+        print(f"{printable(str(lab.classroom.roster))}: {len(roster.students)} students; rigs are {how}")
     for warning in accuracy_warnings(rigs):
         print(f"warning: {warning}", file=sys.stderr)

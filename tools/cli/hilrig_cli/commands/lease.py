@@ -17,26 +17,30 @@ def lease(
     ] = None,
     every: AllRigs = False,
     release: Annotated[bool, typer.Option("--release", help="Revoke the lease of the current lease holder.")] = False,
+    end_claim: Annotated[bool, typer.Option("--end-claim", help="End the claim of the rig by a student.")] = False,
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the lease holder of each rig, or revoke leases: the next other controller that writes acquires the rig.
+    """Show the lease holder and the student of each rig, or revoke leases or claims.
 
-    Exit code 1: with --release, a rig had no lease holder.
+    After --release the next other controller that writes acquires the rig. After --end-claim it must be claimed again,
+    with this or another code. Exit code 1: a rig had no lease holder, or was not claimed.
     """
     from hilrig_cli.client import query_edges
     from hilrig_runtime.config.lab import load_lab
     from hilrig_schemas import LeaseRequest, topics
 
-    if release:
-        check_rigs(rigs, every, "hilrig lease --release")
-    statuses = query_edges(load_lab(config), topics.LEASE, rigs or [], LeaseRequest(release=release))
+    if release or end_claim:
+        check_rigs(rigs, every, f"hilrig lease {'--release' if release else '--end-claim'}")
+    request = LeaseRequest(release=release, end_claim=end_claim)
+    statuses = query_edges(load_lab(config), topics.LEASE, rigs or [], request)
     if as_json:
         rows = [_row(status) for status in statuses]
         print(json.dumps(rows[0] if len(rigs or []) == 1 else rows))
     else:
-        _print_table(statuses, release)
-    if release and not all(status.released for status in statuses):
+        _print_table(statuses, release, end_claim)
+    done = [(not release or status.released) and (not end_claim or status.claim_ended) for status in statuses]
+    if not all(done):
         raise typer.Exit(1)
 
 
@@ -53,22 +57,24 @@ def _row(status: "LeaseStatus") -> dict[str, object]:
         "client_of": status.client_of,
         "controller_fault": status.controller_fault,
         "skipped_states": status.skipped_states,
-    }
+    } | {key: getattr(status, key) for key in ("student", "claimed_from", "claim_ended") if getattr(status, key)}
 
 
-def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
+def _print_table(statuses: "list[LeaseStatus]", release: bool, end_claim: bool) -> None:
     from rich.table import Table
 
     from hilrig_cli.terminal import TerminalConsole
 
     table = Table()
-    for column in ("rig", "lease holder", "last request", "session", "connections", "watchdog"):
+    student = ["student"] if any(status.student for status in statuses) else []
+    for column in ("rig", *student, "lease holder", "last request", "session", "connections", "watchdog"):
         table.add_column(column, no_wrap=column == "rig", overflow="fold")
     for status in statuses:
         timeout = "off" if not status.watchdog_timeout_ns else f"{status.watchdog_timeout_ns / 1e6:g} ms"
         holder = f"client of {status.client_of}" if status.client_of else status.holder or "none"
         table.add_row(
             status.rig,
+            *([_student(status)] if student else []),
             f"{holder}: {status.controller_fault}" if status.controller_fault else holder,
             f"{status.silent_ns / 1e9:.1f} s ago" if status.holder else "",
             status.session,
@@ -81,3 +87,11 @@ def _print_table(statuses: "list[LeaseStatus]", release: bool) -> None:
         former = statuses[0].released
         text = f"lease of {former} revoked: the next other controller that writes acquires it"
         console.print(text if former else "the rig had no lease holder")
+    if end_claim:
+        for status in statuses:
+            ended = f"claim of {status.claim_ended} ended: it must be claimed again"
+            console.print(f"{status.rig}: {ended if status.claim_ended else 'it was not claimed'}")
+
+
+def _student(status: "LeaseStatus") -> str:
+    return f"{status.student} from {status.claimed_from}" if status.claimed_from else status.student or "none"

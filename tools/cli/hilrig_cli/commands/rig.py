@@ -1,4 +1,4 @@
-"""`hilrig rig`: lists, adds, removes and resets rigs of a running lab."""
+"""`hilrig rig`: lists, adds, removes and resets rigs of a running lab; makes the codes that claim rigs."""
 
 import json
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hilrig_schemas import ServiceInfo
 
 app = typer.Typer(
-    help="List, add, remove or reset rigs of a running lab.",
+    help="List, add, remove or reset rigs of a running lab; make the codes with which students claim rigs.",
     no_args_is_help=True,
     callback=config_for_commands,
 )
@@ -122,6 +122,58 @@ def reset(rigs: Rigs = None, every: AllRigs = False, config: Config = None) -> N
             print(send_control_request(bus, lab, edges[rig], ControlRequest(reset_rig=ResetRig(rig=rig))).text)
 
 
+@app.command()
+def codes(
+    until: Annotated[
+        str, typer.Option(metavar="TIME", help="End of the lab slot: HH:MM, or date and time as '2026-12-01 11:30'.")
+    ],
+    group: Annotated[str, typer.Option(help="Only the students of this group.")] = "",
+    student: Annotated[
+        list[str] | None, typer.Option(metavar="ID", help="Only this student, as for a lost code; may be repeated.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE.CSV", help="Also write the codes to this file.")
+    ] = None,
+    config: Config = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the codes with which the students of a lab slot claim their rigs (hilrig claim), and print them.
+
+    The codes go to the folder classroom.claims of lab.toml, as hashes; edges read them at the next claim. The old codes
+    of these students are no longer valid; claims that were made with them stay until their end.
+    """
+    from datetime import datetime
+
+    from rich.table import Table
+
+    from hilrig_classroom.slot_codes import codes_csv, issue_codes, parse_end, select_students
+    from hilrig_cli.terminal import TerminalConsole
+    from hilrig_runtime.config.claim_codes import replace_private_file
+    from hilrig_runtime.config.lab import load_lab
+    from hilrig_runtime.errors import InputError, OperationError
+
+    lab, now = load_lab(config), datetime.now().astimezone()
+    if lab.classroom is None or lab.classroom.claims is None:
+        raise InputError("lab.toml has no classroom.claims: add the folder of codes and claims, and --config")
+    ends = parse_end(until, now)
+    students = select_students(lab.classroom.students([one.name for one in lab.rigs]), group, student or [])
+    made = issue_codes(lab.classroom.claims, students, ends, now)
+    if out is not None:
+        try:
+            replace_private_file(out, codes_csv(students, made, ends))
+        except OSError as error:
+            raise OperationError(f"{out}: can't be written: {error.strerror}") from error
+    if as_json:
+        print(json.dumps({"until": ends.isoformat(), "codes": made}))
+        return
+    table = Table(
+        "id", "name", "group", "rig", "code", title=f"codes until {ends:%Y-%m-%d %H:%M}", title_justify="left"
+    )
+    for one in students:
+        table.add_row(one.id, one.name, one.group, one.rig or "any", made[one.id])
+    TerminalConsole().print(table)
+
+
 @contextmanager
 def _join(config: Path | None) -> "Iterator[tuple[LabConfig, Bus, list[ServiceInfo]]]":
     """Join the bus of a running lab; yield the lab, its bus and its services."""
@@ -135,9 +187,7 @@ def _join(config: Path | None) -> "Iterator[tuple[LabConfig, Bus, list[ServiceIn
     with ZenohBus(lab.bus, "rig") as bus:
         found = discover_services(bus, lab, set(RIG_SERVICES))
         if not found:
-            raise OperationError(
-                f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?"
-            )
+            raise OperationError(f"no service of lab {lab.name!r} found: {lab.bus.no_answer_hint}")
         yield lab, bus, found
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from hilrig_schemas import Health
 
 REFRESH_S: Final = 0.5
+FILE_WIDTH: Final = 160
+"""Maximum number of characters per line of output that is not for a terminal."""
 SERVICE_COLUMNS: Final = {
     "service": 0,
     "host": 5,
@@ -32,6 +34,7 @@ SERVICE_COLUMNS: Final = {
 }
 RIG_COLUMNS: Final = {
     "rig": 0,
+    "student": 2,
     "controller": 2,
     "loop p50": 1,
     "p99 ms": 0,
@@ -42,7 +45,7 @@ RIG_COLUMNS: Final = {
     "state": 0,
 }
 """Columns and their ranks: a narrow terminal hides the columns of the highest rank first, and never those of 0."""
-LEFT_ALIGNED_COLUMNS: Final = frozenset({"service", "host", "rig", "controller", "recorded", "state"})
+LEFT_ALIGNED_COLUMNS: Final = frozenset({"service", "host", "rig", "student", "controller", "recorded", "state"})
 """Columns with text."""
 
 
@@ -63,7 +66,7 @@ def top(
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    console = TerminalConsole()
+    console = TerminalConsole(width=None if sys.stdout.isatty() else FILE_WIDTH)
     with LabWatch(lab) as watch:
         watch.wait()
         if as_json or once or not sys.stdout.isatty():
@@ -121,6 +124,7 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
     rigs = [
         {
             "rig": rig.rig,
+            "student": rig.student,
             "controller": rig.controller or "none",
             "loop p50": _or_dash(rig.loop_ms(0.5)),
             "p99 ms": _or_dash(rig.loop_ms(0.99)),
@@ -132,8 +136,8 @@ def render(view: "LabView", now_s: float, height: int | None, width: int | None 
         }
         for rig in rig_views[:max_rigs]
     ]
-    has_refused = any(rig["refused"] for rig in rigs)
-    rig_columns = {name: rank for name, rank in RIG_COLUMNS.items() if name != "refused" or has_refused}
+    empty = {name for name in ("student", "refused") if not any(rig[name] for rig in rigs)}
+    rig_columns = {name: rank for name, rank in RIG_COLUMNS.items() if name not in empty}
     return Group(_table(services, SERVICE_COLUMNS, width, silent), _table(rigs, rig_columns, width), *alerts)
 
 

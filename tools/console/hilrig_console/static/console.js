@@ -149,7 +149,8 @@ class Rig {
   update(rig, runs) {
     this.held = Boolean(rig.controller);
     this.level = runs ? LEVELS[rig.state] ?? "warn" : "";
-    this.text = `${rig.rig} ${rig.state} ${rig.controller} ${rig.address} ${rig.session}`.toLowerCase();
+    const user = [rig.student, rig.controller || "none"].filter(Boolean).join(": ");
+    this.text = `${rig.rig} ${rig.state} ${rig.student || ""} ${rig.controller} ${rig.address} ${rig.session}`.toLowerCase();
     const recorded = rig.recording ? rig.session || "manual recording" : "–";
     const p50 = fixed(rig.loop_p50_ms, 1), p99 = fixed(rig.loop_p99_ms, 1), late = fixed(rig.simulated ? rig.lateness_p99_ms : null, 2);
     for (const pill of [this.pill, this.rowPill]) {
@@ -160,7 +161,7 @@ class Rig {
     setText(this.figures.loop, rig.loop_samples ? `${p50} / ${p99} ms` : "–");
     const age = fixed(rig.age_p99_ms, 1);
     setText(this.figures.age, rig.age_p99_ms === null ? age : `${age} ms`);
-    setText(this.figures.controller, rig.controller || "none");
+    setText(this.figures.controller, user);
     setText(this.figures.address, rig.address || "–");
     setText(this.figures.late, rig.simulated ? `${late} ms` : late);
     setText(this.figures.overruns, rig.simulated ? String(rig.overruns) : "–");
@@ -169,7 +170,7 @@ class Rig {
     setText(this.figures.recorded, recorded);
     this.figures.recorded.classList.toggle("rec", rig.recording);
     this.figures.recorded.title = recorded;
-    const cells = [rig.address || "–", rig.controller || "none", p50, p99, age, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
+    const cells = [rig.address || "–", user, p50, p99, age, late, rig.simulated ? String(rig.overruns) : "–", watchdog, recorded];
     cells.forEach((text, number) => setText(this.cells[number], text));
     this.cells[8].classList.toggle("rec", rig.recording);
   }

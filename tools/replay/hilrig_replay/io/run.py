@@ -93,6 +93,11 @@ class Run:
         return self._metadata_text("session", "certificate")
 
     @property
+    def students(self) -> tuple[str, ...]:
+        """Ids of the students who owned the rig, normally one; empty: the lab had no roster."""
+        return tuple(filter(None, self._metadata_text("session", "student").split(",")))
+
+    @property
     def started(self) -> str:
         """Start time of the session, UTC, as recorded; empty: not recorded."""
         return self._metadata_text("session", "start")

@@ -1,4 +1,4 @@
-"""Login throttle of the console: a burst of wrong passwords, then one attempt per interval."""
+"""Throttle of wrong passwords and codes: a burst, then one attempt per interval."""
 
 import asyncio
 import base64
@@ -9,14 +9,14 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message
 
 from hilrig_console.auth import AccessPolicy, AuthMiddleware
-from hilrig_console.login_throttle import BURST_ATTEMPTS, MAX_ADDRESSES, RETRY_INTERVAL_NS, LoginThrottle
 from hilrig_runtime.timing.clock import ManualClock
+from hilrig_runtime.timing.guess_throttle import BURST_ATTEMPTS, MAX_ADDRESSES, RETRY_INTERVAL_NS, GuessThrottle
 
 HOST = "192.0.2.7"
 
 
-def exhausted(address: str = HOST) -> LoginThrottle:
-    throttle = LoginThrottle()
+def exhausted(address: str = HOST) -> GuessThrottle:
+    throttle = GuessThrottle()
     for _ in range(BURST_ATTEMPTS):
         assert throttle.wait_ns(address, 0) == 0
         throttle.record_failure(address, 0)
