@@ -52,10 +52,10 @@ class RigServer:
         self.monotonic_ns: Callable[[], int] = clock.monotonic_ns
         self._admission = Admission(device, limits, clock.monotonic_ns, counters, self._make_room)
         self._malformed: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
-        self._not_owned: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._set_alert)
+        self._not_owned: RepeatReporter[tuple[str, str], str] = RepeatReporter(LOG_PERIOD_NS, self._warn)
         self.exceptions = ExceptionLog(self._warn)
         self._alert = ("", 0)
-        """The last message about a client, and its time, ns."""
+        """The last log message, and its time, ns."""
         self._acceptors: list[asyncio.Task[None]] = []
 
     async def listen(self, listening: socket.socket, policy: TlsPolicy | None = None) -> None:
@@ -119,12 +119,9 @@ class RigServer:
         return text if self.monotonic_ns() - reported_ns < ALERT_NS else ""
 
     def _warn(self, text: str, count: int) -> None:
-        self._set_alert(text, count)
-        logger.warning("rig %s: %s", self.device.rig, self._alert[0])
-
-    def _set_alert(self, text: str, count: int) -> None:
-        """Set the alert; a denied write is an event, which is logged."""
-        self._alert = (f"{text}{repeat_suffix(count)}", self.monotonic_ns())
+        text = f"{text}{repeat_suffix(count)}"
+        self._alert = (text, self.monotonic_ns())
+        logger.warning("rig %s: %s", self.device.rig, text)
 
     def log_tcp_figures(self) -> None:
         """Add the TCP figures of each connection to the request log."""
