@@ -19,7 +19,9 @@ import pytest
 
 from hilrig_modbus_edge.command_scheduler import CommandScheduler
 from hilrig_modbus_edge.device.command_sender import CommandSender
+from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.rig_endpoint import RigEndpoint
+from hilrig_modbus_edge.service import EdgeService
 from hilrig_recorder.service import Recorder
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import LabConfig
@@ -29,6 +31,7 @@ from hilrig_runtime.timing.rate import Tick
 from hilrig_schemas import TorqueCommand, topics
 from hilrig_sim.loop import Simulation
 from hilrig_sim.parameters import rig_parameters
+from support.plc import Plc
 
 PAGE = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
 HOP = re.compile(r"^(\d+)\. `([\w.]+)`(?:, through `(\w+)`)?(?:, called by (\d+|[a-z ]+))?: ")
@@ -95,8 +98,8 @@ def read_paths() -> list[list[Hop]]:
 
 
 SERVER_ROLE = ("torque", "state", "recorded message")
-"""Paths whose calls are recorded in one cycle."""
-PATHS = dict(zip((*SERVER_ROLE, "state in the client role", "torque in the client role"), read_paths(), strict=True))
+CLIENT_ROLE = ("state in the client role", "torque in the client role")
+PATHS = dict(zip((*SERVER_ROLE, *CLIENT_ROLE), read_paths(), strict=True))
 
 
 def names_called_in(function: FunctionType) -> set[str]:
@@ -218,19 +221,47 @@ async def run_cycle(folder: Path) -> Trace:
     return trace
 
 
+async def run_client_cycle() -> Trace:
+    """Let an edge exchange with a controller that is a server, until it has commanded its torques twice."""
+    hub = MemoryHub()
+    with Plc(law=lambda _: struct.unpack(">4h", WORDS)) as plc:
+        rigs = [{"name": "rig1", "controller": plc.address, "registers": {"echo": 9}}]
+        lab = LabConfig.model_validate({"sim": {"step_ms": STEP_NS / 1e6}, "rigs": rigs})
+        with Service("sim", lab, MemoryBus(hub)) as sim, Service("edge", lab, MemoryBus(hub)) as edge:
+            simulation = Simulation(sim, [rig_parameters(lab, rig) for rig in lab.rigs])
+            [endpoint] = EdgeService(edge, asyncio.get_running_loop())._endpoints.values()
+            assert endpoint.exchange is not None
+            endpoint.device.start()
+            endpoint.exchange.start()
+            with Trace() as trace:
+                async with asyncio.timeout(10):
+                    while trace.calls.count(Device.command.__code__) < 2:
+                        simulation.tick(Tick(sim.clock.monotonic_ns(), 0, 0))
+                        await asyncio.sleep(STEP_NS / 1e9)
+            endpoint.stop("end")
+    return trace
+
+
 @pytest.fixture(scope="module")
 def trace(tmp_path_factory: pytest.TempPathFactory) -> Trace:
     return asyncio.run(run_cycle(tmp_path_factory.mktemp("recordings")))
 
 
-@pytest.mark.parametrize("path", SERVER_ROLE)
-def test_hops_are_called_in_the_listed_order(trace: Trace, path: str) -> None:
-    calls = iter(trace.calls)
+@pytest.fixture(scope="module")
+def client_trace() -> Trace:
+    return asyncio.run(run_client_cycle())
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_hops_are_called_in_the_listed_order(trace: Trace, client_trace: Trace, path: str) -> None:
+    calls = iter((client_trace if path in CLIENT_ROLE else trace).calls)
     for hop in PATHS[path]:
         assert hop.function is None or any(code is hop.function.__code__ for code in calls), hop.name
 
 
-def test_no_other_function_passes_the_command_on(trace: Trace) -> None:
+@pytest.mark.parametrize("role", ["server role", "client role"])
+def test_no_other_function_passes_the_command_on(trace: Trace, client_trace: Trace, role: str) -> None:
+    trace = client_trace if role == "client role" else trace
     listed = {hop.function.__code__ for hops in PATHS.values() for hop in hops if hop.function is not None}
     # The transport is behind the interface of the bus.
     passing = {code for code in trace.passing if not code.co_filename.endswith("/bus/memory_bus.py")}

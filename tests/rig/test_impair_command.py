@@ -14,7 +14,7 @@ pytestmark = pytest.mark.rig
 
 
 def test_impairment_is_set_by_command_at_run_time(tmp_path: Path) -> None:
-    recording = record(tmp_path / "run.mcap", Script(seconds=2.0))
+    recording = record(tmp_path / "run.mcap", Script(seconds=4.0))
     config = write_lab(tmp_path)
     with RunningLab(config) as lab, RawClient("127.0.0.1", lab.port) as client:
         client.write(0, 1)

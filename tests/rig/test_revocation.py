@@ -5,6 +5,7 @@ import signal
 import socket
 import ssl
 import struct
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,14 @@ def test_certificate_is_permitted_and_revoked_in_use(tmp_path: Path) -> None:
     only_bob = listed.replace("tls.clients.alice", "tls.clients.bob")
     elsewhere = tmp_path / "elsewhere.toml"
     elsewhere.write_text(only_bob)
-    with RunningLab(config) as lab:
-        alice, bob, plain = (Controller(lab, certs, name) for name in ("alice", "bob", ""))
+    with RunningLab(config) as lab, ExitStack() as closing:
+
+        def connect(name: str) -> Controller:
+            controller = Controller(lab, certs, name)
+            closing.callback(controller.socket.close)
+            return controller
+
+        alice, bob, plain = map(connect, ("alice", "bob", ""))
         for reader in (bob, plain):
             assert reader.ask(READ)[:2] == b"\x03\x08"
             assert reader.ask(WRITE) == REFUSED_AS_READER
@@ -86,7 +93,7 @@ def test_certificate_is_permitted_and_revoked_in_use(tmp_path: Path) -> None:
         assert code == 0, text
         assert "connections closed: 1" in json.loads(text)["edges"].popitem()[1]
         assert alice.ask(READ) == b""
-        assert Controller(lab, certs, "alice").ask(WRITE) == REFUSED_AS_READER
+        assert connect("alice").ask(WRITE) == REFUSED_AS_READER
         eventually(lambda: bob.ask(WRITE) == WRITTEN)
         assert lab.process.poll() is None
     assert {open_run(path).certificate for path in lab.recordings} == {"alice", "bob"}

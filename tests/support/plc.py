@@ -24,6 +24,7 @@ class Plc:
 
     Args:
         scan_s: period of the program; 0: it answers each write of positions at once.
+        output_s: time from the inputs of a scan to its outputs.
         delay_s: delay of each direction of the network.
         law: the program.
         copies_step: whether the program copies the step number.
@@ -33,6 +34,7 @@ class Plc:
         self,
         *,
         scan_s: float = 0.0,
+        output_s: float = 0.0,
         delay_s: float = 0.0,
         law: Law = hold,
         copies_step: bool = True,
@@ -51,8 +53,10 @@ class Plc:
         """Returns the bytes that answer a request (transaction, unit, PDU); None: the connection is closed."""
         self.tls: ssl.SSLContext | None = None
         """Context of a server with TLS; None: without TLS."""
+        self.closes_after_response = False
         self.connections = 0
         self._scan_s, self._delay_s, self._law, self._copies_step = scan_s, delay_s, law, copies_step
+        self._output_s = output_s
         self._lock = threading.Lock()
         self._host, self.port = host, port
         self._stopping = threading.Event()
@@ -64,7 +68,8 @@ class Plc:
 
     def listen(self) -> None:
         """Open the port, the same one each time."""
-        self._listening = socket.create_server((self._host, self.port))
+        family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+        self._listening = socket.create_server((self._host, self.port), family=family)
         self.port = self._listening.getsockname()[1]
         self._start(self._accept, self._listening)
 
@@ -87,7 +92,7 @@ class Plc:
 
     @property
     def address(self) -> str:
-        return f"{self._host}:{self.port}"
+        return f"[{self._host}]:{self.port}" if ":" in self._host else f"{self._host}:{self.port}"
 
     @property
     def positions(self) -> tuple[int, ...]:
@@ -107,6 +112,8 @@ class Plc:
         with self._lock:
             positions, step = self.positions, struct.unpack_from(">H", self.registers, 16)[0]
         torques = self._law(positions)
+        if self._output_s:
+            time.sleep(self._output_s)  # the program computes
         with self._lock:
             self.set_torques(*torques)
             if self._copies_step:
@@ -170,6 +177,8 @@ class Plc:
                 if self._delay_s:
                     time.sleep(self._delay_s)  # a slow network
                 connected.sendall(reply)
+                if self.closes_after_response:
+                    break
         except OSError:
             pass
         finally:

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,6 +30,18 @@ class RrdFile:
                 times.extend(batch.column("sim_time").cast(pa.int64()).to_pylist())
         order = np.argsort(times, kind="stable")
         return np.array([rows[number] for number in order])
+
+    def static(self, path: str, ending: str) -> list[Any]:
+        """Return the values of a component without a time."""
+        batches = [batch for batch in self.tables[path] if "sim_time" not in batch.schema.names]
+        return [
+            value
+            for batch in batches
+            for name in batch.schema.names
+            if name.endswith(ending)
+            for values in batch.column(name).to_pylist()
+            for value in values
+        ]
 
     def rows(self, path: str) -> int:
         """Number of an entity's rows with a time."""

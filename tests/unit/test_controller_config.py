@@ -97,6 +97,10 @@ def test_check_refuses_registers(registers: str, text: str) -> None:
         ('[[rigs]]\nname = "a"\nunit = 2\n', "no effect without controller"),
         ('[[rigs]]\nname = "a"\n[rigs.registers]\necho = 9\n', "no effect without controller"),
         (RIG + '[[rigs]]\nname = "b"\ncontroller = "PLC1:502"\n', "rigs 'a' and 'b': both are clients"),
+        (
+            '[[rigs]]\nname = "a"\ncontroller = "localhost"\n[[rigs]]\nname = "b"\ncontroller = "127.0.0.1"\n',
+            "rigs 'a' and 'b': both are clients",
+        ),
         ('[[rigs]]\nname = "a"\ncontroller = "localhost:5020"\n', "is the address of a rig of this lab"),
         (RIG + "[rigs.client]\nread_lead_ms = 20.0\n", "read_lead_ms must be < sim.step_ms"),
         (
@@ -118,6 +122,17 @@ def test_blocks_of_one_request() -> None:
     )
     echo = RegistersConfig(echo=9)
     assert (echo.written_block, echo.read_block) == (RegisterBlock("holding", 4, 5), RegisterBlock("holding", 0, 10))
+    assert echo.separate_magnet_block == RegisterBlock("coil", 0)
+    for magnet, count, separate in (
+        ("holding 10.3", 11, False),
+        ("holding 11.3", 10, True),
+        ("input 10.3", 10, True),
+    ):
+        beside = RegistersConfig(echo=9, magnet=magnet)
+        assert (beside.read_block.count, beside.separate_magnet_block is not None) == (count, separate)
+    # The positions exist: a bit after them can be read with the torques.
+    assert RegistersConfig(magnet="holding 8.0").read_block.count == 9
+    assert RegistersConfig(magnet="holding 9.0").read_block.count == 4
     wide = RegistersConfig(torques="30001", positions="40101", echo="30010", format="float32", magnet="none")
     assert (wide.written_block.count, wide.read_block) == (9, RegisterBlock("input", 0, 10))
 

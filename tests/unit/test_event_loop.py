@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from selectors import EVENT_READ
+from statistics import median
 
 import pytest
 
@@ -40,8 +41,8 @@ def test_timer_is_not_rounded_to_milliseconds() -> None:
         rounded_s = runner.run(lateness_s())
     # asyncio calls a timer that is due within the resolution of its clock.
     assert min(exact_s) > -1e-6
-    # At least one of a hundred is not delayed by other processes. A rounded one is late by the rest of a millisecond.
-    assert min(exact_s) < min(rounded_s) - 0.0002
+    # A rounded one is late by the rest of a millisecond.
+    assert median(exact_s) < median(rounded_s) - 0.0002
 
 
 def test_timers_are_called_in_order() -> None:

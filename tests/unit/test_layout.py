@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import rerun as rr
 import rerun.blueprint as rrb
 
 from hilrig_replay.io.run import Run, open_run
@@ -22,6 +23,7 @@ yaw_deg = 0
 [task.path]
 points_mm = [[300, 0, 100], [300, 100, 100]]
 """
+DATA = Path(__file__).parents[1] / "data"
 HIDDEN = {1: "/loop", 2: "/{root}/stages"}
 """Written, but not shown, by number of runs: stages are shown for one run, the loop of several runs in one plot."""
 
@@ -106,3 +108,16 @@ def test_legends_are_in_titles_and_cover_no_curve() -> None:
         plot.name for plot in plots if plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() != [False]
     ] == ["Modbus requests per second"]
     assert plots[0].name == "Positions: θ1 blue, θ2 orange, d3 green, θ4 purple (°; d3 mm)"
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"), [("client-role", "position write yellow"), ("limit-cycle", "controller orange")]
+)
+def test_title_names_the_stages_of_the_role(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, stage: str
+) -> None:
+    shown: list[rrb.Blueprint] = []
+    monkeypatch.setattr(rr.RecordingStream, "send_blueprint", lambda _, blueprint: shown.append(blueprint))
+    save_rrd(open_run(DATA / f"{name}.mcap"), tmp_path / "run.rrd")
+    titles = [str(view.name) for view in views(shown[-1].root_container)]
+    assert [title for title in titles if title.startswith("Latency, ms: register wait blue, ") and stage in title]

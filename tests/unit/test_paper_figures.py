@@ -1,15 +1,12 @@
 """Experiment (44) of the paper gives the published numbers and three figures."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilrig_runtime.errors import InputError
 from hilrig_sim.validation.paper_figures import compute
-from support.labs import hilrig
-from support.recordings import Script, record
 
 
 def test_experiment_44_gives_the_published_numbers() -> None:
@@ -51,23 +48,3 @@ def test_step_that_does_not_divide_a_second_is_rejected() -> None:
     for step_ms in (7.0, 0.0, -1.0, 3000.0):
         with pytest.raises(InputError, match="a second must be a multiple of the step"):
             compute(step_ms)
-
-
-def test_three_figures_are_drawn(tmp_path: Path) -> None:
-    out = tmp_path / "new" / "folder"
-    assert hilrig("figures", "--out", out).returncode == 0
-    files = sorted(out.iterdir())
-    assert [path.name for path in files] == ["figure4_euler.png", "figure5_dop853.png", "figure6_rkf45.png"]
-    assert all(path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000 for path in files)
-    # A recording with the name of a figure is kept, and no other figure is replaced.
-    record(files[1], Script(seconds=0.1))
-    before = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in files]
-    refused = hilrig("figures", "--out", out)
-    assert (refused.returncode, "is a recording and is not overwritten" in refused.stderr) == (2, True)
-    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in files] == before
-
-
-def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    done = hilrig("figures", "--out", tmp_path / "file" / "folder")
-    assert (done.returncode, "can't be written" in done.stderr) == (3, True)

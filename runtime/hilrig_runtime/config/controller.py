@@ -50,6 +50,15 @@ class RegisterBlock:
         """Address after the last one."""
         return self.address + self.count
 
+    def __iter__(self) -> Iterator[int]:
+        """The addresses."""
+        return iter(range(self.address, self.end))
+
+    def to(self, other: "RegisterBlock") -> "RegisterBlock":
+        """Return the registers of both blocks of one table, and those between them."""
+        first = min(self.address, other.address)
+        return RegisterBlock(self.table, first, max(self.end, other.end) - first)
+
     def overlaps(self, other: "RegisterBlock") -> bool:
         """Return whether both have a register or coil in common; different bits of one register are distinct."""
         if self.table != other.table or self.end <= other.address or other.end <= self.address:
@@ -146,7 +155,8 @@ class RegistersConfig(Section):
     positions: _Register = 4
     """First holding register of the four positions, which the edge writes."""
     magnet: Literal["none"] | _Number | str = "coil 0"
-    """Coil, discrete input or bit of a register that switches the magnet, which the edge reads; "none": not read."""
+    """Coil, discrete input or bit of a register that switches the magnet, which the edge reads; "none": not read. A bit
+    beside the torques, the echo or the positions is read with the torques, in one request."""
     echo: _Register | None = None
     """Register into which the program copies the step number that the edge writes directly after the positions; the
     watchdog then monitors the program, and the latency is exact. It is read in one request with the torques."""
@@ -186,13 +196,26 @@ class RegistersConfig(Section):
         return block if self.echo is None else replace(block, count=block.count + 1)
 
     @property
+    def _torques_and_echo(self) -> RegisterBlock:
+        return self.torque_block if self.echo_block is None else self.torque_block.to(self.echo_block)
+
+    @property
     def read_block(self) -> RegisterBlock:
-        """The registers of one request that reads the torques and, if it has a register, the echo."""
-        block, echo = self.torque_block, self.echo_block
-        if echo is None:
+        """The registers of one request that reads the torques, the echo if it has one, and the magnet if possible."""
+        block, magnet = self._torques_and_echo, self.magnet_block
+        if magnet is None or magnet.table != block.table:
             return block
-        first = min(block.address, echo.address)
-        return RegisterBlock(block.table, first, max(block.end, echo.end) - first)
+        wider = block.to(magnet)
+        # A register in between that does not exist would make the request fail.
+        existing = {address for _, known in self._named_blocks() if known.table == block.table for address in known}
+        existing.update(block)
+        return wider if wider.count <= MAX_READ and existing.issuperset(wider) else block
+
+    @property
+    def separate_magnet_block(self) -> RegisterBlock | None:
+        """The switch of the magnet if it has a request of its own; None: it is read with the torques, or not at all."""
+        magnet, block = self.magnet_block, self.read_block
+        return None if magnet is None or (magnet.table == block.table and magnet.address in block) else magnet
 
     def _named_blocks(self) -> Iterator[tuple[str, RegisterBlock]]:
         yield "torques", self.torque_block
@@ -213,7 +236,7 @@ class RegistersConfig(Section):
             raise ValueError(f'magnet: expected a coil, a discrete input, or a bit as in "holding 8.3", got {magnet}')
         if echo is not None and (echo.table != torques.table or echo.bit is not None):
             raise ValueError(f"echo: expected a register of the table of the torques ({torques}), got {echo}")
-        if self.read_block.count > MAX_READ:
+        if self._torques_and_echo.count > MAX_READ:
             raise ValueError(
                 f"echo: {echo} is too far from the torques ({torques}): one request reads at most {MAX_READ} registers"
             )

@@ -7,7 +7,7 @@ with the defaults below.
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
@@ -237,6 +237,10 @@ def _expand_group(rigs: Any) -> Any:
     return RigsTable.model_validate(rigs).rigs() if isinstance(rigs, dict) else rigs
 
 
+_LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
+"""Names of this host, which are one controller."""
+
+
 class LabConfig(Section):
     """The configuration of a lab."""
 
@@ -302,13 +306,14 @@ class LabConfig(Section):
             if rig.controller is None:
                 continue
             host, port = parse_controller(rig.controller)
-            other = rig_of.setdefault((host.lower(), port), rig.name)
+            name = "localhost" if host in _LOOPBACK else host.lower()
+            other = rig_of.setdefault((name, port), rig.name)
             if other != rig.name:
                 raise ValueError(
                     f"rigs {other!r} and {rig.name!r}: both are clients of the controller {rig.controller}; a "
                     "controller has one rig"
                 )
-            if port in served and host in {"localhost", "127.0.0.1", "::1", *map(self.host_of, self.rigs)}:
+            if port in served and host in {*_LOOPBACK, *map(self.host_of, self.rigs)}:
                 raise ValueError(
                     f"rig {rig.name!r}: its controller {rig.controller} is the address of a rig of this lab"
                 )

@@ -1,8 +1,8 @@
 """Request log of a rig: records each Modbus request with its timestamps, for publication in batches.
 
-Clients repeat the same few requests, so an entry is an index into a table of request kinds and two timestamps, which
-takes half a microsecond. The message is built entry by entry: building a whole batch at once would delay the request at
-that moment.
+The requests of clients, and in the client role those of the edge itself. The same few requests are repeated, so an
+entry is an index into a table of request kinds and two timestamps, which takes half a microsecond. The message is built
+entry by entry: building a whole batch at once would delay the request at that moment.
 """
 
 from typing import Final
@@ -43,7 +43,10 @@ class RequestLog:
         return len(self._message.kind_indexes)
 
     def record(self, pdu: bytes, arrived_ns: int, answered_ns: int, exception: int, controller: str) -> None:
-        """Record a request: PDU, arrival and response time (ns, monotonic clock), exception code or 0, and client."""
+        """Record a request: PDU, arrival and response time (ns, monotonic clock), exception code or 0, and client.
+
+        Of a request of the edge: the times of sending and of the response, and the address of the controller.
+        """
         head = pdu[:5], exception, controller
         index = self._index_of_head.get(head)
         if index is None:

@@ -84,11 +84,6 @@ class RigEndpoint:
         publisher = service.rig_publisher(topics.COMMAND, rig.name)
         sender = CommandSender(rig.name, scheduler, publisher, service.clock, settings.repeat_ns)
         self.device = Device(rig.name, settings, service.clock, self._output, states, sender, ownership=ownership)
-        self.exchange: Exchange | None = None
-        """Exchange with the controller, if that is a server; None: the rig is a server only."""
-        if rig.controller is not None:
-            exchange_settings = ExchangeSettings.of(rig, lab.sim.step_ns)
-            self.exchange = Exchange(exchange_settings, self.device, states, service.clock)
         limits = Limits(
             lab.edge.max_connections,
             lab.edge.max_connections_per_host,
@@ -96,6 +91,12 @@ class RigEndpoint:
             rig.allow,
         )
         self._server = RigServer(self.device, limits, service.clock, service.counters)
+        self.exchange: Exchange | None = None
+        """Exchange with the controller, if that is a server; None: the rig is a server only."""
+        if rig.controller is not None:
+            exchange_settings = ExchangeSettings.of(rig, lab.sim.step_ns)
+            request_log = self._server.request_log
+            self.exchange = Exchange(exchange_settings, self.device, states, service.clock, request_log)
         self.closing = ExitStack()
         """Resources that are closed with the endpoint."""
         self.address = ""

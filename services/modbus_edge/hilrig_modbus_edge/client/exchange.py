@@ -8,6 +8,7 @@ the states in between are skipped and counted.
 import asyncio
 import logging
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from hilrig_modbus_edge.client.faults import ControllerError, FaultKind
@@ -20,7 +21,8 @@ from hilrig_modbus_edge.device.device import Device
 from hilrig_modbus_edge.device.settings import MS
 from hilrig_modbus_edge.protocol.exceptions import ModbusError
 from hilrig_modbus_edge.registers.image import StateImage, StateRef
-from hilrig_runtime.config.controller import ClientConfig, RegistersConfig, parse_controller
+from hilrig_modbus_edge.request_log import RequestLog
+from hilrig_runtime.config.controller import ClientConfig, RegisterBlock, RegistersConfig, parse_controller
 from hilrig_runtime.config.lab import RigSettings
 from hilrig_runtime.messaging.latest_value_cache import LatestValueCache
 from hilrig_runtime.timing.clock import Clock
@@ -83,22 +85,64 @@ class ResponseTime:
         return self._mean_ns + 2 * self._deviation_ns
 
 
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Requests of a cycle, and the positions of the values in the response with the torques, bytes."""
+
+    written: RegisterBlock
+    read: RegisterBlock
+    magnet: RegisterBlock | None
+    """The switch of the magnet if it has a request of its own."""
+    torques_at: int
+    echo_at: int | None
+    """None: no echo register."""
+    magnet_at: tuple[int, int] | None
+    """The byte and its bit; None: not in this response."""
+
+    @classmethod
+    def of(cls, registers: RegistersConfig) -> "_Layout":
+        read, echo, magnet = registers.read_block, registers.echo_block, registers.magnet_block
+        magnet_at = None
+        if magnet is not None and registers.separate_magnet_block is None:
+            assert magnet.bit is not None
+            # The high byte of a register comes first.
+            magnet_at = 2 * (magnet.address - read.address) + 1 - magnet.bit // 8, magnet.bit % 8
+        return cls(
+            registers.written_block,
+            read,
+            registers.separate_magnet_block,
+            2 * (registers.torque_block.address - read.address),
+            None if echo is None else 2 * (echo.address - read.address),
+            magnet_at,
+        )
+
+
 class Exchange:
-    """Exchange of one rig with its controller; runs on the event loop of the edge.
+    """Exchange of one rig with its controller; runs on the event loop of the edge. Its requests are logged.
 
     Raises `InputError` if a file of client.tls can't be used.
     """
 
-    def __init__(self, settings: ExchangeSettings, device: Device, states: LatestValueCache, clock: Clock) -> None:
+    def __init__(
+        self,
+        settings: ExchangeSettings,
+        device: Device,
+        states: LatestValueCache,
+        clock: Clock,
+        request_log: RequestLog,
+    ) -> None:
         self._settings = settings
         self._device = device
         self._states = states
         self._monotonic_ns = clock.monotonic_ns
+        self._clock = clock
+        self._request_log = request_log
         supervised = settings.registers.echo is not None
         self._client = device.reserve(settings.host, settings.port, "" if supervised else NOT_SUPERVISED)
         device.clients.discard(self._client)
         self._context = None if settings.client.tls is None else client_context(settings.client.tls)
         self._format = ValueFormat(settings.registers)
+        self._layout = _Layout.of(settings.registers)
         self._written = WrittenPositions()
         self._state_arrived = asyncio.Event()
         self._newest: StateRef | None = None
@@ -140,7 +184,14 @@ class Exchange:
         settings, backoff_s = self._settings, MIN_BACKOFF_S
         while True:
             connection = ControllerConnection(
-                settings.host, settings.port, settings.unit, settings.client, self._context, self._on_late_response
+                settings.host,
+                settings.port,
+                settings.unit,
+                settings.client,
+                self._context,
+                self._clock,
+                on_late=self._on_late_response,
+                log=partial(self._request_log.record, controller=self.address),
             )
             answered_ns = self._client.last_request_ns
             try:
@@ -202,17 +253,18 @@ class Exchange:
         served = image.basis, self._monotonic_ns()
         words = self._words_of(image)
         self._skip_to(image)
-        self._written.add(served)
-        written, registers = self._settings.registers.written_block, self._settings.registers
+        layout = self._layout
         if self._settings.client.combined_request:
-            # The torques answer the positions that were acknowledged before.
+            # A device executes a request as a whole: the torques answer the positions of an earlier one.
             basis = self._written.newest_basis(served[1])
-            data = await connection.write_and_read(written, words, registers.read_block, "torques")
+            self._written.add(served)
+            data = await connection.write_and_read(layout.written, words, layout.read, "torques")
             self._written.acknowledge(served, self._monotonic_ns())
             await self._read_magnet(connection)
             self._command(data, basis, served[1])
             return
-        await connection.write_registers(written, words, "positions")
+        self._written.add(served)
+        await connection.write_registers(layout.written, words, "positions")
         self._written.acknowledge(served, self._monotonic_ns())
         wait_ns = self._read_due_ns() - self._monotonic_ns()
         if wait_ns > 0:
@@ -229,16 +281,16 @@ class Exchange:
         self._command(data, basis, sent_ns)
 
     async def _read(self, connection: ControllerConnection) -> bytes:
-        return await connection.read_registers(self._settings.registers.read_block, "torques")
+        return await connection.read_registers(self._layout.read, "torques")
 
     async def _read_magnet(self, connection: ControllerConnection) -> None:
-        magnet = self._settings.registers.magnet_block
+        magnet = self._layout.magnet
         if magnet is not None:
             self._magnet = await connection.read_bit(magnet, "the magnet")
 
     def _words_of(self, image: StateImage) -> bytes:
         words = self._format.positions(image)
-        if self._settings.registers.echo is None:
+        if self._layout.echo_at is None:
             return words
         return words + (image.step & STEP_MASK).to_bytes(2, "big")
 
@@ -275,16 +327,12 @@ class Exchange:
     # -- torques
 
     def _echo_in(self, data: bytes) -> int | None:
-        registers = self._settings.registers
-        if registers.echo_block is None:
-            return None
-        at = 2 * (registers.echo_block.address - registers.read_block.address)
-        return int.from_bytes(data[at : at + 2], "big")
+        at = self._layout.echo_at
+        return None if at is None else int.from_bytes(data[at : at + 2], "big")
 
     def _command(self, data: bytes, basis: tuple[ServedState, PollTimes], read_sent_ns: int) -> None:
         """Command the torques that were read; `basis`: the newest state that they can answer."""
-        now_ns = self._monotonic_ns()
-        registers = self._settings.registers
+        now_ns, layout = self._monotonic_ns(), self._layout
         echo = self._echo_in(data)
         if echo is not None:
             if echo == self._echo:
@@ -299,8 +347,10 @@ class Exchange:
             basis = found
         elif not self._written.any_acknowledged:
             return
-        at = 2 * (registers.torque_block.address - registers.read_block.address)
-        torque = self._format.torques(data[at : at + self._format.size])
+        if layout.magnet_at is not None:
+            byte, bit = layout.magnet_at
+            self._magnet = bool(data[byte] >> bit & 1)
+        torque = self._format.torques(data[layout.torques_at : layout.torques_at + self._format.size])
         try:
             self._device.command(self._client, torque, self._magnet, *basis, now_ns)
         except ModbusError:

@@ -55,7 +55,8 @@ class ControllerError(Exception):
 
 def connection_fault(error: BaseException, host: str, port: int) -> ControllerError:
     """Return the fault for an error while a connection was established."""
-    if isinstance(error, ConnectionRefusedError):
+    if isinstance(error, ConnectionRefusedError) or f"[Errno {errno.ECONNREFUSED}]" in str(error):
+        # The error of a host with several addresses has only the texts of their errors.
         text = f"connection refused: nothing listens on port {port}; start the controller's server, or correct its port"
         return ControllerError(FaultKind.REFUSED, text)
     if isinstance(error, ssl.SSLError):
@@ -73,8 +74,15 @@ def connection_fault(error: BaseException, host: str, port: int) -> ControllerEr
     return ControllerError(FaultKind.UNREACHABLE, f"no connection: {reason}; check address, cable and firewall")
 
 
-def closed_text(error: BaseException | None) -> str:
-    """Return a description of a lost connection; None: the controller closed it in order."""
+def closed_text(error: BaseException | None, responses: int = 0) -> str:
+    """Return a description of a lost connection.
+
+    Args:
+        error: None: the controller closed it in order.
+        responses: number of its responses.
+    """
+    if error is None and responses == 1:
+        return "the controller closed the connection after one response: configure it to keep connections open"
     if error is None:
         return "the controller closed the connection; it may accept one client only: disconnect other programs"
     if isinstance(error, ConnectionResetError | BrokenPipeError):

@@ -7,6 +7,7 @@ from hilrig_modbus_edge.client.exchange import ExchangeSettings
 from hilrig_modbus_edge.client.faults import ControllerError, FaultKind
 from hilrig_modbus_edge.client.tls_context import client_context
 from hilrig_modbus_edge.client.transactions import ControllerConnection
+from hilrig_runtime.timing.clock import SYSTEM_CLOCK
 
 
 def probe_controller(settings: ExchangeSettings) -> list[str]:
@@ -21,12 +22,14 @@ def probe_controller(settings: ExchangeSettings) -> list[str]:
 async def _probe(settings: ExchangeSettings) -> list[str]:
     context = None if settings.client.tls is None else client_context(settings.client.tls)
     registers, found = settings.registers, []
-    connection = ControllerConnection(settings.host, settings.port, settings.unit, settings.client, context)
+    connection = ControllerConnection(
+        settings.host, settings.port, settings.unit, settings.client, context, SYSTEM_CLOCK
+    )
     reads: list[Callable[[], Awaitable[object]]] = [
         lambda: connection.read_registers(registers.read_block, "torques"),
         lambda: connection.read_registers(registers.written_block, "positions"),
     ]
-    if (magnet := registers.magnet_block) is not None:
+    if (magnet := registers.separate_magnet_block) is not None:
         reads.append(lambda: connection.read_bit(magnet, "the magnet"))
     try:
         await connection.connect()

@@ -10,6 +10,7 @@ import ssl
 import struct
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from pymodbus.client import AsyncModbusTcpClient
@@ -21,6 +22,7 @@ from hilrig_modbus_edge.client.faults import ControllerError, FaultKind, closed_
 from hilrig_modbus_edge.protocol.functions import FunctionCode
 from hilrig_modbus_edge.protocol.mbap import Request, decode_frames, encode_frame
 from hilrig_runtime.config.controller import ClientConfig, RegisterBlock, Table
+from hilrig_runtime.timing.clock import Clock
 
 _READ: Final[dict[Table, FunctionCode]] = {
     "coil": FunctionCode.READ_COILS,
@@ -28,6 +30,12 @@ _READ: Final[dict[Table, FunctionCode]] = {
     "input": FunctionCode.READ_INPUT_REGISTERS,
     "holding": FunctionCode.READ_HOLDING_REGISTERS,
 }
+NEXT_ADDRESS_S: Final = 0.25
+"""Time after which the next address of a host is tried, too (RFC 8305), s."""
+_HEAD: Final = struct.Struct(">BHH")
+LogRequest = Callable[[bytes, int, int, int], None]
+"""Records a request: the first five bytes of its PDU, the times of sending and of the response (ns, monotonic clock),
+and the exception code or 0."""
 MAX_REMEMBERED_REQUESTS: Final = 16
 """Number of failed requests whose late responses are recognized."""
 
@@ -55,8 +63,11 @@ class _Transactions(TransactionManager):
         super().__init__(*arguments)
         self._unit = unit
         self._on_late = on_late
+        self._responses = 0
         self._failed: deque[int] = deque(maxlen=MAX_REMEMBERED_REQUESTS)
-        create = self.call_create
+        # A host may have several addresses, of which some do not answer. The function is asyncio's.
+        call_create: Any = self.call_create
+        create = partial(call_create, happy_eyeballs_delay=NEXT_ADDRESS_S)
 
         async def create_connection() -> Any:
             try:
@@ -75,7 +86,7 @@ class _Transactions(TransactionManager):
     def callback_disconnected(self, exc: Exception | None) -> None:
         """See `TransactionManager`: the connection was lost."""
         super().callback_disconnected(exc)
-        self._fail(ControllerError(FaultKind.CLOSED, closed_text(exc)))
+        self._fail(ControllerError(FaultKind.CLOSED, closed_text(exc, self._responses)))
 
     def callback_data(self, data: bytes, addr: tuple[str, int] | None = None) -> int:  # noqa: ARG002
         """See `TransactionManager`: bytes were received; pass on the valid response only."""
@@ -117,6 +128,7 @@ class _Transactions(TransactionManager):
             )
             return ControllerError(FaultKind.MALFORMED, text)
         self.expected = None
+        self._responses += 1
         super().callback_data(encode_frame(frame.transaction, frame.unit, pdu))
         return None
 
@@ -139,13 +151,18 @@ class ControllerConnection:
         unit: int,
         settings: ClientConfig,
         context: ssl.SSLContext | None,
+        clock: Clock,
+        *,
         on_late: Callable[[], None] = lambda: None,
+        log: LogRequest = lambda *_: None,
     ) -> None:
         # Failures are reported as events at a limited rate; pymodbus would log a line for each.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
         self._address = host, port
         self._unit = unit
         self._settings = settings
+        self._monotonic_ns = clock.monotonic_ns
+        self._log = log
         self._client = client = AsyncModbusTcpClient(host, port=port, reconnect_delay=0, retries=0)
         client.comm_params.sslctx = context
         self._timed_out = False
@@ -256,6 +273,7 @@ class ControllerConnection:
         if transactions.lost is not None:
             raise transactions.lost
         transactions.expected = expected
+        sent_ns = self._monotonic_ns()
         try:
             response = await request()
         except ModbusException:
@@ -265,6 +283,8 @@ class ControllerConnection:
         finally:
             transactions.expected = None
         self._timed_out = False
+        head = _HEAD.pack(expected.function, block.address, block.count)
+        self._log(head, sent_ns, self._monotonic_ns(), response.exception_code if response.isError() else 0)
         if response.isError():
             raise exception_fault(response.exception_code, expected.function, action, block)
         return response

@@ -26,6 +26,8 @@ class WrittenPositions:
         self._by_step: dict[int, _Write] = {}
         self._newest = _Write(NO_STATE, 0)
         """The newest acknowledged write."""
+        self._sent = self._newest
+        """The newest write that was sent."""
 
     @property
     def any_acknowledged(self) -> bool:
@@ -41,13 +43,13 @@ class WrittenPositions:
         """Add a write that is about to be sent; `served` has the state and the time of sending."""
         step = served[0][1] & STEP_MASK
         self._by_step.pop(step, None)
-        self._by_step[step] = _Write(served, 0)
+        self._sent = self._by_step[step] = _Write(served, 0)
         if len(self._by_step) > MAX_WRITES:
             del self._by_step[next(iter(self._by_step))]
 
     def acknowledge(self, served: ServedState, now_ns: int) -> None:
         """Record that this write was acknowledged; ns, monotonic clock."""
-        self._newest = self._by_step[served[0][1] & STEP_MASK] = _Write(served, now_ns)
+        self._newest = self._sent = self._by_step[served[0][1] & STEP_MASK] = _Write(served, now_ns)
 
     def basis_of_echo(
         self, echo: int, read_sent_ns: int, stale_read_sent_ns: int
@@ -68,5 +70,9 @@ class WrittenPositions:
         return write.served, PollTimes(acknowledged_ns, read_sent_ns, stale_ns, False)
 
     def newest_basis(self, read_sent_ns: int) -> tuple[ServedState, PollTimes]:
-        """Return the newest state that torques can answer that were read with a request sent at a time."""
-        return self._newest.served, PollTimes(self._newest.acknowledged_ns, read_sent_ns, 0, True)
+        """Return the newest state that torques can answer that are read with a request that is sent at a time.
+
+        The controller may have executed a write that it has not acknowledged.
+        """
+        write = self._sent
+        return write.served, PollTimes(write.acknowledged_ns or read_sent_ns, read_sent_ns, 0, True)

@@ -117,12 +117,14 @@ def print_report(report: "LatencyReport") -> None:
     for title in STATISTICS_TITLES:
         table.add_column(title, justify="right", no_wrap=True)
     if report.loop_ms is not None:
-        table.add_row("loop", *cells(report.loop_ms, report.intervals_ms["loop"]), style="bold", end_section=True)
+        values = cells(report.loop_ms, report.intervals_ms["loop"])
+        table.add_row(f"loop{report.qualifier}", *values, style="bold", end_section=True)
         for stage in report.stages:
             table.add_row(f"  {stage.title}", *cells(report.stages_ms[stage.key], report.intervals_ms[stage.key]))
         table.add_section()
     if report.age_ms is not None:
-        table.add_row("age", *cells(report.age_ms, report.intervals_ms["age"]), style="bold", end_section=True)
+        values = cells(report.age_ms, report.intervals_ms["age"])
+        table.add_row(f"age{report.qualifier}", *values, style="bold", end_section=True)
     table.add_row("tick lateness", *cells(report.jitter_ms.tick_lateness))
     console.print(table)
     jitter = f"jitter: std {report.jitter_ms.loop_std:.2f} ms, p99 − p1 {report.jitter_ms.loop_p99_p1:.2f} ms; "

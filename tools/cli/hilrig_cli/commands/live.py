@@ -40,7 +40,8 @@ def live(
     name = rig or lab.rigs[0].name
     stopping = stop_on_signals()
 
-    blueprint = layout(live=True)
+    client_role = any(each.name == name and each.controller is not None for each in lab.rigs)
+    blueprint = layout(live=True, client_role=client_role)
     with ExitStack() as closing:
         bus = closing.enter_context(ZenohBus(lab.bus, "tool"))
         check_rig(bus, lab, name)

@@ -28,7 +28,7 @@ from hilrig_replay.analysis.feedback import follows_positions, rounding_gains
 from hilrig_replay.analysis.intervals import Interval, percentile_intervals
 from hilrig_replay.analysis.network import NetworkShare, network_share
 from hilrig_replay.analysis.samples import CommandMatcher, SampleTable
-from hilrig_replay.analysis.stages import CLIENT_STAGES, CONTROLLER, LOOP_STAGES, Stage
+from hilrig_replay.analysis.stages import CONTROLLER, Stage, stages_of_role
 from hilrig_replay.geometry.scene import parameters_of
 from hilrig_replay.io.disk_table import Blocks
 from hilrig_replay.io.records import Records
@@ -84,9 +84,11 @@ class LatencyReport:
     edge."""
     device_scan: DeviceScan | None
     """Scan time of the controller's program in the client role; None: not measured."""
+    is_lower_bound: bool
+    """Whether loop latency and age are lower bounds: in the client role without an echo register."""
     older_positions: OlderPositions | None
-    """Estimate of the time by which the latency exceeds its bound in the client role without an echo register; None: it
-    is exact, or the torques do not show it."""
+    """Estimate of the mean time by which the latency exceeds that bound; None: it is exact, or the torques do not show
+    it."""
     network: NetworkShare | None
     """Share of the network in *controller*; None: not recorded."""
     jitter_ms: Jitter
@@ -111,7 +113,12 @@ class LatencyReport:
     @property
     def stages(self) -> tuple[Stage, ...]:
         """Stages of the loop in the role of the edge."""
-        return CLIENT_STAGES if self.client_role else LOOP_STAGES
+        return stages_of_role(self.client_role)
+
+    @property
+    def qualifier(self) -> str:
+        """What follows the names of loop latency and age in texts: whether they are lower bounds."""
+        return ", at least" if self.is_lower_bound else ""
 
     def notes(self) -> list[str]:
         """Sentences on holding times, provenance and limits of the figures, for tables and reports."""
@@ -198,25 +205,25 @@ def measure(
     windows = windows_of(run)
     other_connection = _share(table, "basis_on_other_connection") >= 0.5
     client_role = _share(table, "polled") >= 0.5
-    role_stages = CLIENT_STAGES if client_role else LOOP_STAGES
     open_loop = other_connection and not follows_positions((window.states, window.commands) for window in windows)
     if open_loop:
         # The basis of the commands is not their basis.
         table, age = SampleTable(), None
     if len(table):
         loop = Statistics.of(table.column("loop"))
-        stages = {stage.key: Statistics.of(table.column(stage.key)) for stage in role_stages}
+        stages = {stage.key: Statistics.of(table.column(stage.key)) for stage in stages_of_role(client_role)}
         low, high = percentiles(table.column("loop"), (1, 99)) / 1e6
         spread = float(high - low)
         intervals = {name: _intervals_ms(table.column(name)) for name in ("loop", *stages)}
     if age is not None:
         intervals["age"] = _intervals_ms(ages.ages_ns)
-    stalled = edge_stalls(quality.edge_stalls, table, windows, run.time_ns)
+    # In the client role the requests are those of the edge, whose answers wait for the controller.
+    stalled = edge_stalls(quality.edge_stalls, table, () if client_role else windows, run.time_ns)
     reasons = tuple(quality.reasons(matcher.unmatched, loop, age, stalled))
     if open_loop:
         reasons = (*(reason for reason in reasons if reason not in NO_SAMPLES), OPEN_LOOP)
-    is_bound = _share(table, "basis_is_bound") > 0
-    if is_bound:
+    is_lower_bound = _share(table, "basis_is_bound") > 0
+    if is_lower_bound:
         reasons = (*reasons, NO_ECHO)
     network = network_share(windows, stages[CONTROLLER.key].p50 if CONTROLLER.key in stages else None)
     evidence = Evidence(
@@ -254,7 +261,12 @@ def measure(
         read_on_other_connection=other_connection,
         kernel_timestamps=_kernel_timestamps(table),
         device_scan=device_scan(np.concatenate([window.commands for window in windows])),
-        older_positions=older_positions(evidence.gains, run.step_ns) if is_bound else None,
+        is_lower_bound=is_lower_bound,
+        older_positions=(
+            older_positions((window.commands for window in windows), evidence.gains, run.step_ns)
+            if is_lower_bound
+            else None
+        ),
         network=network,
         jitter_ms=Jitter(loop.std if loop else 0.0, spread, quality.lateness()),
         lost=quality.lost(),

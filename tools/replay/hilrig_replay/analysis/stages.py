@@ -127,6 +127,11 @@ ALL_STAGES: Final = (*LOOP_STAGES, *_POLLED_STAGES)
 """The stages of both roles."""
 
 
+def stages_of_role(client_role: bool) -> tuple[Stage, ...]:
+    """Return the stages in a role of the edge: as the client of the controller, or as its server."""
+    return CLIENT_STAGES if client_role else LOOP_STAGES
+
+
 def fill_stages(samples: NDArray[np.void], stages: Sequence[Stage], states: Rows, commands: Rows) -> None:
     """Compute the stages of samples whose `loop` is set, from their states and commands, row by row.
 

@@ -16,6 +16,8 @@ COLOR_NAMES: Final = {
     "#b279a2": "purple",
     "#72b7b2": "teal",
     "#e45756": "red",
+    "#eeca3b": "yellow",
+    "#ff9da6": "pink",
 }
 """Names of the colors of joints and stages, for legends in words."""
 PALE_JOINT_COLORS: Final = ("#9db7d5", "#f9c58b", "#a4cf9d", "#d3b3ca")

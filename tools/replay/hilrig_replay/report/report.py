@@ -266,13 +266,13 @@ def _facts(page: _Page) -> str:
         error = summary.placement.largest_error_mm
         within = "none placed" if error is None else f"largest error {error:.1f} mm"
         facts.append((f"{summary.placement.placed} of {len(summary.placement.parts)}", f"parts placed; {within}"))
-    loop = summary.latency.loop_ms
+    loop, qualifier = summary.latency.loop_ms, summary.latency.qualifier
     if loop is None:
         facts.append(("–", f"loop latency: {summary.latency.reasons[-1].text}"))
     else:
-        facts.append((f"{loop.p50:.1f} ms", f"loop latency p50; p99 {loop.p99:.1f} ms"))
+        facts.append((f"{loop.p50:.1f} ms", f"loop latency p50{qualifier}; p99 {loop.p99:.1f} ms"))
     if (age := summary.latency.age_ms) is not None:
-        facts.append((f"{age.p50:.1f} ms", f"age of the acting torque p50; p99 {age.p99:.1f} ms"))
+        facts.append((f"{age.p50:.1f} ms", f"age of the acting torque p50{qualifier}; p99 {age.p99:.1f} ms"))
     facts.append((f"{summary.motion.tool_path_m:.2f} m", f"tool path; top speed {summary.motion.top_speed:.2f} m/s"))
     facts.append((f"{summary.motion.work_j:.1f} J", "drive work"))
     if page.verified is not None:
@@ -313,10 +313,10 @@ def _latency(summary: RunSummary) -> str:
     rows = []
     if latency.loop_ms is not None:
         known = latency.intervals_ms
-        rows.append(["loop", *cells(latency.loop_ms, known["loop"])])
+        rows.append([f"loop{latency.qualifier}", *cells(latency.loop_ms, known["loop"])])
         rows += [[stage.title, *cells(latency.stages_ms[stage.key], known[stage.key])] for stage in latency.stages]
     if latency.age_ms is not None:
-        rows.append(["age", *cells(latency.age_ms, latency.intervals_ms["age"])])
+        rows.append([f"age{latency.qualifier}", *cells(latency.age_ms, latency.intervals_ms["age"])])
     rows.append(["tick lateness", *cells(latency.jitter_ms.tick_lateness)])
     verdict = (
         '<p class="good">Valid for latency measurements.</p>'

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind as _Kind
 
-from hilrig_replay.analysis.stages import LOOP_STAGES
+from hilrig_replay.analysis.stages import stages_of_role
 from hilrig_replay.plots.palette import EFFORT_SYMBOLS, JOINT_COLORS, JOINT_SYMBOLS, legend_in_words
 from hilrig_replay.rerun_view import entity_paths as paths
 from hilrig_replay.rerun_view.entity_paths import arm_path, entity_path
@@ -24,18 +24,25 @@ LIVE_WINDOW_S: Final = 20.0
 """Time range of the plots of a running rig, s."""
 _JOINTS: Final = legend_in_words(JOINT_SYMBOLS, JOINT_COLORS)
 _EFFORTS: Final = legend_in_words(EFFORT_SYMBOLS, JOINT_COLORS)
-_STAGES: Final = legend_in_words([one.title for one in LOOP_STAGES], [one.color for one in LOOP_STAGES])
 _CAMERA_POSITION: Final = (0.80, -0.72, 0.50)
 _CAMERA_TARGET: Final = (0.14, 0.02, 0.02)
 _BACKGROUND: Final = (24, 28, 33)
 
 
 def layout(
-    roots: Sequence[str] = ("",), *, live: bool = False, ranges: Mapping[str, Range] = MappingProxyType({})
+    roots: Sequence[str] = ("",),
+    *,
+    live: bool = False,
+    client_role: bool = False,
+    ranges: Mapping[str, Range] = MappingProxyType({}),
 ) -> rrb.Blueprint:
     """Blueprint for the rigs under the entity paths `roots`: one scene with all arms, and common plots.
 
-    `ranges`: of value axes, by the path of the first entity of a plot; the others are chosen by the viewer.
+    Args:
+        roots: root paths of the rigs.
+        live: whether they run now.
+        client_role: whether the only rig is the client of its controller.
+        ranges: of value axes, by the path of the first entity of a plot; the others are chosen by the viewer.
     """
     trail = [
         rrb.VisibleTimeRange(
@@ -89,14 +96,17 @@ def layout(
             contents=[f"+ {entity_path(root, paths.STATES)}/**" for root in roots],
         ),
     )
-    single = len(roots) == 1
+    single, stages = len(roots) == 1, stages_of_role(client_role)
     plots = rrb.Vertical(
         # Legends are in the titles: a box in a plot covers curves. Of several runs, color identifies the run, and the
         # box in the first plot names them.
         plot(f"Positions: {_JOINTS if single else 'θ'} (°; d3 mm)", paths.POSITION, legend=not single),
         plot("Velocities (°/s; d3 mm/s) and events", paths.VELOCITY, paths.EVENT_MARKERS),
         plot(f"Efforts: {_EFFORTS if single else 'τ'} (N·m; τ3 N; thin: commanded)", paths.EFFORT),
-        plot(f"Latency, ms: {_STAGES}", paths.LATENCY_STAGES)
+        plot(
+            f"Latency, ms: {legend_in_words([one.title for one in stages], [one.color for one in stages])}",
+            paths.LATENCY_STAGES,
+        )
         if single
         else plot("Loop latency, ms", paths.LOOP_LATENCY),
         rrb.Tabs(

@@ -20,7 +20,7 @@ from rerun.urdf import UrdfTree
 from hilrig_replay.analysis.age import AgeTracker
 from hilrig_replay.analysis.data_quality import tick_lateness_ns
 from hilrig_replay.analysis.samples import CommandMatcher, join_commands
-from hilrig_replay.analysis.stages import LOOP_STAGES
+from hilrig_replay.analysis.stages import Stage, stages_of_role
 from hilrig_replay.geometry.quaternion import about_z
 from hilrig_replay.geometry.scene import ArmGeometry, parameters_of, parse_arm, tool_positions, workspace_outline
 from hilrig_replay.io.columns import Rows, StringTable
@@ -110,6 +110,10 @@ class RerunRigWriter:
         self._source_colors = {_SAFE: "#e45756", _NO_CONTROLLER: "#3a424c"}
         self._rates = RequestRates(names)
         self._known_clients: set[str] = set()
+        self.client_role = False
+        """Whether the edge is the client of the controller; known with the first loop latency."""
+        self._stages: tuple[Stage, ...] = ()
+        """Stages of the role; empty: not known yet."""
         self._last_tip: NDArray[np.float64] | None = None
         self._known_parts: set[str] = set()
         self._known_event_kinds: set[str] = set()
@@ -199,9 +203,6 @@ class RerunRigWriter:
         self._legend(paths.VELOCITY, JOINT_SYMBOLS, JOINT_COLORS)
         self._legend(paths.COMMANDED_EFFORT, [f"{name} commanded" for name in EFFORT_SYMBOLS], PALE_JOINT_COLORS, 0.8)
         self._legend(paths.APPLIED_EFFORT, [f"{name} applied" for name in EFFORT_SYMBOLS], JOINT_COLORS)
-        ends = ["state sampled", *(f"+ {stage.title}" for stage in LOOP_STAGES)]
-        ends[-1] += " = loop"
-        self._legend(paths.LATENCY_STAGES, ends, [_BASELINE_COLOR, *(stage.color for stage in LOOP_STAGES)])
         self._legend(paths.LOOP_LATENCY, ["loop latency"], ["#e0e4e8"])
         self._state_legend("magnet", {"on": "#e45756", "off": "#3a424c"})
         self._state_legend("part", {part.name: part.colour for part in self._geometry.parameters.scene.parts})
@@ -306,7 +307,13 @@ class RerunRigWriter:
     def _add_latency(self, samples: Rows) -> None:
         times = self._times(samples)
         self._scalars(paths.LOOP_LATENCY, times, samples["loop"][:, None] / 1e6)
-        ends = np.cumsum(np.stack([samples[stage.key] for stage in LOOP_STAGES], axis=1), axis=1) / 1e6
+        if not self._stages:
+            self.client_role = bool(samples["polled"].mean() >= 0.5)
+            self._stages = stages_of_role(self.client_role)
+            names = ["state sampled", *(f"+ {stage.title}" for stage in self._stages)]
+            names[-1] += " = loop"
+            self._legend(paths.LATENCY_STAGES, names, [_BASELINE_COLOR, *(stage.color for stage in self._stages)])
+        ends = np.cumsum(np.stack([samples[stage.key] for stage in self._stages], axis=1), axis=1) / 1e6
         self._scalars(paths.LATENCY_STAGES, times, np.hstack((np.zeros((len(ends), 1)), ends)))
 
     def _add_rates(self, rates: Iterable[Rate]) -> None:

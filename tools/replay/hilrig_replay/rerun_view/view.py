@@ -75,9 +75,9 @@ def _write(
 
     rerun encodes and writes on its own threads and holds every block that is not written yet. A file is flushed after
     each block, so the memory depends neither on the length of the run nor on the scheduling of these threads. A viewer
-    is not flushed, because it may close at any time. The ranges of the plots are known at the end.
+    is not flushed, because it may close at any time. The ranges of the plots and the role are known at the end.
     """
-    ranges = ValueRanges()
+    ranges, client_role = ValueRanges(), False
     with stream:
         for number, (run, root) in enumerate(zip(runs, root_names(runs), strict=True)):
             color = None if len(runs) == 1 else RUN_COLORS[number % len(RUN_COLORS)]
@@ -90,5 +90,6 @@ def _write(
                 if file is not None:
                     flush_file(stream, file)
             view.end()
-        stream.send_blueprint(layout(root_names(runs), ranges=ranges.ranges()))
+            client_role = view.client_role
+        stream.send_blueprint(layout(root_names(runs), client_role=client_role, ranges=ranges.ranges()))
     stream.disconnect()
