@@ -146,7 +146,7 @@ def test_viewer_cannot_release_a_lease_on_the_secured_bus(secured_lab: RunningLa
             shutil.copy(tmp_path / "certs/bus" / name, viewers / "certs/bus" / name)
         refused = hilrig("lease", "rig1", "--release", "-c", secured_lab.config, cwd=viewers)
         assert refused.returncode == 3
-        assert "this host has only the viewer certificate; a lease request needs operator" in refused.stderr
+        assert "this host has only the viewer certificate; lease requests need operator" in refused.stderr
         assert not client.write_registers(0, [0, 0, 0, 0]).isError()
     assert eventually(lambda: secured_lab.recordings)
 

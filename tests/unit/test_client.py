@@ -7,9 +7,9 @@ from hilrig_cli.client import check_rig
 from hilrig_runtime.bus.api import Reply
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
-from hilrig_runtime.errors import InputError
-from hilrig_schemas import ServiceInfo
-from hilrig_schemas.topics import SERVICE_INFO
+from hilrig_runtime.errors import InputError, OperationError
+from hilrig_schemas import LeaseRequest, ServiceInfo
+from hilrig_schemas.topics import LEASE, SERVICE_INFO
 
 LAB = parse_lab("[rigs]\ncount = 3\n")
 
@@ -89,3 +89,13 @@ def test_error_lists_some_of_many_rigs() -> None:
     bus = CountingBus(info("sim", "1", *rigs), info("edge", "1", *rigs))
     with pytest.raises(InputError, match=r"rig1, .* and 112 more \(hilrig rig list\)$"):
         check_rig(bus, lab, "rig129")
+
+
+def test_unanswered_command_names_the_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mesh looks empty to a command whose certificate has expired."""
+    monkeypatch.setattr(client, "QUERY_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(client, "ZenohBus", lambda *_: MemoryBus(MemoryHub()))
+    monkeypatch.setattr(client, "check_permission", lambda *_: None)
+    for text, expected in (("", "with this lab.toml?"), ("[bus.tls]\n", "valid certificates in .*bus?")):
+        with pytest.raises(OperationError, match=f"no edge answers .*{expected}.* See hilrig doctor"):
+            client.query_edges(parse_lab(text), LEASE, [], LeaseRequest())

@@ -139,4 +139,4 @@ def test_invalid_lease_reply_is_an_error(monkeypatch: pytest.MonkeyPatch, reply:
     bus = replying(topics.LEASE.key(LAB.name, "rig1"), reply.SerializeToString())
     monkeypatch.setattr(client, "ZenohBus", lambda *_: bus)
     with pytest.raises(OperationError, match=r"an edge sent an invalid reply: (message of rig|watchdog_timeout_ns is)"):
-        client.query_edges(LAB, topics.LEASE, "rig1", LeaseRequest())
+        client.query_edges(LAB, topics.LEASE, ["rig1"], LeaseRequest())

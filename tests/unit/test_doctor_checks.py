@@ -148,8 +148,11 @@ def test_modbus_certificate_of_the_edge_is_checked(tmp_path: Path) -> None:
 def test_port_used_by_another_program_is_an_error() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as other:
         port = other.getsockname()[1]
-        text = only_error(host.check_ports(parse_lab(f"[edge]\nfirst_port = {port}"), set()))
+        lab = parse_lab(f"[edge]\nfirst_port = {port}")
+        text = only_error(host.check_ports(lab, set()))
+        stopped = list(host.check_ports(lab, set(), is_edge_stopped=True))
     assert f"rig 'rig1': 127.0.0.1:{port} is unavailable" in text
+    assert by_level(stopped)[Level.ERROR] == [], "a stopped edge has its ports"
 
 
 def test_rigs_without_access_control_are_a_warning() -> None:
@@ -262,6 +265,9 @@ def test_running_process_of_this_host_is_not_to_be_restarted(is_alive: bool) -> 
     [error] = [one for one in services.check_services(parse_lab(ROUTED), found, local) if one.level is Level.ERROR]
     assert "4711" in error.text + error.fix
     assert "do not restart it" in error.fix
+    secured = parse_lab("[bus.tls]\n")
+    [error] = [one for one in services.check_services(secured, snapshot("edge/1", "recorder/1"), local) if one.fix]
+    assert error.fix.endswith("check the certificates below"), "only a valid certificate is answered in a mesh"
 
 
 @pytest.mark.parametrize(
@@ -284,6 +290,41 @@ def test_router_link_and_services_are_told_apart(
     assert results[0].fix.startswith(advice)
     assert results[1].fix == "do not restart it: it continues when the router answers"
     assert results[2].fix == "continue it: kill -CONT 4712"
+
+
+def two_edges(*, is_west_alive: bool) -> services.BusSnapshot:
+    names = ("sim/1", "edge/east", "recorder/1") + ("edge/west",) * is_west_alive
+    found = snapshot(*names)
+    served = {"sim/1": ["rig1", "rig2"], "edge/east": ["rig1"], "edge/west": ["rig2"]}
+    for name in set(served) & set(names):
+        for rig in served[name]:
+            found.healths[name].rig_reports.add(rig=rig)
+    found.healths["recorder/1"].peers.add(service="edge/west", host="left", silent_ns=12_300_000_000)
+    return found
+
+
+def test_lost_instance_of_several_is_an_error() -> None:
+    lab = parse_lab(f"{ROUTED}[rigs]\ncount = 3\n")
+    # Rig 3 was removed from the running lab.
+    assert by_level(services.check_services(lab, two_edges(is_west_alive=True)))[Level.ERROR] == []
+    lost = two_edges(is_west_alive=False)
+    [error] = [one for one in services.check_services(lab, lost) if one.level is Level.ERROR]
+    assert error.text == (
+        "not connected: edge of rig2; edge/west on left: recorder/1 received its last message 12.3 s ago"
+    )
+    assert error.fix.startswith("run hilrig doctor on left first")
+    assert "hilrig edge --instance NAME --rigs rig2" in error.fix
+
+
+def test_stopped_instance_of_several_is_to_be_continued() -> None:
+    lab = parse_lab(f"{ROUTED}[rigs]\ncount = 2\n")
+    local = [LocalProcess("edge", 1, is_stopped=False, instance="east"), LocalProcess("edge", 2, True, "west")]
+    for is_alive in (True, False):
+        found = two_edges(is_west_alive=is_alive)
+        found.healths.pop("edge/west", None)
+        [error] = [one for one in services.check_services(lab, found, local) if one.level is Level.ERROR]
+        assert "edge/west on this host is stopped" in error.text
+        assert error.fix == "continue it: kill -CONT 2"
 
 
 def test_denied_realtime_policy_is_a_warning_with_a_fix() -> None:

@@ -177,6 +177,20 @@ def test_reports_of_rigs_of_another_certificate_are_ignored() -> None:
     assert second.loops_us == [], "the simulation reports latencies"
 
 
+def test_kind_of_service_without_a_report_is_an_alert() -> None:
+    """It was stopped, killed or cut off before the view was opened."""
+    made = LabView(("rig1",))
+    observer = edge()
+    observer.peers.add(service="sim/1", host="lab-pc", silent_ns=12_000_000_000)
+    made.update(observer, 1.0)
+    assert made.alerts(1.0) == [], "the others report within a second"
+    made.update(observer, 3.0)
+    assert made.alerts(3.0) == [
+        "no sim reports: run hilrig doctor; edge/east received the last message of sim/1 12 s ago",
+        "no recorder reports: run hilrig doctor",
+    ]
+
+
 def test_services_are_bounded() -> None:
     made = LabView()
     for number in range(MAX_SERVICES + 9):

@@ -52,7 +52,7 @@ def test_json_log_is_one_object_per_line(monkeypatch: pytest.MonkeyPatch, capsys
     assert (entry["service"], entry["level"], entry["message"]) == ("up", "WARNING", "two\nlines")
 
 
-@pytest.mark.parametrize("command", ["up", "edge"])
+@pytest.mark.parametrize("command", ["up", "edge", "router", "metrics", "console"])
 def test_final_errors_are_json_too(tmp_path: Path, command: str) -> None:
     (tmp_path / "lab.toml").write_text("[sim]\nstep = 1\n[edge]\nhots = 2\n")
     done = hilrig(command, "--log-format", "json", "--config", tmp_path / "lab.toml")

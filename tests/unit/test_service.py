@@ -124,6 +124,17 @@ def test_health_report_has_the_last_messages_of_others() -> None:
     assert (peer.service, peer.host, peer.silent_ns) == ("sim/1", platform.node(), 3_000_000_000)
 
 
+def test_repeated_stalls_are_logged_every_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
+    clock = ManualClock()
+    with make_service(MemoryHub(), clock) as service:
+        service.ready()
+        for _ in range(25):
+            clock.advance(1_000_000_000)
+            service.beat(clock.monotonic_ns())
+    assert len(caplog.messages) == 3
+    assert caplog.messages[1].endswith("overloaded (10 times)")
+
+
 def test_stall_of_a_service_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     clock = ManualClock()
     with make_service(MemoryHub(), clock) as service:

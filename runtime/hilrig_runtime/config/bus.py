@@ -51,6 +51,12 @@ class BusConfig(Section):
         """Host name or address in the endpoint of the router."""
         return self.router.partition("/")[2].partition("?")[0].rpartition(":")[0].strip("[]")
 
+    @property
+    def no_answer_hint(self) -> str:
+        """What to check if no service answers; without a valid certificate a mesh looks empty."""
+        valid = "" if self.tls is None else f", and with valid certificates in {self.tls.folder}"
+        return f"is it running (hilrig up), with this lab.toml{valid}? See hilrig doctor"
+
     def may_serve(self, source: str, rig: str) -> bool:
         """Return whether a service, "<service>/<instance>", may publish for a rig according to its certificate."""
         service, _, instance = source.partition("/")

@@ -1,5 +1,6 @@
 """Runs the zenoh router of a lab: the router embedded in the zenoh library, with the lab's access rules."""
 
+from collections.abc import Callable
 from contextlib import closing
 
 import zenoh
@@ -26,8 +27,8 @@ def router_endpoint(lab: LabConfig, listen: str) -> str:
     return endpoint
 
 
-def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -> None:
-    """Run the lab's router until it is stopped; `listen` as in `router_endpoint`.
+def run_router(lab: LabConfig, listen: str, announce: Callable[[str], None], *, stop_with_parent: bool = False) -> None:
+    """Run the lab's router until it is stopped; `listen` as in `router_endpoint`, which is announced.
 
     Raises:
         InputError: as `router_endpoint`, or a certificate is missing.
@@ -45,5 +46,5 @@ def run_router(lab: LabConfig, listen: str, *, stop_with_parent: bool = False) -
             "or choose another --listen"
         ) from error
     with closing(session), session.liveliness().declare_token(alive_key(lab.name, ROUTER, "1")):
-        print(f"router of lab {lab.name!r} at {endpoint}", flush=True)
+        announce(f"router of lab {lab.name!r} at {endpoint}")
         wait_for(stopping)

@@ -27,12 +27,15 @@ from hilrig_runtime.process.event_log import EventLog
 from hilrig_runtime.process.health import HealthReporter
 from hilrig_runtime.process.outage import STALL_NS
 from hilrig_runtime.timing.clock import SYSTEM_CLOCK, Clock
+from hilrig_runtime.timing.rate_limiter import RateLimiter, repeat_suffix
 from hilrig_schemas import Event, PeerReport, RigBatch, ServiceInfo
 from hilrig_schemas.topics import EVENT, HEALTH, LOG, RigTopic, ServiceTopic, alive_key, source_of_key
 
 MessageT = TypeVar("MessageT", bound=Message)
 EXTRA_QUEUED_BATCHES: Final = 64
 """Capacity of the queue of received batches beyond one batch per rig."""
+STALL_LOG_PERIOD_NS: Final = 10_000_000_000
+"""Shortest time between two log messages about stalls, ns: on an overloaded host each second has one."""
 
 logger = logging.getLogger(__name__)
 
@@ -79,6 +82,7 @@ class Service(Handle):
         self._event_log = EventLog()
         self._closing.callback(self._event_log.flush)
         self._beat_ns = clock.monotonic_ns()
+        self._stalls: RateLimiter[None] = RateLimiter(STALL_LOG_PERIOD_NS)
         self._token: Handle | None = None
         self._failure = ""
         info = ServiceInfo(service=name, instance=instance, incarnation=self.incarnation)
@@ -179,8 +183,10 @@ class Service(Handle):
     def beat(self, now_ns: int) -> None:
         """Once per tick: publish the recording batch and the health report if due; `now_ns`: monotonic clock."""
         if self._token is not None and now_ns - self._beat_ns > STALL_NS:
-            text = "stalled for %.1f s until now: this process was stopped, or its host was overloaded"
-            logger.warning(text, (now_ns - self._beat_ns) / 1e9)
+            count = self._stalls.record(None, now_ns)
+            if count:
+                text = "stalled for %.1f s until now: this process was stopped, or its host was overloaded%s"
+                logger.warning(text, (now_ns - self._beat_ns) / 1e9, repeat_suffix(count))
         self._beat_ns = now_ns
         self._event_log.flush_if_due(now_ns)
         self.recording_stream.flush_if_due(now_ns)

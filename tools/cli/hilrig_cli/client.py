@@ -54,12 +54,12 @@ def query_edges(lab: LabConfig, topic: RigTopic[MessageT], rigs: Sequence[str], 
                 time.sleep(0.05)
             if not found:
                 rest = f"rig {rig!r}" if rigs else f"lab {lab.name!r}"
-                raise OperationError(f"no edge answers for {rest}: is it running (hilrig up), with this lab.toml?")
+                raise OperationError(f"no edge answers for {rest}: {lab.bus.no_answer_hint}")
             replies += found
-    if refused := [f"rig {parse_rig_key(reply.key).rig!r}: {reply.error}" for reply in replies if reply.error]:
-        raise OperationError(f"the edge refused: {'; '.join(refused)}")
     positions = {rig.name: position for position, rig in enumerate(lab.rigs)}
     try:
+        if refused := [f"rig {parse_rig_key(reply.key).rig!r}: {reply.error}" for reply in replies if reply.error]:
+            raise OperationError(f"the edge refused: {'; '.join(refused)}")
         by_rig = {parse_rig_key(reply.key).rig: topic.decode_from(reply.key, reply.payload) for reply in replies}
     except (DecodeError, ValueError) as error:
         raise _invalid_reply("an edge", error) from error
@@ -75,7 +75,7 @@ def check_permission(lab: LabConfig, topic: Topic[Any]) -> None:
     role = "operator" if lab.bus.tls is None else own_identity(lab.bus.tls, "tool")
     if role not in RULES[topic.name].subscribers:
         raise OperationError(
-            f"this host has only the {role} certificate; a {topic.name} request needs operator: copy operator.pem and "
+            f"this host has only the {role} certificate; {topic.name} requests need operator: copy operator.pem and "
             f"operator.key into bus.tls.folder, or run the command on a host that has them"
         )
 

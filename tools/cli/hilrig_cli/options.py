@@ -1,6 +1,9 @@
 """Options and texts that several commands share."""
 
+import logging
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -43,6 +46,11 @@ def check_rigs(rigs: list[str] | None, every: bool, command: str) -> None:
 def log(line: str) -> None:
     """Print a message of a running command on standard error."""
     print(f"hilrig: {line}", file=sys.stderr, flush=True)
+
+
+def announcer(log_format: str) -> Callable[[str], None]:
+    """Return the function with which a command announces its address: it prints text, or logs one JSON object."""
+    return partial(print, flush=True) if log_format == "text" else logging.getLogger(__name__).info
 
 
 def format_size(size: float) -> str:

@@ -5,16 +5,19 @@ holder, the recorder the rigs that it records. No I/O: reports and time are pass
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from hilrig_schemas import Health
+from hilrig_schemas.topics import SERVICES
 
 WINDOW_S: Final = 10.0
 """Window of the percentiles of loop latency and age."""
 SILENT_AFTER_S: Final = 3.5
 """Time without a report after which a service is shown as silent and its rig reports are discarded."""
+MISSING_AFTER_S: Final = 1.5
+"""Time after the first report of any service after which a kind of service without a report is missing."""
 MAX_SERVICES: Final = 256
 """Maximum number of services; the reports of others are ignored."""
 MAX_RIG_ALERTS: Final = 8
@@ -108,12 +111,15 @@ class LabView:
         self._rigs = rigs
         self._may_serve = may_serve
         self._services: dict[str, ServiceStatus] = {}
+        self._first_s: float | None = None
+        """Time of the first report."""
         self._loops: dict[str, deque[tuple[float, tuple[int, ...], tuple[int, ...]]]] = {}
         """By rig: times of the reports within the window, with loop latencies and ages, µs."""
 
     def update(self, health: Health, now_s: float) -> None:
         """Update the status with a report that arrived at `now_s`."""
         self._evict(now_s)
+        self._first_s = now_s if self._first_s is None else self._first_s
         status = ServiceStatus(health, now_s)
         before = self._services.get(status.name)
         if before is None and len(self._services) >= MAX_SERVICES:
@@ -178,8 +184,8 @@ class LabView:
         return list(found.values())
 
     def alerts(self, now_s: float) -> list[str]:
-        """Alerts for the operator: silent services, and the alerts of services and rigs, one line each."""
-        found = []
+        """Alerts for the operator: missing and silent services, alerts of services and rigs, one line each."""
+        found = list(self._missing(now_s))
         for service in self.services():
             health = service.health
             if self.is_silent(service, now_s):
@@ -191,6 +197,20 @@ class LabView:
         if len(rigs) > MAX_RIG_ALERTS:
             found.append(f"{len(rigs) - MAX_RIG_ALERTS} more rigs have such alerts")
         return found
+
+    def _missing(self, now_s: float) -> Iterator[str]:
+        """Yield each kind of service that never reported to this view, with the observations of the others."""
+        if self._first_s is None or now_s - self._first_s < MISSING_AFTER_S:
+            return
+        kinds = {service.health.service for service in self._services.values()}
+        for kind in [kind for kind in SERVICES if kind not in kinds]:
+            seen = [
+                f"{observer.name} received the last message of {peer.service} {peer.silent_ns / 1e9:.0f} s ago"
+                for observer in self.services()
+                for peer in observer.health.peers
+                if peer.service.startswith(f"{kind}/") and peer.silent_ns
+            ]
+            yield "; ".join([f"no {kind} reports: run hilrig doctor", *seen[:1]])
 
     def as_dict(self, now_s: float) -> dict[str, Any]:
         """The status as plain values, for JSON; times in ms, None if unknown."""

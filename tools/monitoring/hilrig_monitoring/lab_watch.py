@@ -12,7 +12,7 @@ from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.errors import OperationError
 from hilrig_runtime.process.discovery import list_services
-from hilrig_schemas.topics import HEALTH
+from hilrig_schemas.topics import HEALTH, SERVICES
 
 FIRST_REPORTS_TIMEOUT_S: Final = 3.0
 """Timeout for the first reports: the time to set up the links, and one report period of 1 s."""
@@ -30,7 +30,7 @@ class LabWatch(Handle):
         self._bus.subscribe(HEALTH.key(lab.name, "*", "*"), self._on_health)
 
     def wait(self) -> None:
-        """Wait until every running service has reported twice, so that its CPU usage is known.
+        """Wait until every service has reported twice, so that its CPU usage is known, or until the timeout.
 
         Raises:
             OperationError: no service has reported.
@@ -38,15 +38,15 @@ class LabWatch(Handle):
         deadline_s = time.monotonic() + FIRST_REPORTS_TIMEOUT_S
         while time.monotonic() < deadline_s:
             expected = {f"{info.service}/{info.instance}" for info in list_services(self._bus, self.lab)}
+            # A stopped service does not answer.
+            is_complete = {name.partition("/")[0] for name in expected}.issuperset(SERVICES)
             with self.lock:
-                if expected and all(self._report_counts.get(name, 0) > 1 for name in expected):
+                if is_complete and all(self._report_counts.get(name, 0) > 1 for name in expected):
                     return
             time.sleep(0.1)
         with self.lock:
             if not self.view.services():
-                raise OperationError(
-                    f"no service of lab {self.lab.name!r} found: is it running (hilrig up), with this lab.toml?"
-                )
+                raise OperationError(f"no service of lab {self.lab.name!r} found: {self.lab.bus.no_answer_hint}")
 
     def _on_health(self, key: str, payload: bytes) -> None:
         try:

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from hilrig_cli.options import Config, log
+from hilrig_cli.commands.services import LogFormat
+from hilrig_cli.options import Config, announcer
 
 
 def console(
@@ -30,11 +31,13 @@ def console(
     check: Annotated[
         bool, typer.Option("--check", help="Check that the console at --listen responds; for container health checks.")
     ] = False,
+    log_format: LogFormat = "text",
 ) -> None:
     """Serve a web console until Ctrl-C: every rig live, services, events, recordings with their reports.
 
     The console is read-only: it cannot change the bus or a rig.
     """
+    import logging
     import platform
     import secrets
 
@@ -43,6 +46,7 @@ def console(
     from hilrig_runtime.config.lab import load_lab
     from hilrig_runtime.errors import InputError
     from hilrig_runtime.listen_address import ListenAddress
+    from hilrig_runtime.process.logging_setup import start_logging
     from hilrig_runtime.process.shutdown import force_exit_after, stop_on_signals, wait_for
     from hilrig_runtime.timing.realtime import lower_priority
 
@@ -53,6 +57,8 @@ def console(
     if check:
         check_health(address, tls)
         return
+    start_logging("console", "1", log_format)
+    say = announcer(log_format)
     lab = load_lab(config)
     password = _password(password_file) if password_file is not None else ""
     generated = not password and not address.is_loopback
@@ -64,11 +70,11 @@ def console(
     stopping = stop_on_signals()
     force_exit_after(stopping, 8.0)
     with server:
-        print(f"console of lab {lab.name}: {server.urls}", flush=True)
+        say(f"console of lab {lab.name}: {server.urls}")
         if generated:
-            print(f"password: {password} (any user name)", flush=True)
+            say(f"password: {password} (any user name)")
         if tls is None and not address.is_loopback:
-            log("warning: without --certificate and --key the password is sent unencrypted")
+            logging.getLogger(__name__).warning("without --certificate and --key the password is sent unencrypted")
         wait_for(stopping)
 
 

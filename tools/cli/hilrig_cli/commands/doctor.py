@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from hilrig_runtime.config.lab import LabConfig
 
 
+_SERVICE_FIX = "run hilrig doctor on its host: it tells a stopped process, a dead one and a cut link apart"
+
+
 def doctor(
     config: Config = None,
     service: Annotated[
@@ -68,7 +71,8 @@ def _check_all(lab: "LabConfig") -> "list[CheckResult]":
     results += services.check_clocks(snapshot.clocks)
     if lab.bus.tls is not None or lab.edge.tls is not None:
         results += _check_certificates(lab)
-    results += host.check_ports(lab, snapshot.services)
+    is_edge_stopped = any(one.service == "edge" and one.is_stopped for one in local)
+    results += host.check_ports(lab, snapshot.services, is_edge_stopped=is_edge_stopped)
     if any(rig.controller is not None for rig in lab.rigs):
         results += _check_controllers(lab, snapshot.services)
     results += host.check_open_files(lab)
@@ -122,7 +126,7 @@ def _check_service(lab: "LabConfig", service: str, instance: str) -> "list[Check
             if health.alert:
                 return [CheckResult.error(service, health.alert, "see the service's log")]
             return [CheckResult.ok(service, f"{name}: running for {health.uptime_ns / 1e9:.0f} s")]
-    return [CheckResult.error(service, f"no health report from {wanted}", "see the service's log, or restart it")]
+    return [CheckResult.error(service, f"no health report from {wanted}", _SERVICE_FIX)]
 
 
 def _print_table(results: "list[CheckResult]") -> None:

@@ -53,9 +53,7 @@ def _request(
     with ZenohBus(lab.bus, "tool") as bus:
         recorders = [one for one in discover_services(bus, lab, {"recorder"}) if one.service == "recorder"]
         if not recorders:
-            raise OperationError(
-                f"no recorder answers for lab {lab.name!r}: is it running (hilrig up), with this lab.toml?"
-            )
+            raise OperationError(f"no recorder answers for lab {lab.name!r}: {lab.bus.no_answer_hint}")
         owners = {rig: one for one in recorders for rig in one.rigs}
         # Rigs that were added at run time belong to the recorder of the first rig in the lab's file.
         default = owners.get(lab.rigs[0].name, recorders[0])

@@ -187,9 +187,7 @@ def _join(config: Path | None) -> "Iterator[tuple[LabConfig, Bus, list[ServiceIn
     with ZenohBus(lab.bus, "rig") as bus:
         found = discover_services(bus, lab, set(RIG_SERVICES))
         if not found:
-            raise OperationError(
-                f"no service of lab {lab.name!r} found: is it running (hilrig up), with this lab.toml?"
-            )
+            raise OperationError(f"no service of lab {lab.name!r} found: {lab.bus.no_answer_hint}")
         yield lab, bus, found
 
 

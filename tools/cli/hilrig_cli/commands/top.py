@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from hilrig_schemas import Health
 
 REFRESH_S: Final = 0.5
+FILE_WIDTH: Final = 160
+"""Maximum number of characters per line of output that is not for a terminal."""
 SERVICE_COLUMNS: Final = {
     "service": 0,
     "host": 5,
@@ -64,7 +66,7 @@ def top(
     from hilrig_runtime.config.lab import load_lab
 
     lab = load_lab(config)
-    console = TerminalConsole()
+    console = TerminalConsole(width=None if sys.stdout.isatty() else FILE_WIDTH)
     with LabWatch(lab) as watch:
         watch.wait()
         if as_json or once or not sys.stdout.isatty():

@@ -5,14 +5,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hilrig_cli.commands.services import LogFormat, StopWithParent
-from hilrig_cli.options import Config
+from hilrig_cli.options import Config, announcer
 
 
 def up(
@@ -52,7 +51,7 @@ def up(
     config = file or config
     start_logging("up", "1", log_format)
     report: Callable[[str], None] = logging.getLogger(__name__).info
-    say: Callable[[str], None] = partial(print, flush=True) if log_format == "text" else report
+    say = announcer(log_format)
     written = ExitStack()
     if controller:
         config = written.enter_context(lab_file_of_controller(controller, config))

@@ -37,12 +37,13 @@ def check_software() -> Iterator[CheckResult]:
     yield CheckResult.ok("software", f"Python {sys.version.split()[0]}, {', '.join(found)}")
 
 
-def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResult]:
+def check_ports(lab: LabConfig, running: Collection[str], *, is_edge_stopped: bool = False) -> Iterator[CheckResult]:
     """Check that each Modbus port of the lab is free or served by a hilrig edge.
 
     Args:
         lab: the lab.
         running: kinds of service that are alive on the bus.
+        is_edge_stopped: whether an edge of the lab is stopped on this host: it has its ports, but does not answer.
     """
     ports = [(rig, *address) for rig, kinds in lab.addresses().items() for address in kinds.values()]
     served, free = 0, 0
@@ -50,7 +51,7 @@ def check_ports(lab: LabConfig, running: Collection[str]) -> Iterator[CheckResul
         error = bind_error(host, port)
         if error is None:
             free += 1
-        elif _is_hilrig_edge(host, port) or (port in lab.tls_ports.values() and "edge" in running):
+        elif is_edge_stopped or _is_hilrig_edge(host, port) or (port in lab.tls_ports.values() and "edge" in running):
             served += 1
         else:
             yield CheckResult.error(

@@ -27,12 +27,18 @@ class LocalProcess:
     pid: int
     is_stopped: bool
     """It was stopped with a signal (SIGSTOP, Ctrl-Z) or by a debugger: it does nothing until SIGCONT."""
+    instance: str = "1"
+
+    @property
+    def name(self) -> str:
+        """ "<service>/<instance>"."""
+        return f"{self.service}/{self.instance}"
 
 
 class RouterState(Enum):
     """Result of a TCP connection to the router."""
 
-    ACCEPTS = "accepts connections"
+    ACCEPTS = "its port accepts connections, but it does not answer"
     REFUSES = "its host answers, but no program listens on the port"
     UNREACHABLE = "its host does not answer"
 
@@ -54,7 +60,8 @@ def local_processes(lab: LabConfig) -> list[LocalProcess]:
                 # The name in parentheses may contain spaces; the state follows it.
                 state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
                 if state not in ("Z", "X"):
-                    found.append(LocalProcess(service, int(entry.name), state in _STOPPED))
+                    instance = next(_values_of(options, "--instance"), "1")
+                    found.append(LocalProcess(service, int(entry.name), state in _STOPPED, instance))
     return sorted(found, key=lambda one: (one.service, one.pid))
 
 
@@ -75,7 +82,7 @@ def _is_here(entry: Path) -> bool:
 
 
 def _is_of_lab(lab: LabConfig, options: Sequence[str], entry: Path) -> bool:
-    path = next(_values_of(options), None)
+    path = next(_values_of(options, "-c", "--config"), None)
     try:
         config = load_lab(None if path is None else Path(os.path.join((entry / "cwd").readlink(), path)))  # noqa: PTH118
     except (HilrigError, OSError):
@@ -84,11 +91,11 @@ def _is_of_lab(lab: LabConfig, options: Sequence[str], entry: Path) -> bool:
     return config.name == lab.name and config.bus == lab.bus
 
 
-def _values_of(options: Sequence[str]) -> Iterator[str]:
+def _values_of(options: Sequence[str], *names: str) -> Iterator[str]:
     for option, value in zip(options, [*options[1:], ""], strict=True):
-        if option in ("-c", "--config"):
+        if option in names:
             yield value
-        elif option.startswith("--config="):
+        elif option.startswith(f"{names[-1]}="):
             yield option.partition("=")[2]
 
 

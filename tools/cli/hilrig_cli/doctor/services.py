@@ -11,10 +11,11 @@ from google.protobuf.message import DecodeError
 
 from hilrig_cli.doctor import CheckResult, Level
 from hilrig_cli.doctor.processes import LocalProcess, RouterState, can_list_processes, probe_router
+from hilrig_cli.service_kinds import RIG_SERVICES
 from hilrig_runtime.bus.zenoh_bus import ZenohBus
 from hilrig_runtime.config.lab import LabConfig
 from hilrig_runtime.counters import Counters
-from hilrig_runtime.errors import HilrigError, InputError
+from hilrig_runtime.errors import HilrigError, InputError, list_names
 from hilrig_runtime.process.control import release_series
 from hilrig_runtime.process.discovery import ClockOffset, query_services, worst_offset
 from hilrig_runtime.timing.realtime import REALTIME_PRIORITIES, go_realtime
@@ -165,17 +166,29 @@ def check_services(
     """
     if not snapshot.services & set(SERVICES) and not any(one.service in SERVICES for one in processes):
         text = f"no service of lab {lab.name!r} is running"
-        yield CheckResult.warning("services", text, "start the lab: hilrig up, or each service")
+        yield CheckResult.warning(
+            "services",
+            text,
+            "start the lab: hilrig up, or each service. If it runs, compare name and [bus] in the lab.toml of both",
+        )
         return
     missing = [service for service in SERVICES if service not in snapshot.services]
     for service in missing:
-        yield _explain_missing(lab, service, snapshot, processes)
+        yield _explain_missing(lab, service, [], snapshot, processes)
     silent = sorted(
         name for name in snapshot.alive if name.partition("/")[0] in SERVICES and name not in snapshot.healths
     )
     for name in silent:
         yield _explain_silent(name, snapshot, processes)
-    if not missing and not silent:
+    unserved = {
+        service: rigs
+        for service in RIG_SERVICES
+        if service not in {name.partition("/")[0] for name in (*missing, *silent)}
+        and (rigs := _unserved_rigs(lab, service, snapshot))
+    }
+    for service, rigs in unserved.items():
+        yield _explain_missing(lab, service, rigs, snapshot, processes)
+    if not missing and not silent and not unserved:
         yield CheckResult.ok("services", f"running: {', '.join(sorted(snapshot.alive))}")
     for name, health in sorted(snapshot.healths.items()):
         if health.alert:
@@ -186,33 +199,51 @@ def check_services(
             yield CheckResult.warning("services", text, "see 'Sizing' in docs/operations.md")
 
 
+def _unserved_rigs(lab: LabConfig, service: str, snapshot: BusSnapshot) -> list[str]:
+    """Return the rigs that no simulation steps, or no edge serves, although they have the other one."""
+    found: dict[str, set[str]] = {kind: set() for kind in RIG_SERVICES}
+    for health in snapshot.healths.values():
+        found.setdefault(health.service, set()).update(report.rig for report in health.rig_reports)
+    others = set().union(*(found[kind] for kind in RIG_SERVICES if kind != service))
+    return [rig.name for rig in lab.rigs if rig.name in others - found[service]]
+
+
 def _explain_missing(
-    lab: LabConfig, service: str, snapshot: BusSnapshot, processes: Sequence[LocalProcess]
+    lab: LabConfig, service: str, rigs: Sequence[str], snapshot: BusSnapshot, processes: Sequence[LocalProcess]
 ) -> CheckResult:
-    """Explain that no instance of a service has a liveliness token: it ended, or its link is down for seconds."""
-    local = [one for one in processes if one.service == service]
+    """Explain that a service has no liveliness token: it ended, or its link is down for seconds.
+
+    `rigs`: its rigs, if other instances of its kind run.
+    """
+    local = [one for one in processes if one.service == service and one.name not in snapshot.alive]
     stopped = next((one for one in local if one.is_stopped), None)
     if stopped is not None:
         return CheckResult.error("services", _stopped_text(stopped), _continue_fix(stopped))
+    what = f"{service} of {list_names(rigs)}" if rigs else service
     if local:
-        text = f"{service} runs on this host (process {local[0].pid}), but is not on the bus"
-        return CheckResult.error("services", text, "see its log: it starts, or waits for the bus; do not restart it")
+        text = f"{what} runs on this host (process {local[0].pid}), but is not on the bus"
+        # In a mesh, a command without a valid certificate joins, but nobody answers.
+        certificates = "; check the certificates below" if lab.bus.tls is not None else ""
+        fix = f"see its log: it starts, or waits for the bus; do not restart it{certificates}"
+        return CheckResult.error("services", text, fix)
     known = sorted({peer.service for peer in snapshot.peers() if peer.service.startswith(f"{service}/")})
-    text = f"not running: {service}" + "".join(f"; {_observations(name, snapshot)}" for name in known)
+    known = [name for name in known if name not in snapshot.alive]
+    observations = "".join(f"; {_observations(name, snapshot)}" for name in known)
+    start = f"hilrig {service}" + (f" --instance NAME --rigs {','.join(rigs)}" if rigs else "")
     if lab.bus.topology == "mesh" and can_list_processes():
-        return CheckResult.error("services", f"{text}: no process on this host", f"start it: hilrig {service}")
+        text = f"not running: {what}{observations}: no process on this host"
+        return CheckResult.error("services", text, f"start it: {start}")
     where = _host_of(known[0], snapshot) if known else ""
     if where == platform.node() and can_list_processes():
-        fix = f"start it here (hilrig {service}): it ran on this host, and has no process now"
+        fix = f"start it here ({start}): it ran on this host, and has no process now"
     else:
-        fix = f"{_check_there(where)}. Start it (hilrig {service}) only if no process runs there: it may be cut off"
-    return CheckResult.error("services", f"not connected: {service}" + text.partition(service)[2], fix)
+        fix = f"{_check_there(where)}. Start it ({start}) only if no process runs there: it may be cut off"
+    return CheckResult.error("services", f"not connected: {what}{observations}", fix)
 
 
 def _explain_silent(name: str, snapshot: BusSnapshot, processes: Sequence[LocalProcess]) -> CheckResult:
     """Explain that a service has a liveliness token, but sends no health reports."""
-    service = name.partition("/")[0]
-    local = [one for one in processes if one.service == service]
+    local = [one for one in processes if one.name == name]
     stopped = next((one for one in local if one.is_stopped), None)
     if stopped is not None:
         return CheckResult.error("services", _stopped_text(stopped), _continue_fix(stopped))
@@ -245,7 +276,8 @@ def _observations(name: str, snapshot: BusSnapshot) -> str:
 
 
 def _stopped_text(process: LocalProcess) -> str:
-    return f"{process.service} on this host is stopped (process {process.pid}): it does nothing until it is continued"
+    name = process.service if process.instance == "1" else process.name
+    return f"{name} on this host is stopped (process {process.pid}): it does nothing until it is continued"
 
 
 def _continue_fix(process: LocalProcess) -> str:
