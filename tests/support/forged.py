@@ -5,7 +5,6 @@ process, whose memory is limited, and prints a JSON line a problem and a last on
 """
 
 import contextlib
-import io
 import json
 import resource
 import signal
@@ -15,8 +14,10 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from random import Random
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import zstandard
@@ -27,6 +28,7 @@ from mcap.opcode import Opcode
 from hilrig_recorder.mcap_format.file_names import MAGIC
 from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.records import FOOTER_BYTES, RECORD_HEAD, DamagedError
+from support.in_process import hilrig_in_process
 from support.recordings import PARAMETERS, Script, make, write
 
 SCRIPT = Script(seconds=0.6)
@@ -55,14 +57,20 @@ def forge(path: Path, random: Random) -> None:
     random.choice((_metadata, _attachment, _messages, _bytes, _bytes, _records, _records, _bomb))(path, random)
 
 
-def _good(path: Path, **changes: Any) -> bytearray:
+def _good(path: Path, **changes: Any) -> None:
     write(path, make(SCRIPT), script=SCRIPT, **changes)
-    return bytearray(path.read_bytes())
+
+
+@cache
+def _good_bytes() -> bytes:
+    with TemporaryDirectory() as folder:
+        _good(Path(folder) / "run.mcap")
+        return (Path(folder) / "run.mcap").read_bytes()
 
 
 def _bytes(path: Path, random: Random) -> None:
     """Flip, zero, remove, repeat or truncate bytes anywhere."""
-    data = _good(path)
+    data = bytearray(_good_bytes())
     for _ in range(random.choice((1, 1, 2, 8))):
         at, length = random.randrange(len(data) + 1), random.choice((1, 4, 64, 4096))
         kind = random.randrange(6)
@@ -81,7 +89,7 @@ def _bytes(path: Path, random: Random) -> None:
 
 def _records(path: Path, random: Random) -> None:
     """Put an extreme number into the head or a field of a record."""
-    data = _good(path)
+    data = bytearray(_good_bytes())
     reader = buffer_reader(bytes(data))
     summary = reader.summary()
     end = summary.end if random.random() < 0.7 else summary.start
@@ -239,7 +247,7 @@ def _spoil(message: Message, random: Random) -> None:
 
 def _bomb(path: Path, random: Random) -> None:
     """Add a chunk that expands to much more than the file, or says so."""
-    data = _good(path)
+    data = bytearray(_good_bytes())
     raw_size = random.choice((1 << 30, 100 << 20, 1 << 43, (1 << 64) - 1, 0))
     packed = _BOMB if random.random() < 0.5 else zstandard.compress(b"abc")
     head = struct.pack("<QQQII4sQ", 0, 1, raw_size, random.choice((0, 1)), 4, b"zstd", len(packed))
@@ -300,25 +308,17 @@ RARE = {"report": 0.06, "replay": 0.06, "plot": 0.06, "verify": 0.5, "foxglove":
 
 def main(folder: Path, count: int, seed: int) -> None:
     """Evaluate forged recordings and print the problems."""
-    from hilrig_cli.main import app
-    from hilrig_runtime.process.shutdown import run_main
 
-    def run(arguments: list[str]) -> tuple[object, str, str]:
-        out, err = io.StringIO(), io.StringIO()
-        stdout, stderr = sys.stdout, sys.stderr
-        sys.stdout, sys.stderr = out, err
+    def run(arguments: list[str]) -> tuple[object, str]:
+        """Exit code, or the error that was raised, and standard error."""
         signal.alarm(TIMEOUT_S)
         try:
-            try:
-                code: object = run_main(lambda: app(arguments))
-            except SystemExit as ending:
-                code = ending.code or 0
-            except BaseException as error:
-                code = repr(error)
+            done = hilrig_in_process(*arguments)
+        except BaseException as error:
+            return repr(error), ""
         finally:
             signal.alarm(0)
-            sys.stdout, sys.stderr = stdout, stderr
-        return code, out.getvalue(), err.getvalue()
+        return done.returncode, done.stderr
 
     def timed_out(*_: object) -> None:
         raise TimeoutError(f"no result within {TIMEOUT_S} s")
@@ -330,7 +330,7 @@ def main(folder: Path, count: int, seed: int) -> None:
     write(good, make(SCRIPT), script=SCRIPT)
     write(forged, make(SCRIPT), script=SCRIPT)
     for name, arguments in commands(forged, good, out).items():
-        code, _, err = run(arguments)
+        code, err = run(arguments)
         if code not in (0, 1):
             print(json.dumps({"case": "undamaged", "command": name, "code": code, "error": err}))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
@@ -345,7 +345,7 @@ def main(folder: Path, count: int, seed: int) -> None:
         forge(forged, random)
         (name,) = random.choices(names, weights)
         began = time.perf_counter()
-        code, _, err = run(commands(forged, good, out)[name])
+        code, err = run(commands(forged, good, out)[name])
         slowest = max(slowest, (time.perf_counter() - began, f"{number} {name}"))
         unclear = "can't be evaluated" in err or "out of memory" in err or "Traceback" in err
         if code not in (0, 1, 2) or unclear or (code == 2 and not err.startswith("hilrig: error: ")):

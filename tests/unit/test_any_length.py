@@ -64,7 +64,10 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
         assert function.__kwdefaults__ is not None
         monkeypatch.setitem(function.__kwdefaults__, name, ROWS)
     monkeypatch.setattr(samples, "MATCH_WINDOW_ROWS", ROWS)
-    monkeypatch.setattr(verify, "BLOCK_STATES", ROWS)
+    for name in ("BLOCK_STATES", "COMMAND_WINDOW_ROWS", "TIME_WINDOW_ROWS"):
+        monkeypatch.setattr(verify, name, ROWS)
+    # Many intervals at once, as in a large block: a step of them takes as long as a step of one.
+    monkeypatch.setattr(verify, "MIN_INTERVAL_STEPS", 5)
     monkeypatch.setattr(export, "BLOCK_ROWS", ROWS)
     monkeypatch.setattr(summary, "TRAJECTORY_POINTS", ROWS)
     monkeypatch.setattr(latency_plot, "_MAX_HISTORY_POINTS", ROWS)

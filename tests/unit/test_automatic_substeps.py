@@ -1,8 +1,10 @@
 """Automatic sub-steps compared with the event-driven reference: accuracy, impacts, and independence of the rigs."""
 
+import json
 import os
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from hilrig_sim.plant.hard_stops import first_arrival
 from hilrig_sim.plant.limits import TOOL_CONTACT_FLAG
 from hilrig_sim.plant.linear_joints import free_motion, move_between_stops
 from hilrig_sim.plant.plant import Plant
+from support.labs import hilrig
 from support.reference_plant import ReferenceArm
 
 ARM = ArmParameters()
@@ -309,4 +312,12 @@ def test_check_warns_of_arms_that_one_step_cannot_integrate() -> None:
     assert not list(accuracy_warnings(rigs("auto")))
     (warning,) = accuracy_warnings(rigs(1))
     assert warning.startswith("a and 1 more: at the largest torques ")
+    assert 'set sim.substeps = "auto"' in warning
+
+
+def test_check_prints_its_warnings_as_json_too(tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text("sim.substeps = 1\n")
+    done = hilrig("check", tmp_path / "lab.toml", "--json")
+    (warning,) = json.loads(done.stdout)["warnings"]
+    assert (done.returncode, done.stderr) == (0, "")
     assert 'set sim.substeps = "auto"' in warning

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
+from mcap.writer import Writer
 
 from hilrig_recorder.mcap_format.reader import buffer_reader
 from hilrig_recorder.mcap_format.recover import recover
@@ -18,6 +19,7 @@ from hilrig_replay.analysis.latency import measure
 from hilrig_replay.export.export import export_foxglove, export_tables
 from hilrig_replay.grading.task_loading import recorded_task
 from hilrig_replay.io.columns import COMMAND_DTYPE, STATE_DTYPE
+from hilrig_replay.io.recording_file import MAX_CHANNELS
 from hilrig_replay.io.run import open_run
 from hilrig_replay.io.timebase import Timebase
 from hilrig_replay.plots.latency_plot import save_plot
@@ -158,6 +160,36 @@ def test_nested_index_is_rebuilt(tmp_path: Path) -> None:
     (tmp_path / "run.mcap.verified").write_text("[" * 100_000)
     [entry] = RunIndex(tmp_path).load()
     assert (entry.error, entry.verified) == ("", None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[[task.poses]]\nname = 'a'\nposition_mm = [1e308, 0, 0]",
+        "[task.path]\npoints_mm = [[0, 0, 0], [0, -1e308, 0]]",
+        "[task]\ntime_limit_s = 1e308\nplace = {}",
+    ],
+)
+def test_recorded_number_beyond_all_settings_is_refused(tmp_path: Path, text: str) -> None:
+    path = recordings.write(tmp_path / "run.mcap", recordings.make(SCRIPT), script=SCRIPT, lab_toml=text)
+    with pytest.raises(InputError, match=r"recorded lab\.toml: invalid task: .*must be [≤≥] -?1e\+?10, got"):
+        recorded_task(open_run(path))
+
+
+@pytest.mark.filterwarnings("error")
+def test_step_of_ten_seconds_is_evaluated_without_a_warning(tmp_path: Path) -> None:
+    assert measure(open_run(with_metadata(tmp_path / "run.mcap", "config", step_ns="10000000000"))).step_ms == 10_000
+
+
+def test_recording_with_thousands_of_channels_is_damaged(tmp_path: Path) -> None:
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for number in range(MAX_CHANNELS + 1):
+            writer.register_channel(f"/{number}", "protobuf", 0)
+        writer.finish()
+    with pytest.raises(InputError, match=rf"damaged \(more than {MAX_CHANNELS} channels\)"):
+        open_run(tmp_path / "run.mcap")
 
 
 @pytest.mark.parametrize("wall_ns", [-(1 << 63), (1 << 63) - 1, 0])

@@ -1,14 +1,20 @@
 """Worker process of the console: results, errors, restart after a crash, shutdown; and the recording catalog."""
 
+import asyncio
+import json
 import os
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from starlette.requests import Request
+from starlette.responses import JSONResponse
 
 from hilrig_console import worker as worker_module
+from hilrig_console.app import Console
 from hilrig_console.catalog import ListWorker, RecordingCatalog
 from hilrig_console.worker import Worker
 from hilrig_runtime.errors import InputError, OperationError
@@ -120,6 +126,28 @@ def test_catalog_serves_only_listed_existing_files(tmp_path: Path) -> None:
         for other in ("../run.mcap", str(path), "", "."):
             with pytest.raises(InputError):
                 catalog.file(other)
+
+
+def test_catalog_lists_and_serves_any_file_name(tmp_path: Path) -> None:
+    names = [b"\xe9.mcap", b"a\nb\r\x1b[2J.mcap", "a\u202epacm.mcap".encode(), b"n" * 250 + b".mcap"]
+    paths = [tmp_path / os.fsdecode(name) for name in names]
+    good = record(tmp_path / "run.mcap", Script(seconds=0.5))
+    for path in paths:
+        os.link(good, path)
+    with RecordingCatalog(tmp_path) as catalog:
+        catalog.refresh()
+        # JSON in UTF-8, as the page gets it.
+        runs = json.loads(JSONResponse(catalog.search("")).body)["runs"]
+        assert {catalog.file(run["path"]) for run in runs} == {good, *paths}
+        assert all(text.isprintable() for run in runs for text in (run["path"], run["name"], run["error"]))
+        for run in runs:
+            request = Request({"type": "http", "path_params": {"path": run["path"]}})
+            download: Any = asyncio.run(Console._recording(SimpleNamespace(_catalog=catalog), request))  # type: ignore[arg-type]
+            assert download.headers["content-disposition"].startswith("attachment; filename")
+        paths[0].unlink()
+        paths[0].symlink_to(paths[0])
+        with pytest.raises(InputError, match=r"unknown recording '\\\\xe9\.mcap'"):
+            catalog.file(r"\xe9.mcap")
 
 
 def test_catalog_reports_missing_folder(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """One recorder per rig (folder locks, partition), and manual sessions."""
 
+import os
 import random
 from contextlib import closing
 from pathlib import Path
@@ -34,6 +35,16 @@ def test_recorders_of_different_rigs_share_a_folder(tmp_path: Path) -> None:
 def test_unheld_lock_file_with_any_content_is_ignored(tmp_path: Path, content: str) -> None:
     (tmp_path / ".recorder-old.lock").write_text(content)
     FolderLock(tmp_path, "1", ["rig1"]).close()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs POSIX FIFOs")
+@pytest.mark.timeout(20)
+def test_fifo_with_the_name_of_a_lock_does_not_block(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / ".recorder-old.lock")
+    (tmp_path / ".recorder-folder.lock").mkdir()
+    FolderLock(tmp_path, "1", ["rig1"]).close()
+    with pytest.raises(OperationError, match=r"\.recorder-old\.lock: can't be locked: expected a regular file"):
+        FolderLock(tmp_path, "old", ["rig1"])
 
 
 def test_each_rig_also_an_added_one_has_one_recorder() -> None:

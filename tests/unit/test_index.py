@@ -2,6 +2,7 @@
 
 import json
 import os
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -157,18 +158,45 @@ def test_lists_a_folder_without_write_permission(tmp_path: Path, monkeypatch: py
 
 def test_lists_ten_thousand_indexed_files_quickly(tmp_path: Path) -> None:
     good = make(tmp_path)
-    folder = good.parent
-    for number in range(9_999):
-        os.link(good, folder / f"20260101T000000Z-rig1-{number:04}.mcap")
     index = RunIndex(tmp_path)
-    assert len(index.load()) == 10_000
+    [entry] = index.load()
+    paths = [good.with_name(f"20260101T000000Z-rig1-{number:04}.mcap") for number in range(9_999)]
+    for path in paths:
+        os.link(good, path)
+    # As if each had been read; reading ten thousand takes 20 s.
+    index._known |= {(name,): replace(entry, path=name) for name in (str(path.relative_to(tmp_path)) for path in paths)}
     index.save()
-    import time
-
-    begin_s = time.process_time()
-    assert len(RunIndex(tmp_path).load()) == 10_000
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hilrig_replay.analysis.index.read_entry", lambda *_: pytest.fail("was read again"))
+        begin_s = time.process_time()
+        assert len(RunIndex(tmp_path).load()) == 10_000
     # Measured: 0.2 s of processor time; more if caches are shared with another busy process.
     assert time.process_time() - begin_s < 2
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("start_wall_ns", '"x"'), ("duration_s", "1e999"), ("loop_p50_ms", "NaN"), ("size", "9" * 5000), ("span", "5")],
+)
+def test_forged_index_is_rebuilt(tmp_path: Path, field: str, value: str) -> None:
+    make(tmp_path)
+    index = RunIndex(tmp_path)
+    entries = index.load()
+    index.save()
+    content = json.loads((tmp_path / INDEX_NAME).read_text())
+    content["runs"][0][content["fields"].index(field)] = "FORGED"
+    (tmp_path / INDEX_NAME).write_text(json.dumps(content).replace('"FORGED"', value))
+    assert RunIndex(tmp_path).load() == entries
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs POSIX FIFOs")
+@pytest.mark.timeout(20)
+def test_index_and_verdict_that_are_fifos_are_ignored(tmp_path: Path) -> None:
+    path = make(tmp_path)
+    os.mkfifo(tmp_path / INDEX_NAME)
+    os.mkfifo(f"{path}.verified")
+    [entry] = RunIndex(tmp_path).load()
+    assert (entry.error, entry.verified) == ("", None)
 
 
 def test_command_lists_filters_and_sorts(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -243,6 +245,17 @@ def test_endless_update_is_reported_with_its_line(tmp_path: Path, monkeypatch: p
         run_first(user_study(tmp_path, body), tmp_path)
     assert (os._exit, signal.getsignal(signal.SIGALRM)) == before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_code_that_no_exception_ends_ends_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("import itertools\nsum(itertools.repeat(0))\n")
+    load = "controller.TIME_LIMIT_S = 0.5; controller.UserController(pathlib.Path('mine.py'), 0.02)"
+    code = f"import pathlib; from hilrig_study.controllers import user_controller as controller; {load}"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, check=False, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    assert 'mine.py", line 2 in <module>' in done.stderr
 
 
 def test_reports_missing_controller_file(tmp_path: Path) -> None:

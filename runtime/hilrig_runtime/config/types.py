@@ -11,6 +11,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from hilrig_schemas.topics import NAME_PATTERN
 
 _NAME: Final = rf"^{NAME_PATTERN}$"
+MAX_NUMBER: Final = 1e10
+"""Largest number of a setting without a limit of its own: the square of a larger one can exceed the range of floats."""
 _COLOR: Final = r"^#[0-9a-fA-F]{6}$"
 PATTERN_DESCRIPTIONS: Final = {
     _NAME: "1 to 63 letters, digits, - and _, beginning with a letter or digit",
@@ -23,9 +25,9 @@ Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=_NAME)]
 Color = Annotated[str, Field(pattern=_COLOR)]
 Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
-Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, le=MAX_NUMBER, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=MAX_NUMBER, allow_inf_nan=False)]
+Number = Annotated[float, Field(strict=True, ge=-MAX_NUMBER, le=MAX_NUMBER, allow_inf_nan=False)]
 # pydantic's own network type takes as long to import as all of this package.
 Network = Annotated[IPv4Network | IPv6Network, BeforeValidator(ip_network)]
 Vector2 = tuple[Number, Number]

@@ -24,7 +24,7 @@ from hilrig_console.catalog import RecordingCatalog
 from hilrig_console.subscriber import LabSubscriber
 from hilrig_console.view_model import ClientState, Frame
 from hilrig_runtime.errors import HilrigError, InputError
-from hilrig_runtime.escaping import as_html
+from hilrig_runtime.escaping import as_html, printable
 
 FRAME_PERIOD_S: Final = 0.2
 """Period of the frames, s."""
@@ -129,7 +129,7 @@ class Console:
 
     async def _recording(self, request: Request) -> Response:
         file = self._catalog.file(request.path_params["path"])
-        return FileResponse(file, filename=file.name, media_type="application/octet-stream")
+        return FileResponse(file, filename=printable(file.name), media_type="application/octet-stream")
 
     async def _report(self, request: Request) -> Response:
         page = await asyncio.to_thread(self._catalog.report, request.path_params["path"])

@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +18,7 @@ from hilrig_replay.analysis.index import IN_PROGRESS, RunEntry, RunIndex
 from hilrig_replay.io.segments import RunFiles
 from hilrig_runtime.bus.api import Handle
 from hilrig_runtime.errors import HilrigError, InputError
+from hilrig_runtime.escaping import printable
 
 LIST_PERIOD_S: Final = 2.0
 """Shortest period of listing the folder while a browser is connected, s."""
@@ -114,23 +116,26 @@ class RecordingCatalog(Handle):
         found = [entry for entry in self._entries if all(term in _search_text(entry) for term in terms)]
         return {
             "version": self.version,
-            "error": self.error,
+            "error": printable(self.error),
             "total": len(self._entries),
             "found": len(found),
             "runs": [_row(entry) for entry in found[:MAX_LISTED]],
         }
 
     def file(self, path: str) -> Path:
-        """Return the path of a file of a listed run.
+        """Return the file of a listed run by its path in the list, in which control characters are escaped.
 
         Raises:
             InputError: the file is not listed or does not exist anymore.
         """
-        found = (self.folder / path).resolve()
-        is_listed = any(path in entry.paths for entry in self._entries)
-        if not is_listed or not found.is_relative_to(self.folder.resolve()) or not found.is_file():
-            raise InputError(f"unknown recording {path!r}")
-        return found
+        listed = {printable(one): one for entry in self._entries for one in entry.paths}
+        if path in listed:
+            # RuntimeError: a loop of symbolic links.
+            with suppress(OSError, RuntimeError):
+                found = (self.folder / listed[path]).resolve()
+                if found.is_relative_to(self.folder.resolve()) and found.is_file():
+                    return found
+        raise InputError(f"unknown recording {path!r}")
 
     def report(self, path: str) -> Path:
         """Return the report page of a listed run, by its first file; it is created if it is not cached.
@@ -138,10 +143,10 @@ class RecordingCatalog(Handle):
         Raises:
             HilrigError: the recording is unknown, or its report can't be created.
         """
-        listed = next((entry.paths for entry in self._entries if entry.path == path), (path,))
-        recording = tuple(map(self.file, listed))
+        listed = next((entry.paths for entry in self._entries if printable(entry.path) == path), None)
+        recording = tuple(self.file(printable(one)) for one in listed) if listed else (self.file(path),)
         states = [one.stat() for one in recording]
-        key = (listed, *(number for info in states for number in (info.st_size, info.st_mtime_ns)))
+        key = (recording, *(number for info in states for number in (info.st_size, info.st_mtime_ns)))
         with self._reporting:
             page = self._reports.get(key)
             if page is not None:
@@ -173,11 +178,18 @@ def _search_text(entry: RunEntry) -> str:
 
 
 def _row(entry: RunEntry) -> dict[str, Any]:
-    row = asdict(entry)
+    row = {name: _shown(value) for name, value in asdict(entry).items()}
     for name in ("mtime_ns", "start_wall_ns", "unfit_reasons", "measured", "lab", "segment", "span"):
         del row[name]
     row["start_ms"] = entry.start_wall_ns // 1_000_000
-    row["name"] = recording_stem(Path(entry.path).name)
+    row["name"] = printable(recording_stem(Path(entry.path).name))
     row["unfit"] = "; ".join(reason.text for reason in entry.unfit_reasons)
     row["open"] = entry.ended == IN_PROGRESS
     return row
+
+
+def _shown(value: Any) -> Any:
+    """A value with its texts escaped: UTF-8 has no undecodable file names."""
+    if isinstance(value, str):
+        return printable(value)
+    return [_shown(one) for one in value] if isinstance(value, list | tuple) else value

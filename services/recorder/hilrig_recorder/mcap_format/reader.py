@@ -302,6 +302,8 @@ def chunk_records(raw: bytes, wanted: Container[int] | None = None) -> Iterator[
     last = end - MESSAGE_HEAD.size
     unpack_head, unpack_message = RECORD_HEAD.unpack_from, MESSAGE_HEAD.unpack_from
     head_size, payload_at = RECORD_HEAD.size, MESSAGE_HEAD.size
+    # The constructor of a NamedTuple is a Python function that calls this one.
+    new_tuple = tuple.__new__
     while at < end:
         if at <= last:
             opcode, length, channel_id, sequence, log_time, publish_time = unpack_message(raw, at)
@@ -316,7 +318,8 @@ def chunk_records(raw: bytes, wanted: Container[int] | None = None) -> Iterator[
             if length < MESSAGE_FIXED_BYTES:
                 raise DamagedError(f"message of {length} bytes, expected at least {MESSAGE_FIXED_BYTES}", at)
             if wanted is None or channel_id in wanted:
-                yield Message(channel_id, sequence, log_time, publish_time, raw[at + payload_at : following])
+                payload = raw[at + payload_at : following]
+                yield new_tuple(Message, (channel_id, sequence, log_time, publish_time, payload))
         elif opcode == 0:
             raise DamagedError("opcode 0 in a chunk", at)
         elif wanted is None:

@@ -31,6 +31,8 @@ class FolderLock:
 
     def __init__(self, folder: Path, instance: str, rigs: Collection[str]) -> None:
         path = folder / f".recorder-{instance}.lock"
+        if path.exists() and not path.is_file():
+            raise OperationError(f"{path}: can't be locked: expected a regular file; remove it")
         self._file = path.open("a+")
         try:
             if not _lock_with_retries(self._file):
@@ -41,7 +43,8 @@ class FolderLock:
             self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "rigs": sorted(rigs)}))
             self._file.flush()
             for other in sorted(folder.glob(".recorder-*.lock")):
-                if other != path and not _is_free(other):
+                # Reading a FIFO could wait forever.
+                if other != path and other.is_file() and not _is_free(other):
                     self._refuse_shared(folder, other, rigs)
         except BaseException:
             self._file.close()

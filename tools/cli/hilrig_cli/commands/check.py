@@ -39,7 +39,8 @@ def check(
     rigs = lab_parameters(lab, str(file or "defaults"))
     roster = None if lab.classroom is None else lab.classroom.students([rig.name for rig in lab.rigs])
     if as_json:
-        print(json.dumps(lab.model_dump(mode="json") | {"ports": lab.ports, "tls_ports": lab.tls_ports}))
+        found = {"ports": lab.ports, "tls_ports": lab.tls_ports, "warnings": list(accuracy_warnings(rigs))}
+        print(json.dumps(lab.model_dump(mode="json") | found))
         return
     addresses = lab.addresses()
     is_restricted = any(rig.allow for rig in lab.rigs)

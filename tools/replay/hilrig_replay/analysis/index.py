@@ -6,11 +6,15 @@ is only a cache: it can be deleted at any time and is rebuilt from the files.
 
 import contextlib
 import json
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
+
+from pydantic import TypeAdapter
 
 from hilrig_recorder.mcap_format.file_names import MCAP_SUFFIX, UNFINISHED_SUFFIX
 from hilrig_recorder.mcap_format.fsutil import open_file
@@ -39,6 +43,8 @@ from hilrig_runtime.errors import HilrigError, InputError
 
 INDEX_NAME: Final = ".hilrig-index.json"
 INDEX_VERSION: Final = 6
+_MAX_DIGITS: Final = 20
+"""Digits of the largest integer of 64 bits."""
 VERDICT_SUFFIX: Final = ".verified"
 """Suffix of the file next to a recording with the result of `hilrig verify`."""
 _ADDED: Final = (
@@ -205,22 +211,43 @@ class RunIndex:
 
     def _read(self) -> dict[tuple[str, ...], RunEntry]:
         try:
-            index = json.loads((self.folder / INDEX_NAME).read_text())
+            index = _read_json(self.folder / INDEX_NAME)
             names = index["fields"]
             if index["version"] != INDEX_VERSION or names != [field.name for field in fields(RunEntry)]:
                 return {}
-            entries = []
-            for row in index["runs"]:
-                values = dict(zip(names, row, strict=True))
-                values["unfit_reasons"] = tuple(Reason(**reason) for reason in values["unfit_reasons"])
-                values["segment"], values["segments"] = Segment(*values["segment"]), tuple(values["segments"])
-                values["span"], values["overlaps"] = Span(*values["span"]), tuple(values["overlaps"])
-                values["span"] = values["span"]._replace(incarnations=tuple(values["span"].incarnations))
-                entries.append(RunEntry(**values))
-            return {entry.paths: entry for entry in entries}
-        except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError):
+            rows = [dict(zip(names, row, strict=True)) for row in index["runs"]]
+            return {entry.paths: entry for entry in _entries_type().validate_python(rows)}
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             # Damaged, or of another version: the index is rebuilt.
             return {}
+
+
+@cache
+def _entries_type() -> TypeAdapter[list[RunEntry]]:
+    return TypeAdapter(list[RunEntry])
+
+
+def _read_json(path: Path) -> Any:
+    """Content of a JSON file beside recordings, which anyone may have put there.
+
+    Raises:
+        OSError, ValueError, RecursionError: it is not a regular file with JSON of finite numbers.
+    """
+    with open_file(path) as file:
+        return json.loads(file.read(), parse_constant=_finite, parse_float=_finite, parse_int=_integer)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"expected a finite number, got {text}")
+    return number
+
+
+def _integer(text: str) -> int:
+    if len(text) > _MAX_DIGITS:
+        raise ValueError(f"expected at most {_MAX_DIGITS} digits, got {len(text)}")
+    return int(text)
 
 
 def read_entry(folder: Path, relative: str, info: os.stat_result) -> RunEntry:
@@ -288,7 +315,7 @@ def read_verdict(run: Path | RunFiles) -> bool | None:
     """Result of the last verification of a run; None: no result, or a result of other files of this name."""
     files = as_files(run)
     try:
-        verdict = json.loads(_verdict_path(files).read_text())
+        verdict = _read_json(_verdict_path(files))
         return bool(verdict["verified"]) if verdict.items() >= _identity(files).items() else None
     except (OSError, AttributeError, ValueError, KeyError, TypeError, RecursionError):
         return None

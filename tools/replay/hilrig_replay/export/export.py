@@ -140,7 +140,7 @@ class _Visualization:
         """Compute the joint frames of the next states at once."""
         decoder = Decoder(StringTable(), Timebase())
         for _, sequence, log_time, _, payload in state_messages:
-            decoder.add("state", payload, sequence, log_time)
+            decoder.decoders["state"](payload, sequence, log_time)
         states = decoder.drain().states
         frames = (joint.transforms(states["position"][:, number]) for number, joint in enumerate(self._arm.joints))
         self._poses = zip(states["wall_ns"].tolist(), *(zip(*both, strict=True) for both in frames), strict=True)

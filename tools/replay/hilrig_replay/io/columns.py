@@ -35,7 +35,6 @@ _STRUCT_CODES: Final = {
     "|b1": "?",
 }
 _VECTOR: Final = ("<f8", (4,))
-_INITIAL_ROWS: Final = 1024
 
 STATE_DTYPE: Final = np.dtype(
     [
@@ -149,19 +148,9 @@ class StringTable:
     OVERFLOW_TEXT: Final = "others"
 
     def __init__(self) -> None:
-        self._codes: dict[str, int] = {"": 0}
         self._texts: list[str] = [""]
-
-    def code(self, text: str) -> int:
+        self.code: Final = _Codes(self._texts).__getitem__
         """Code of a text; a new text gets the next code, or the shared last code if none is left."""
-        code = self._codes.get(text)
-        if code is None:
-            code = len(self._texts)
-            if code == self.MAX_STRINGS:
-                return code - 1
-            self._codes[text] = code
-            self._texts.append(text if code < self.MAX_STRINGS - 1 else self.OVERFLOW_TEXT)
-        return code
 
     def __getitem__(self, code: int) -> str:
         return self._texts[code]
@@ -172,32 +161,39 @@ class StringTable:
         return np.asarray(texts[codes])
 
 
+class _Codes(dict[str, int]):
+    """Codes of the texts in a list, to which a new text is appended; without a Python call for a known text."""
+
+    def __init__(self, texts: list[str]) -> None:
+        super().__init__({text: code for code, text in enumerate(texts)})
+        self._texts = texts
+
+    def __missing__(self, text: str) -> int:
+        code = len(self._texts)
+        if code == StringTable.MAX_STRINGS:
+            return code - 1
+        self[text] = code
+        self._texts.append(text if code < StringTable.MAX_STRINGS - 1 else StringTable.OVERFLOW_TEXT)
+        return code
+
+
 class RowBuffer:
-    """Growing buffer of rows; its capacity doubles when full, so appending takes amortized constant time."""
+    """Rows of a type: each is packed when it is added, and `drain` reads all of them as an array without a copy."""
 
-    def __init__(self, dtype: np.dtype[np.void], capacity: int = 0) -> None:
+    def __init__(self, dtype: np.dtype[np.void]) -> None:
         self._dtype = dtype
-        self._struct = struct.Struct("<" + "".join(_code(dtype[name]) for name in dtype.names or ()))
-        self._size = dtype.itemsize
-        self._buffer = bytearray(self._size * max(capacity, _INITIAL_ROWS))
-        self._end = 0
-        self._pack = self._struct.pack_into
-
-    def append(self, *fields: Any) -> None:
-        """Add a row: the fields in order, a vector as bytes."""
-        if self._end == len(self._buffer):
-            self._buffer.extend(bytes(self._end))
-        self._pack(self._buffer, self._end, *fields)
-        self._end += self._size
-
-    def __len__(self) -> int:
-        return self._end // self._size
+        self._rows: list[bytes] = []
+        self.pack: Final = struct.Struct("<" + "".join(_code(dtype[name]) for name in dtype.names or ())).pack
+        """Packs the fields of a row in order, a vector as bytes."""
+        self.add: Final = self._rows.append
+        """Adds a packed row."""
+        self.extend: Final = self._rows.extend
+        """Adds packed rows."""
 
     def drain(self) -> Rows:
         """Return the rows, shape (number of rows,), and empty the buffer."""
-        rows = np.frombuffer(self._buffer, self._dtype, count=len(self))
-        self._buffer = bytearray(self._size * _INITIAL_ROWS)
-        self._end = 0
+        rows = np.frombuffer(bytearray().join(self._rows), self._dtype)
+        self._rows.clear()
         return rows
 
 
@@ -233,50 +229,57 @@ DecodeFunction = Callable[[bytes, int, int], None]
 def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> DecodeFunction:
     """Return a function that adds `JointState` messages to `states` and the parts in them to `parts`."""
     message = _StateView()
-    parse, add, add_part, code = message.ParseFromString, states.append, parts.append, names.code
+    parse, code, add, pack = message.ParseFromString, names.code, states.add, states.pack
 
     def decode(payload: bytes, sequence: int, log_ns: int) -> None:
         parse(payload)
         held_part = message.held_part
+        position, velocity, effort = message.position, message.velocity, message.effort
+        if not len(position) == len(velocity) == len(effort) == len(_NO_VECTOR):
+            position, velocity, effort = map(_vector, (position, velocity, effort))
         add(
-            message.step,
-            message.incarnation,
-            message.sampled_ns,
-            message.wall_ns,
-            message.lateness_ns,
-            _vector(message.position),
-            _vector(message.velocity),
-            _vector(message.effort),
-            message.integration_error or _NO_VECTOR,
-            message.external_force_z,
-            message.external_torque_z,
-            message.command_seq,
-            message.basis_step,
-            message.command_arrived_ns,
-            message.loop_latency_ns,
-            log_ns,
-            message.missed_steps,
-            sequence,
-            message.limit_flags,
-            message.substeps,
-            code(message.session),
-            code(held_part) if held_part else 0,
-            message.magnet,
-            message.safe,
+            pack(
+                message.step,
+                message.incarnation,
+                message.sampled_ns,
+                message.wall_ns,
+                message.lateness_ns,
+                position,
+                velocity,
+                effort,
+                message.integration_error or _NO_VECTOR,
+                message.external_force_z,
+                message.external_torque_z,
+                message.command_seq,
+                message.basis_step,
+                message.command_arrived_ns,
+                message.loop_latency_ns,
+                log_ns,
+                message.missed_steps,
+                sequence,
+                message.limit_flags,
+                message.substeps,
+                code(message.session),
+                code(held_part) if held_part else 0,
+                message.magnet,
+                message.safe,
+            )
         )
         for part in message.parts:
-            add_part(
-                message.step,
-                message.wall_ns,
-                part.x,
-                part.y,
-                part.z,
-                part.yaw,
-                part.vx,
-                part.vy,
-                part.vz,
-                code(part.name),
-                part.name == held_part,
+            parts.add(
+                parts.pack(
+                    message.step,
+                    message.wall_ns,
+                    part.x,
+                    part.y,
+                    part.z,
+                    part.yaw,
+                    part.vx,
+                    part.vy,
+                    part.vz,
+                    code(part.name),
+                    part.name == held_part,
+                )
             )
 
     return decode
@@ -285,36 +288,39 @@ def state_decoder(states: RowBuffer, parts: RowBuffer, names: StringTable) -> De
 def command_decoder(commands: RowBuffer, names: StringTable) -> DecodeFunction:
     """Return a function that adds `TorqueCommand` messages to `commands`."""
     message = _CommandView()
-    parse, add, code = message.ParseFromString, commands.append, names.code
+    parse, code, add, pack = message.ParseFromString, names.code, commands.add, commands.pack
 
     def decode(payload: bytes, sequence: int, log_ns: int) -> None:
         parse(payload)
+        effort, write_arrived_ns = message.effort, message.write_arrived_ns
         add(
-            message.seq,
-            message.wall_ns,
-            _vector(message.effort),
-            message.basis_incarnation,
-            message.basis_step,
-            message.state_arrived_ns,
-            message.state_served_ns,
-            message.write_arrived_ns,
-            message.write_received_ns or message.write_arrived_ns,
-            message.sent_ns,
-            message.state_injected_ns,
-            message.command_injected_ns,
-            message.positions_acknowledged_ns,
-            message.read_sent_ns,
-            message.stale_read_sent_ns,
-            log_ns,
-            sequence,
-            message.resets,
-            message.echo & 0xFFFF,
-            code(message.session),
-            code(message.controller),
-            message.magnet,
-            message.safe,
-            message.basis_on_other_connection,
-            message.basis_is_bound,
+            pack(
+                message.seq,
+                message.wall_ns,
+                effort if len(effort) == len(_NO_VECTOR) else _vector(effort),
+                message.basis_incarnation,
+                message.basis_step,
+                message.state_arrived_ns,
+                message.state_served_ns,
+                write_arrived_ns,
+                message.write_received_ns or write_arrived_ns,
+                message.sent_ns,
+                message.state_injected_ns,
+                message.command_injected_ns,
+                message.positions_acknowledged_ns,
+                message.read_sent_ns,
+                message.stale_read_sent_ns,
+                log_ns,
+                sequence,
+                message.resets,
+                message.echo & 0xFFFF,
+                code(message.session),
+                code(message.controller),
+                message.magnet,
+                message.safe,
+                message.basis_on_other_connection,
+                message.basis_is_bound,
+            )
         )
 
     return decode

@@ -32,6 +32,8 @@ from hilrig_schemas.topics import RECORDED
 
 SCHEMA_PACKAGE: Final = "hilrig.v1"
 """Package of the message schemas that this version reads."""
+MAX_CHANNELS: Final = 1000
+"""Largest number of channels of a recording; those of hilrig have one a topic."""
 CHUNK_DTYPE: Final = np.dtype(
     [("first_ns", "<i8"), ("last_ns", "<i8"), ("offset", "<u8"), ("length", "<u8"), ("channels", "<u8")]
 )
@@ -170,6 +172,8 @@ class _FileContents:
             self.schemas[record.id] = record
         elif isinstance(record, Channel):
             self.channels[record.id] = record
+            if len(self.channels) > MAX_CHANNELS:
+                raise DamagedError(f"more than {MAX_CHANNELS} channels")
         elif isinstance(record, Metadata):
             add_metadata(self.metadata, record, offset)
         elif isinstance(record, Attachment):
@@ -232,7 +236,8 @@ def _read_summary(reader: RecordReader) -> _FileContents | None:
     index: list[MetadataIndex | AttachmentIndex] = []
     for item in reader.summary_items(summary):
         if isinstance(item, ChunkIndex):
-            contents.chunks.append(item.first_ns, item.last_ns, item.offset, item.length, _bits(item.channels))
+            row = item.first_ns, item.last_ns, item.offset, item.length, _bits(item.channels)
+            contents.chunks.add(contents.chunks.pack(*row))
         elif isinstance(item, Schema | Channel):
             contents.add(item)
         elif isinstance(item, Statistics):

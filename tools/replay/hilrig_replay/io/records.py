@@ -75,7 +75,9 @@ class Decoder:
         )
         self._parts, self._connections = RowBuffer(PART_DTYPE), RowBuffer(CONNECTION_DTYPE)
         self._events: list[tuple[Any, ...]] = []
-        self._decoders = self._new_decoders()
+        self.decoders = self._new_decoders()
+        """Functions that add one message of a topic, by topic; `drain` replaces them. They raise `DecodeError` if the
+        payload is not a valid message."""
 
     def _new_decoders(self) -> dict[str, DecodeFunction]:
         # No reference to `self`: a reference cycle would keep the buffers until the next garbage collection.
@@ -86,14 +88,6 @@ class Decoder:
             "event": lambda payload, *_: events.append(_event_row(payload)),
             "traffic": traffic_decoder(self._traffic, self._connections, self._names),
         }
-
-    def add(self, topic: str, payload: bytes, sequence: int, log_ns: int) -> None:
-        """Add one message of a topic.
-
-        Raises:
-            google.protobuf.message.DecodeError: the payload is not a valid message of this topic.
-        """
-        self._decoders[topic](payload, sequence, log_ns)
 
     def drain(self) -> Records:
         """Return and remove the messages that were added since the last call."""
@@ -110,7 +104,7 @@ class Decoder:
         self._timebase.update(records.states)
         self._timebase.update_commands(records.commands)
         # A protobuf message that is reused for parsing never frees memory: new decoders bound its growth.
-        self._decoders = self._new_decoders()
+        self.decoders = self._new_decoders()
         return records
 
 

@@ -275,17 +275,18 @@ class Run:
         self, topics: frozenset[str], rows: int, from_ns: int | None, until_ns: int | None
     ) -> Iterator[Records]:
         decoder = Decoder(self.names, self.timebase)
-        topic_of = self.file.topics
+        topic_of, decode = self.file.topics, decoder.decoders
         count = 0
         try:
             for channel_id, sequence, log_ns, _, payload in self.file.messages(
                 topics, from_ns=from_ns, until_ns=until_ns
             ):
-                decoder.add(topic_of[channel_id], payload, sequence, log_ns)
+                decode[topic_of[channel_id]](payload, sequence, log_ns)
                 count += 1
                 if count >= rows:
                     count = 0
                     yield self._checked(decoder.drain())
+                    decode = decoder.decoders
         except (DecodeError, struct.error, OverflowError) as error:
             raise DamagedRecordingError(self.path, f"a message can't be decoded: {error}") from error
         if count:

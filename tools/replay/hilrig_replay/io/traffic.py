@@ -17,7 +17,7 @@ def traffic_decoder(requests: RowBuffer, connections: RowBuffer, names: StringTa
         names: texts of the codes in the rows.
     """
     message = ModbusTraffic()
-    parse, add = message.ParseFromString, requests.append
+    parse, pack = message.ParseFromString, requests.pack
 
     def fields(kind: ModbusKind | ModbusRequest) -> tuple[int, ...]:
         controller = names.code(kind.controller)
@@ -29,14 +29,19 @@ def traffic_decoder(requests: RowBuffer, connections: RowBuffer, names: StringTa
         kinds = [fields(kind) for kind in message.kinds]
         columns = zip(message.kind_indexes, message.arrived_ns, message.answered_after_ns, strict=True)
         try:
-            for index, arrived_ns, after_ns in columns:
-                add(wall_from_monotonic + arrived_ns, arrived_ns, arrived_ns + after_ns, *kinds[index])
+            requests.extend(
+                [
+                    pack(wall_from_monotonic + arrived_ns, arrived_ns, arrived_ns + after_ns, *kinds[index])
+                    for index, arrived_ns, after_ns in columns
+                ]
+            )
         except (ValueError, IndexError, struct.error) as error:
             raise DecodeError(f"inconsistent request columns: {error}") from error
         for request in message.requests:
             arrived_ns = request.arrived_ns
-            add(wall_from_monotonic + arrived_ns, arrived_ns, request.answered_ns, *fields(request))
+            requests.add(pack(wall_from_monotonic + arrived_ns, arrived_ns, request.answered_ns, *fields(request)))
         for tcp in message.connections:
-            connections.append(message.wall_ns, tcp.min_rtt_us, tcp.retransmissions, names.code(tcp.controller))
+            row = message.wall_ns, tcp.min_rtt_us, tcp.retransmissions, names.code(tcp.controller)
+            connections.add(connections.pack(*row))
 
     return decode

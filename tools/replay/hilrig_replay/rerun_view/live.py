@@ -104,7 +104,7 @@ class Follower:
             topic, payload, arrived_ns = self._pending.popleft()
             try:
                 RECORDED[topic].decode_from(RECORDED[topic].key(self._lab, self._rig), payload)
-                self._decoder.add(topic, payload, 0, arrived_ns)
+                self._decoder.decoders[topic](payload, 0, arrived_ns)
             except DecodeError as error:
                 self._malformed.record(topic, f"{self._rig}/{topic}: a message is invalid: {error}", now_ns)
         self._malformed.check(now_ns)

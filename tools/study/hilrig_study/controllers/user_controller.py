@@ -8,10 +8,12 @@ The file need not import hilrig (see `examples/controllers/`):
 
 `position` and `goal` are four floats each (rad, rad, m, rad). The return value is four efforts (N·m, N·m, N, N·m). Each
 run has its own instance of the class. The file is loaded, and all runs of a control step are updated, within
-`TIME_LIMIT_S`. Code that ends the process raises an error instead.
+`TIME_LIMIT_S`. Code that ends the process raises an error instead. Code that an exception does not end, because it
+catches all of them or never returns from a C function, ends the process after twice this time.
 """
 
 import contextlib
+import faulthandler
 import importlib.util
 import itertools
 import os
@@ -63,9 +65,12 @@ def _limited() -> Iterator[None]:
     try:
         if has_timer:
             signal.setitimer(signal.ITIMER_REAL, TIME_LIMIT_S)
+            # Some code is not interrupted by an exception: this prints its line and ends the process.
+            faulthandler.dump_traceback_later(2 * TIME_LIMIT_S, exit=True)
         yield
     finally:
         if has_timer:
+            faulthandler.cancel_dump_traceback_later()
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, before)
         os._exit = exit_process

@@ -38,6 +38,8 @@ MIN_AMPLITUDE: Final = 0.4
 MIN_PERIODS: Final = 3.0
 PIECE_S: Final = 5.0
 """Pieces of the motion that are examined for an oscillation; at least half of them must contain it."""
+MIN_PIECE_ROWS: Final = 20
+"""Fewer states show no oscillation; a lab's step is at most 1 s."""
 MAX_REST_SHARE: Final = 0.15
 """Largest share of the time with less than a twentieth of the largest speed: 3 % of a sine, more of moves from pose to
 pose."""
@@ -130,6 +132,8 @@ def limit_cycle(evidence: Evidence, found: Sequence[Finding]) -> Iterator[Findin
     """Sustained oscillations of a joint."""
     saturated = _found(found, "saturation")
     step_s = evidence.step_ns / 1e9
+    if step_s * MIN_PIECE_ROWS > PIECE_S:
+        return
     best: tuple[float, int, float] | None = None
     for joint in range(4):
         lowest_hz = MIN_SATURATED_FREQUENCY_HZ if joint in saturated else MIN_FREQUENCY_HZ
