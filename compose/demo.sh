@@ -4,9 +4,11 @@
 #     demo.sh HOST RECORDINGS [SECONDS]
 set -eu
 host=$1 recordings=$2 seconds=${3:-20}
-started=$(mktemp)
-hilrig example pick_and_place.py --out /tmp >/dev/null
-python /tmp/pick_and_place.py --host "$host" --duration "$seconds" || [ $? = 1 ] # 1: not every part was placed
+folder=$(mktemp -d)
+started=$folder/started
+touch "$started"
+hilrig example pick_and_place.py --out "$folder" >/dev/null
+python "$folder/pick_and_place.py" --host "$host" --duration "$seconds" || [ $? = 1 ] # 1: not every part was placed
 echo "waiting for the end of the session"
 for _ in $(seq 30); do
     run=$(find "$recordings" -name '*.mcap' -newer "$started" | head -n 1)

@@ -89,3 +89,5 @@ def test_live_events_and_commands_for_several_rigs(tmp_path: Path) -> None:
         assert "impairment-changed" in seen
         follower.send_signal(signal.SIGINT)
         assert follower.wait(LONG_TIMEOUT_S) == 0
+        for pipe in (follower.stdout, follower.stderr):
+            pipe.close()

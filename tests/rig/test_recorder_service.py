@@ -119,6 +119,7 @@ def test_session_is_recorded_with_every_published_byte(tmp_path: Path) -> None:
     found = metadata(path)
     assert found["hilrig.session"]["session"] == SESSION
     assert found["hilrig.session"]["controller"] == "192.0.2.7:40001"
+    assert "student" not in found["hilrig.session"], "the lab has no roster"
     assert found["hilrig.config"]["step_ns"] == "20000000"
     assert found["hilrig.summary"]["ended"] == "ended"
     assert found["hilrig.summary"]["reason"] == "the controller closed the connection"

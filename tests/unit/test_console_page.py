@@ -36,7 +36,9 @@ def lab_message() -> dict[str, Set[str]]:
     model = ViewModel("lab", LabView(("rig1",)), start=0)
     model.view.update(Health(service="sim", instance="1"), 0.0)
     refused = ExceptionCount(host="127.0.0.1", function=3, code=2, count=7)
-    model.view.update(Health(service="edge", rig_reports=[RigReport(rig="rig1", exceptions=[refused])]), 0.0)
+    model.view.update(
+        Health(service="edge", rig_reports=[RigReport(rig="rig1", exceptions=[refused], student="ada")]), 0.0
+    )
     lab = json.loads(model.frame(0.0, {"runs": 1}).lab)
     return {
         "lab": lab.keys(),

@@ -63,7 +63,7 @@ def test_resumed_recorder_does_not_report_a_slow_disk(tmp_path: Path) -> None:
 
 
 def test_name_of_a_segment_is_never_used_again(tmp_path: Path) -> None:
-    sync_worker: Any = SimpleNamespace(sync_delay_s=0.0, follow=lambda _: None, finish=lambda *_: None)
+    sync_worker: Any = SimpleNamespace(sync_delay_s=0.0, follow=lambda _: None, finish=lambda writer, _: writer.close())
     store = make_store(tmp_path, sync_worker, [])
     recording = Recording("rig1", "s", "", "edge/1", 1, 0)
     assert store.open(recording)
