@@ -163,7 +163,7 @@ def encode_records(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]
+    return bytes(builder.end())
 
 
 def decode_record(opcode: int, content: Buffer, offset: int) -> McapRecord | None:
