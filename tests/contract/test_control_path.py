@@ -237,7 +237,7 @@ async def run_client_cycle() -> Trace:
                 async with asyncio.timeout(10):
                     while trace.calls.count(Device.command.__code__) < 2:
                         simulation.tick(Tick(sim.clock.monotonic_ns(), 0, 0))
-                        await asyncio.sleep(STEP_NS / 1e9)
+                        await asyncio.sleep(STEP_NS / 1e9)  # the period of the simulation
             endpoint.stop("end")
     return trace
 

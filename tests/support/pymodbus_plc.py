@@ -80,7 +80,7 @@ class PymodbusPlc:
         self.port = server.transport.sockets[0].getsockname()[1]
         self._listening.set()
         while not self._ended.is_set():
-            await asyncio.sleep(SCAN_S)
+            await asyncio.sleep(SCAN_S)  # the period of the program
             if self.running:
                 *positions, step = await server.async_getValues(1, 3, 4, 5)
                 signed = [word - 0x10000 if word > 0x7FFF else word for word in positions]
