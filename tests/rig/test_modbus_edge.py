@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
+from functools import partial
 
 import pytest
 
@@ -421,8 +422,9 @@ def test_requests_of_other_versions_are_refused() -> None:
 def test_early_client_is_served_after_the_first_state() -> None:
     port = free_ports(1)
     lab = LabConfig.model_validate({"rigs": [{"port": port}]})
-    with Service("edge", lab, MemoryBus()) as service:
-        rig = EdgeRig(lab, service.bus.hub, service)
+    bus = MemoryBus()
+    with Service("edge", lab, bus) as service:
+        rig = EdgeRig(lab, bus.hub, service)
         thread = threading.Thread(target=run, args=(service,))
         thread.start()
         try:
@@ -443,13 +445,17 @@ def _connect(port: int) -> RawClient | None:
         return None
 
 
+def accepts_a_write(client: RawClient) -> bool:
+    return client.write(0, 5).hex() == "1000000001"
+
+
 def test_listens_on_ipv4_and_ipv6_at_once() -> None:
     if not socket.has_dualstack_ipv6():
         pytest.skip("this machine has no IPv6")
     with running_edge(host="::", allow=["127.0.0.0/8", "::1/128"], lease="connection") as rig:
         for host in ("127.0.0.1", "::1"):
             with RawClient(host, rig.port) as client:
-                eventually(lambda client=client: client.write(0, 5).hex() == "1000000001")
+                eventually(partial(accepts_a_write, client))
                 assert rig.commands[-1].controller == format_address(host, client.socket.getsockname()[1])
         address = rig.service.addresses("rig1")
         assert f"{socket.gethostname()}:{rig.port}" in address
