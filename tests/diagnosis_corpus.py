@@ -4,7 +4,7 @@ The thresholds were chosen on `tuning`; `revision` and `revision2` were judged p
 their result. `judged` has other laws and set points, and ranges that are disjoint from all of them; they were written
 down before the first run of that part. Causes that need real processes are in `tests/rig/test_diagnosis_live.py`.
 
-    python tests/diagnosis_corpus.py [PART] [RUNS]    prints the table of docs/timing.md
+    python tests/diagnosis_corpus.py [PART] [RUNS]    prints the table of docs/diagnosis.md
 """
 
 import sys
@@ -499,7 +499,7 @@ def interval(count: int, total: int) -> str:
 
 
 def table(results: Sequence[Result]) -> str:
-    """Table of docs/timing.md: found and wrong by cause."""
+    """Table of docs/diagnosis.md: found and wrong by cause."""
     lines = ["| cause | runs | found | wrong first entry |", "|---|---|---|---|"]
     for code in CODES:
         ours = [one for one in results if one.case.code == code]
