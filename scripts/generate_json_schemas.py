@@ -34,7 +34,6 @@ UNITS: Final = {
     "share": "0 to 1",
 }
 """Unit by the last part of a field's name, of fields with a number."""
-_ANNOTATIONS: Final = ("description", "default")
 INTRODUCTION: Final = """# JSON output
 
 With `--json` a command prints JSON on standard output, in ASCII, and nothing else; messages and errors are on standard
@@ -150,11 +149,11 @@ def broken_fields(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return [name for name, field in fields.items() if present.get(name) != field]
 
 
-def _fields(schema: dict[str, Any]) -> dict[str, Any]:
-    """Return each field of a schema and of its types, without descriptions and defaults."""
+def _fields(schema: dict[str, Any]) -> dict[str, str]:
+    """Return the type of each field of a schema and of its types; limits and descriptions may change."""
     types = {"": schema} | schema.get("$defs", {})
     return {
-        f"{kind}.{name}".removeprefix("."): {key: value for key, value in field.items() if key not in _ANNOTATIONS}
+        f"{kind}.{name}".removeprefix("."): _kind(field)
         for kind, one in types.items()
         for name, field in one.get("properties", {}).items()
     }
