@@ -1,8 +1,9 @@
 """Corpus of runs with a known cause, in simulated time, and the error rate of the diagnosis on its judged part.
 
-The thresholds were chosen on `tuning`; `revision`, `revision2` and `revision3` were judged parts until a rule was changed
-after their result. `judged` has other laws and set points, and ranges that are disjoint from all of them; they were written
-down before the first run of that part. Causes that need real processes are in `tests/rig/test_diagnosis_live.py`.
+The thresholds were chosen on `tuning`; `revision`, `revision2` and `revision3` were judged parts until a rule was
+changed after their result. `judged` has other laws and set points, and ranges that are disjoint from all of them; they
+were written down before the first run of that part. Causes that need real processes are in
+`tests/rig/test_diagnosis_live.py`.
 
     python tests/diagnosis_corpus.py [PART] [RUNS]    prints the table of docs/diagnosis.md
 """

@@ -104,7 +104,7 @@ def test_many_similar_students_are_one_group_and_a_short_cell() -> None:
     document = {"students": [*rows, *pair, {"id": "alone", "similar": []}]}
     files = "; ".join(f"{name}: {name}.mcap" for name in names)
     assert similar_groups(document) == [
-        f"{files}: 91 % same torques to 60 % same torques",
+        f"{files}: 60 to 91 % same torques",
         "x: x.mcap; y: y.mcap: 70 % same torques",
     ]
     assert similar_text(rows[0]).startswith("s7 (91 % same torques), s1 (60 % same torques), ")
