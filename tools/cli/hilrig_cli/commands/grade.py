@@ -1,6 +1,5 @@
 """`hilrig grade`: grades of a class for one assignment."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +41,8 @@ def grade(
 
     from hilrig_classroom.assignment import load_assignment
     from hilrig_classroom.output import GradeFolder
+    from hilrig_cli.json_output.classroom import GradeOutput, GradesDocument
+    from hilrig_cli.json_output.model import print_json
     from hilrig_cli.terminal import TerminalConsole
     from hilrig_runtime.config.roster import read_roster
     from hilrig_runtime.errors import list_names
@@ -59,7 +60,8 @@ def grade(
             target.write_pages(document, student, lambda done: progress.update(bar, completed=share + share * done))
     problems = target.problems(document)
     if as_json:
-        print(json.dumps({"folder": str(out), "grades": document, "exports": [str(path) for path, _ in exports]}))
+        filled = [str(path) for path, _ in exports]
+        print_json(GradeOutput(folder=str(out), grades=GradesDocument.model_validate(document), exports=filled))
     else:
         graded = sum(row["points"] is not None for row in document["students"])
         print(f"{printable(str(out))}: {graded} of {len(document['students'])} students with a grade")
