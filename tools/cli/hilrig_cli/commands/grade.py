@@ -69,9 +69,9 @@ def grade(
             print(f"{printable(str(path))}: {export.filled} grades for {export.system}")
     for path, export in exports:
         # A course may have more students than the roster.
-        for names, text in ((export.unknown, "not in the roster, rows unchanged"), (export.absent, "without a row")):
-            if names:
-                students = f"{len(names)} student{'s' * (len(names) > 1)} {text}: {list_names(names, 40)}"
+        for listed, text in ((export.unknown, "not in the roster, rows unchanged"), (export.absent, "without a row")):
+            if listed:
+                students = f"{len(listed)} student{'s' * (len(listed) > 1)} {text}: {list_names(listed, 40)}"
                 print(printable(f"{path}: {students}"), file=sys.stderr)
     for problem in problems:
         print(printable(problem), file=sys.stderr)
