@@ -1,8 +1,9 @@
 """Random faults in a lab on five hosts, with a controller of each rig, for minutes; run it as root.
 
 Kills, stops, link cuts, router restarts, clock steps and a slow disk follow each other at random times. Afterwards the
-recordings are compared with the guarantees of docs/operations.md: the torque was zero within the timeouts, no message
-is lost that a witness at the router has received, each loss is stated, every file verifies, every fault is reported.
+recordings are compared with the guarantees of docs/several-hosts.md: the torque was zero within the timeouts, no
+message is lost that a witness at the router has received, each loss is stated, every file verifies, every fault is
+reported.
 """
 
 import argparse
@@ -254,7 +255,7 @@ def check_torque(faults: list[Fault], recorded: Recorded) -> Iterator[str]:
 
 
 def check_losses(faults: list[Fault], recorded: Recorded, seen: np.ndarray) -> Iterator[str]:
-    """Yield losses that docs/operations.md excludes; print how many messages each fault lost."""
+    """Yield losses that docs/several-hosts.md excludes; print how many messages each fault lost."""
     lost = []
     for rig, states in recorded.states.items():
         known = set(zip(states["incarnation"].tolist(), states["step"].tolist(), strict=True))

@@ -45,6 +45,9 @@ def test_verify_reports_the_first_diverging_step(made: list[TimedMessage], tmp_p
     assert done.returncode == 1
     assert json.loads(done.stdout)["first_diverging_step"] == state.step
     assert read_verdict(modified) is False
+    both = hilrig("verify", tmp_path, "--json")
+    assert both.returncode == 1
+    assert {each["same"] for each in json.loads(both.stdout)["runs"]} == {True, False}
     both = hilrig("verify", tmp_path)
     assert both.returncode == 1
     assert "valid.mcap: 119 steps re-simulated" in both.stdout

@@ -281,6 +281,19 @@ def test_hold_of_a_timer_may_vary_more_than_a_sleep(deadlines: bool, code: str) 
     assert [one.code for one in diagnose(varying) if one.list == "timing"] == [code]
 
 
+@pytest.mark.parametrize(("sleeps", "code"), [(True, "wait_before_write"), (False, "computing_time")])
+def test_sleep_on_a_busy_host_is_a_wait(sleeps: bool, code: str) -> None:
+    random = np.random.default_rng(2)
+    # Half of the sleeps are late, by up to 20 ms; a computation of the same time varies to both sides.
+    late_ms = 0.1 + random.gamma(1.0, 0.05, 400) + random.choice((0.0, 1.0), 400) * random.exponential(4.0, 400)
+    held_ns = (30.0 + (late_ms if sleeps else random.normal(1.0, 1.5, 400))) * MS
+    assert np.subtract(*np.percentile(held_ns, (75, 25))) > 0.06 * 30 * MS
+    busy = replace(evidence([cycles_of(held_ns, held_ns + 0.3 * MS)], rows_of_samples(32.0)), age=AGE, bases=300)
+    [found] = [one for one in diagnose(busy) if one.list == "timing"]
+    assert found.code == code
+    assert not sleeps or found.evidence["wait_ms"] == 30
+
+
 def test_writes_after_the_first_one_are_no_wait() -> None:
     commands = np.zeros(400, COMMAND_DTYPE)
     # A read every 100 ms, and a write 1 ms later and again every 20 ms.

@@ -88,6 +88,7 @@ def test_error_about_a_file_shows_its_name_escaped(tmp_path: Path) -> None:
 
 
 def test_printable_escapes_control_and_undecodable_characters() -> None:
+    assert printable("علی\u200cرضا") == "علی\u200cرضا"
     assert printable("a\x1b[0m\n\x7f\x9b\u202e") == "a\\x1b[0m\\x0a\\x7f\\x9b\\u202e"
     assert printable(os.fsdecode(b"\xe9.mcap")) == "\\xe9.mcap"
     assert printable("τ1 … 5\u00a0ms, θ̇") == "τ1 … 5\u00a0ms, θ̇"

@@ -27,7 +27,7 @@ from hilrig_sim.arm.model import ArmParameters
 from support import recordings
 from support.labs import hilrig
 
-PAGE = Path(__file__).parents[2] / "docs/recordings.md"
+PAGE = Path(__file__).parents[2] / "docs/export.md"
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_interned_columns_are_exported_as_text(recording: Path) -> None:
 
 def test_documentation_lists_exactly_the_columns(recording: Path, tmp_path: Path) -> None:
     documented: dict[str, set[str]] = {name: set() for name in TABLES}
-    for line in PAGE.read_text(encoding="utf-8").split("### Columns of the tables")[1].splitlines():
+    for line in PAGE.read_text(encoding="utf-8").split("## Columns of the tables")[1].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) == 5 and "`" in cells[1]:
             for name in cells[0].split(", "):

@@ -110,6 +110,8 @@ def test_aggregate_skips_runs_without_a_loop() -> None:
         (19.9996, None, "20.000"),
         (26019.94, None, "26020"),
         (26019.94, (25000.0, 27500.0), "26000"),
+        (4.2, (3.7, 20.0), "<10"),
+        (0.0, (0.0, 0.2), "0.0"),
     ],
 )
 def test_digits_are_no_finer_than_the_interval(value: float, interval: tuple[float, float] | None, text: str) -> None:

@@ -1,6 +1,7 @@
 """Recovery of truncated and damaged files: complete chunks are kept, damaged ones are not, and nothing crashes."""
 
 import errno
+import json
 import os
 import random
 import shutil
@@ -344,6 +345,8 @@ def test_command_recovers_and_reports_losses(tmp_path: Path) -> None:
     complete = hilrig("recover", tmp_path / "run.mcap")
     assert complete.returncode == 0
     assert "nothing to do" in complete.stdout
+    (row,) = json.loads(hilrig("recover", tmp_path / "run.mcap", "--json").stdout)
+    assert row["path"] is None
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 1000])
