@@ -57,16 +57,16 @@ again: .venv/dev ## repeat the tests that failed, one after the other
 coverage: .venv/dev ## line and branch coverage by the unit and contract tests; writes htmlcov/
 	$(BIN)/pytest -n 2 --dist loadfile --cov --cov-report term --cov-report html tests/unit tests/contract
 
+# Test files that repeat more, or for longer, with HILRIG_LONG.
+REPEATED = $(shell grep -lw LONG tests/*/test_*.py)
+
 test-long: .venv/dev ## tests that take minutes: 2,000 forged recordings, packet captures, long outages, random faults
 	HILRIG_FORGED_RECORDINGS=2000 HILRIG_FORGED_SEED=$$(date +%s) $(BIN)/pytest tests/unit/test_forged_recordings.py
 	HILRIG_BUS_FUZZ_MESSAGES=100000 $(BIN)/pytest tests/rig/test_bus_fuzz.py
 	HILRIG_RANDOM_ARMS=100 $(BIN)/pytest tests/unit/test_automatic_substeps.py
 	HILRIG_FUZZ_FRAMES=200000 $(BIN)/pytest tests/rig/test_modbus_fuzz.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_witness.py tests/rig/test_doctor.py tests/rig/test_console.py tests/rig/test_basis_of_commands.py tests/unit/test_diagnosis_corpus.py tests/rig/test_diagnosis_live.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_pick_and_place.py tests/rig/test_demo_slow_network.py tests/rig/test_study_live.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/rig/test_controller_guides.py tests/rig/test_installation.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/unit/test_exercises.py tests/unit/test_assign_check.py tests/unit/test_class_of_30.py tests/rig/test_interactive_report.py
-	HILRIG_LONG=1 $(BIN)/pytest tests/hosts/test_compose.py tests/hosts/test_link_cut.py tests/hosts/test_faults_between_hosts.py tests/hosts/test_doctor_between_hosts.py tests/hosts/test_attacks_between_hosts.py
+	HILRIG_LONG=1 $(BIN)/pytest -m long
+	HILRIG_LONG=1 $(BIN)/pytest -m "not long" $(REPEATED)
 	$(BIN)/python tests/chaos.py
 	$(MAKE) --no-print-directory docs
 

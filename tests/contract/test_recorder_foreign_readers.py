@@ -108,6 +108,7 @@ def test_foxglove_reader_for_node_agrees(files: list[Path], tmp_path: Path) -> N
     assert "hilrig.recovered" in recovered["metadata"]
 
 
+@pytest.mark.long("takes 10 s")
 def test_pymcap_doctor_finds_no_errors(files: list[Path], tmp_path: Path) -> None:
     target = tmp_path / "packages"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]

@@ -49,6 +49,7 @@ class Life:
     """Time that the recorder waited for a processor, because other programs used all."""
 
 
+@pytest.mark.long("takes 10 s")
 @pytest.mark.rig
 @pytest.mark.timeout(60 + 15 * KILLS)
 def test_kill_9_at_random_times_loses_no_messages(tmp_path: Path) -> None:

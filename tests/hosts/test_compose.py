@@ -249,7 +249,7 @@ def containers(tmp_path: Path) -> Iterator[Containers]:
 
 
 @pytest.mark.hosts
-@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes 30 s: make test-long")
+@pytest.mark.long("takes 30 s")
 @pytest.mark.timeout(300)
 def test_services_connect_by_name_and_controllers_move_arms(containers: Containers) -> None:
     network, folder = containers.network, containers.folder

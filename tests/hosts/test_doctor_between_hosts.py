@@ -1,7 +1,6 @@
 """`hilrig doctor` on each host distinguishes a cut link, a stopped and a killed service, and a dead router."""
 
 import json
-import os
 import subprocess
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ COMMANDS = {
     "edge": ["edge"],
     "recorder": ["recorder"],
 }
-LONG = pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="seven more seconds each: set HILRIG_LONG=1")
+SEVEN_SECONDS = pytest.mark.long("seven more seconds each")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +78,7 @@ def signal(lab: MultiHostLab, host: str, name: str) -> None:
             ["sim on this host is stopped", "continue it: kill -CONT"],
             ["run hilrig doctor on sim first", "received its last message"],
             id="stopped",
-            marks=LONG,
+            marks=SEVEN_SECONDS,
         ),
         pytest.param(
             lambda lab: lab.kill("sim"),
@@ -87,7 +86,7 @@ def signal(lab: MultiHostLab, host: str, name: str) -> None:
             ["not connected: sim", "start it here (hilrig sim)"],
             ["not connected: sim", "run hilrig doctor on sim first", "sim/1 on sim: edge/1 received its last message"],
             id="killed",
-            marks=LONG,
+            marks=SEVEN_SECONDS,
         ),
     ],
 )
@@ -113,7 +112,7 @@ def test_lost_simulation_is_explained_on_each_host(
     eventually(lambda: not errors(lab, "edge"), every_s=0.2)
 
 
-@LONG
+@SEVEN_SECONDS
 def test_dead_router_is_explained_on_each_host(lab: MultiHostLab) -> None:
     lab.kill("router")
     try:

@@ -4,7 +4,6 @@ docs/several-hosts.md documents the guarantees.
 """
 
 import json
-import os
 import subprocess
 import time
 from collections.abc import Iterator
@@ -100,7 +99,7 @@ def test_loop_recovers_after_router_restart(lab: MultiHostLab) -> None:
         pytest.param(
             60.0,
             marks=[
-                pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="runs for two minutes: set HILRIG_LONG=1"),
+                pytest.mark.long("runs for two minutes"),
                 pytest.mark.timeout(300),
             ],
         ),
@@ -172,6 +171,7 @@ def test_recorder_failure_does_not_affect_the_loop(lab: MultiHostLab) -> None:
     assert np.diff(states["step"].astype(np.int64)).max() == 1, "messages of the outage are missing"
 
 
+@pytest.mark.long("takes 15 s")
 def test_two_labs_on_one_router_are_isolated(lab: MultiHostLab) -> None:
     other = lab.config.parent / "other.toml"
     other.write_text(lab.config.read_text().replace("[bus]", 'name = "other"\n[bus]', 1))

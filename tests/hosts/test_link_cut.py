@@ -1,7 +1,6 @@
 """Link cut between the recorder and the rig on another host: no message is lost."""
 
 import contextlib
-import os
 import pickle
 import subprocess
 import sys
@@ -74,7 +73,7 @@ def test_five_second_link_cut_loses_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.hosts
 @pytest.mark.rig
-@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="runs for more than a minute: set HILRIG_LONG=1")
+@pytest.mark.long("runs for more than a minute")
 def test_longer_link_cut_is_counted_exactly(tmp_path: Path) -> None:
     sent, paths = record_with_a_cut(tmp_path, 45.0)
     missing = set(sent) - set(recorded(paths))

@@ -19,6 +19,7 @@ from hilrig_replay.analysis.latency import LatencyReport, measure
 from hilrig_replay.io.run import open_run
 from hilrig_schemas import Event, TorqueCommand, topics
 from support.labs import RunningLab, write_lab
+from support.long_tests import LONG
 from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.real_time]
@@ -26,7 +27,6 @@ pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 ROOT = Path(__file__).parents[2]
 HOLD = ROOT / "examples/hold_position.py"
 TWO, COIL_FIRST = (ROOT / "tests/support" / name for name in ("two_connections.py", "coil_first.py"))
-LONG = bool(os.environ.get("HILRIG_LONG"))
 MS = 1_000_000
 
 
@@ -84,7 +84,7 @@ def hold(lab: RunningLab, seconds: float, **stops: float) -> Session:
     return record(lab, HOLD, "--port", str(lab.port), "--duration", str(seconds), **stops)  # type: ignore[arg-type]
 
 
-@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
+@pytest.mark.long("takes minutes")
 @pytest.mark.parametrize(("stops", "stop_ms", "every_s", "seconds"), [(12, 200.0, 1.5, 20.0), (25, 60.0, 0.7, 19.0)])
 def test_stops_of_the_edge_are_counted_and_its_own_time(
     lab: RunningLab, stops: int, stop_ms: float, every_s: float, seconds: float

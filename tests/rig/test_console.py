@@ -31,13 +31,14 @@ from support.browser import CHROMIUM, Browser
 from support.bus_certificates import make_bus_folder
 from support.edge_rig import RawClient
 from support.labs import HILRIG, RunningLab, hilrig, steady_controller, write_lab
+from support.long_tests import LONG
 from support.recordings import Script, record
 from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = pytest.mark.rig
 
 
-CONNECTIONS = 1400 if os.environ.get("HILRIG_LONG") else 700
+CONNECTIONS = 1400 if LONG else 700
 """Half-sent requests."""
 
 

@@ -24,7 +24,7 @@ from support.waiting import eventually
 
 pytestmark = [
     pytest.mark.rig,
-    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),
+    pytest.mark.long("takes minutes"),
     # Runtimes of PLCs are compiled.
     pytest.mark.timeout(1500),
 ]

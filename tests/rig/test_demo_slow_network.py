@@ -5,7 +5,6 @@ In virtual time: `tests/unit/test_pick_and_place.py`.
 
 import asyncio
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -24,7 +23,7 @@ from support.waiting import eventually
 pytestmark = [
     pytest.mark.rig,
     pytest.mark.real_time,
-    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes a minute; set HILRIG_LONG=1 to run it"),
+    pytest.mark.long("takes a minute"),
 ]
 
 ROOT = Path(__file__).parents[2]

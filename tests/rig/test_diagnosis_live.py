@@ -23,13 +23,13 @@ from hilrig_replay.io.run import open_run
 from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.forwarder import Forwarder
 from support.labs import RunningLab, write_lab
+from support.long_tests import LONG
 from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 PROGRAM = Path(__file__).parents[1] / "support/student_program.py"
 EXAMPLE = Path(__file__).parents[2] / "examples/hold_position.py"
-LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 4.0 if LONG else 2.5
 LIVE_RUNS = 25
 """Runs of each cause in the long test, at least."""
@@ -202,7 +202,7 @@ def test_program_that_takes_the_edges_processor_is_found(lab: RunningLab) -> Non
     assert first.evidence["run_delay_ms"] == pytest.approx(first.evidence["longest_ms"], rel=0.2)
 
 
-@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
+@pytest.mark.long("takes minutes")
 @pytest.mark.timeout(1800)
 def test_error_rate_of_live_causes(lab: RunningLab, capsys: pytest.CaptureFixture[str]) -> None:
     """Several rigs run at the same time."""

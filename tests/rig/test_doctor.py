@@ -73,7 +73,7 @@ def test_stopped_service_shifts_no_clock_of_others(lab: RunningLab) -> None:
         assert abs(offset.offset_ns) <= offset.uncertainty_ns < 300_000_000
 
 
-@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes 15 s; set HILRIG_LONG=1 to run it")
+@pytest.mark.long("takes 15 s")
 def test_top_shows_true_clocks_while_a_service_is_stopped(lab: RunningLab) -> None:
     """After each service has compared its clock, which it does every 10 s."""
     with stopped(lab, "recorder"):

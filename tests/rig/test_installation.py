@@ -1,6 +1,5 @@
 """Installations: hilrig with one extra alone, in a new environment, runs the commands of that extra."""
 
-import os
 import shutil
 import signal
 import subprocess
@@ -15,7 +14,7 @@ from support.waiting import LONG_TIMEOUT_S, eventually
 
 pytestmark = [
     pytest.mark.rig,
-    pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes minutes: make test-long"),
+    pytest.mark.long("takes minutes"),
 ]
 STARTED = {"rig": ("up", "rig1"), "console": ("console", "http://")}
 """Command of an extra that runs until it is stopped, and a part of its output after the start."""

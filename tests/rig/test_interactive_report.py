@@ -1,6 +1,5 @@
 """The interactive part of a report in a browser: player, plots, events, print and dark mode."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -138,7 +137,7 @@ SCRUB = """new Promise(done => {
 })"""
 
 
-@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes 20 s; set HILRIG_LONG=1 to run it")
+@pytest.mark.long("takes 20 s")
 def test_ten_minutes_are_small_and_scrubbed_smoothly(tmp_path: Path, browser: Browser) -> None:
     script = Script(seconds=600.0, poll_ms=20.0)
     run = write(tmp_path / "run.mcap", make(script), script=script, lab_toml=TASK)

@@ -27,6 +27,7 @@ def live(config: Path, save: Path, log: Path) -> Iterator["subprocess.Popen[byte
             process.wait()
 
 
+@pytest.mark.long("takes 15 s")
 def test_live_view_survives_a_simulation_restart(tmp_path: Path) -> None:
     save, log = tmp_path / "live.rrd", tmp_path / "live.log"
     with RunningLab(write_lab(tmp_path)) as lab, live(lab.config, save, log) as process:

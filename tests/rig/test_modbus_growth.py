@@ -97,7 +97,7 @@ def test_hundreds_of_connections_leak_nothing(lab: RunningLab) -> None:
     assert "Traceback" not in lab.output()
 
 
-@pytest.mark.skipif("HILRIG_LONG" not in os.environ, reason="takes ten minutes: set HILRIG_LONG=1")
+@pytest.mark.long("takes ten minutes")
 @pytest.mark.timeout(900)
 def test_ten_thousand_connections_leak_nothing(lab: RunningLab, record_property: Callable[[str, object], None]) -> None:
     more_handles, more_bytes = churn(lab, 10_000, 600.0)

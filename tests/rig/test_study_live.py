@@ -4,16 +4,15 @@ With HILRIG_LONG in the environment one more point, each for a longer time.
 """
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 
 from support.labs import hilrig
+from support.long_tests import LONG
 
 pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
-LONG = bool(os.environ.get("HILRIG_LONG"))
 STUDY = f"""
 title = "Simulated and live"
 live_duration_s = {4 if LONG else 2.5}

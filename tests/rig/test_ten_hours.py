@@ -4,7 +4,6 @@ The test takes minutes, so it runs only if HILRIG_LONG is set; `bench/review.py`
 """
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ pytestmark = [
     pytest.mark.real_time,
     pytest.mark.rig,
     pytest.mark.timeout(1200),
-    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes minutes; set HILRIG_LONG=1 to run it"),
+    pytest.mark.long("takes minutes"),
 ]
 
 SECTION_S = 360.0

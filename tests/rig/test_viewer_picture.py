@@ -60,6 +60,7 @@ def is_loadable(library: str) -> bool:
     return True
 
 
+@pytest.mark.long("takes 10 s")
 def test_screenshot_shows_arm_table_and_plots(rrd: Path, tmp_path: Path) -> None:
     require_display()
     shot = tmp_path / "shot.png"

@@ -26,12 +26,12 @@ from hilrig_schemas import Event, ModbusTraffic, TorqueCommand, topics
 from support.capture import Capture, Packet, require_capture, round_trips_ns, without_repeats
 from support.delay_line import NEAR, DelayLine, require_delay_line
 from support.labs import RunningLab, write_lab
+from support.long_tests import LONG
 from support.waiting import eventually
 
 pytestmark = [pytest.mark.rig, pytest.mark.real_time]
 
 CONTROLLER = Path(__file__).parents[1] / "support/witness_controller.py"
-LONG = bool(os.environ.get("HILRIG_LONG"))
 SECONDS = 20.0 if LONG else 1.5
 PERIOD_MS = 10
 US, MS = 1_000, 1_000_000
@@ -263,7 +263,7 @@ def test_stalls_of_the_edge_are_time_of_the_edge(lab: RunningLab, stall_ms: floa
     assert stall_ms - 25 <= max(longest_ms for _, longest_ms in stalls) < stall_ms + 40
 
 
-@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
+@pytest.mark.long("takes minutes")
 @pytest.mark.parametrize(("low_ms", "high_ms"), [(1.0, 1.0), (4.0, 4.0), (2.0, 8.0)])
 def test_network_bound_holds_over_a_delay_line(lab: RunningLab, low_ms: float, high_ms: float) -> None:
     require_delay_line()

@@ -44,6 +44,7 @@ COMMANDS: dict[str, Callable[[Path], object]] = {
     "export --parquet": lambda path: export.export_tables(open_run(path), path.parent / path.stem, "parquet"),
     "runs --loop": lambda path: RunIndex(path.parent).measure(RunIndex(path.parent).load()),
 }
+SLOW = ("compare", "latency --plot", "replay --save", "verify")
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +85,9 @@ def peak(command: Callable[[Path], object], path: Path) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=pytest.mark.long("takes 5 s") if name in SLOW else ()) for name in COMMANDS]
+)
 def test_memory_does_not_depend_on_the_length(command: str, runs: tuple[Path, Path]) -> None:
     # The first call excludes imports and caches of libraries.
     COMMANDS[command](runs[0])

@@ -1,7 +1,6 @@
 """`hilrig assign check`: all mistakes of an assignment at once, and a reference solution in a running lab."""
 
 import json
-import os
 import shutil
 import sys
 from datetime import UTC, datetime, timedelta
@@ -84,7 +83,7 @@ def test_solution_runs_in_a_lab_and_is_graded(tmp_path: Path) -> None:
 
 
 @pytest.mark.rig
-@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="starts one more lab; set HILRIG_LONG=1 to run it")
+@pytest.mark.long("starts one more lab")
 def test_program_without_torques_is_an_error_with_its_output(tmp_path: Path) -> None:
     solution = tmp_path / "solution"
     solution.write_text(f"#!{sys.executable}\nimport sys\nprint('nothing to do', sys.argv[1])\n")
@@ -95,7 +94,7 @@ def test_program_without_torques_is_an_error_with_its_output(tmp_path: Path) -> 
 
 
 @pytest.mark.rig
-@pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes two minutes; set HILRIG_LONG=1 to run it")
+@pytest.mark.long("takes two minutes")
 @pytest.mark.parametrize("exercise", sorted((ROOT / "exercises").glob("*/")), ids=lambda exercise: exercise.name)
 def test_solution_of_each_exercise_passes_in_real_time(exercise: Path) -> None:
     solution = ROOT / "tests/exercises" / f"{exercise.name[2:].replace('-', '_')}.py"

@@ -23,7 +23,7 @@ from support.labs import hilrig
 pytestmark = [
     pytest.mark.rig,
     pytest.mark.timeout(600),
-    pytest.mark.skipif(not os.environ.get("HILRIG_LONG"), reason="takes a minute; set HILRIG_LONG=1 to run it"),
+    pytest.mark.long("takes a minute"),
 ]
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/classroom.md"

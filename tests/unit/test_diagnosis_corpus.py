@@ -1,13 +1,10 @@
 """Error rate of the diagnosis on runs with a known cause; with HILRIG_LONG set, of the complete corpus."""
 
-import os
 from itertools import product
 
 import pytest
 
 from diagnosis_corpus import PARTS, RUNS, UNDISTURBED, corpus, diagnosed, table
-
-LONG = bool(os.environ.get("HILRIG_LONG"))
 
 
 def test_judged_laws_and_ranges_were_not_tuned_on() -> None:
@@ -36,7 +33,7 @@ def test_a_sample_of_forty_runs_is_diagnosed() -> None:
     assert len(missed) <= 1, missed
 
 
-@pytest.mark.skipif(not LONG, reason="long test: set HILRIG_LONG=1")
+@pytest.mark.long("takes minutes")
 @pytest.mark.timeout(900)
 def test_error_rate_of_the_complete_corpus() -> None:
     results = list(diagnosed(corpus("judged", RUNS)))

@@ -47,6 +47,7 @@ def test_figure_is_cut_between_columns_not_through_labels(columns: int) -> None:
         assert axis - dark_columns(piece)[0] > 60
 
 
+@pytest.mark.long("takes 5 s")
 def test_worker_processes_give_the_same_report(tmp_path: Path) -> None:
     complete = record(tmp_path / "run.mcap", Script(seconds=1.0, controllers=False))
     paths = [complete]

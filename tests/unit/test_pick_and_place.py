@@ -3,8 +3,6 @@
 With HILRIG_LONG in the environment with more delays.
 """
 
-import os
-
 import numpy as np
 import pytest
 
@@ -12,10 +10,9 @@ from hilrig_replay.grading.placement import evaluate_placement
 from hilrig_schemas import JointState, PartState
 from hilrig_sim.arm.dynamics import forward_dynamics
 from hilrig_sim.arm.model import ArmParameters, RigParameters
+from support.long_tests import LONG
 from support.recordings import PARAMETERS
 from support.virtual_rig import RemoteRig, VirtualRig, pick_and_place, run_controller
-
-LONG = bool(os.environ.get("HILRIG_LONG"))
 
 
 def last_parts(states: list[JointState]) -> tuple[list[PartState], str]:

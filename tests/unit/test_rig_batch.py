@@ -1,5 +1,7 @@
 """Batches of messages: recorded under each rig's key, cached, and restricted to the rigs of an edge."""
 
+import pytest
+
 from hilrig_runtime.bus.memory_bus import MemoryBus, MemoryHub
 from hilrig_runtime.config.lab import parse_lab
 from hilrig_runtime.process.health import resident_bytes
@@ -74,6 +76,7 @@ def test_edge_may_only_publish_for_its_rigs() -> None:
         assert latest.get("rig2") is None
 
 
+@pytest.mark.long("takes 5 s")
 def test_memory_does_not_grow_while_publishing() -> None:
     with VirtualRig(parse_lab("[rigs]\ncount = 32\n")) as lab:
         lab.service.recording_stream.extend = list  # type: ignore[assignment, method-assign]
