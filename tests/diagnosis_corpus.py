@@ -60,7 +60,7 @@ class Part:
     def intervals(self, name: str) -> tuple[Range, ...]:
         """The ranges of a parameter."""
         found = self.ranges[name]
-        return found if isinstance(found[0], tuple) else (found,)  # type: ignore[return-value]
+        return found if isinstance(found[0], tuple) else (found,)
 
     def draw(self, name: str, random: Random) -> float:
         """A value of a parameter."""
@@ -392,7 +392,7 @@ def case_of(code: str, part: str, number: int) -> Case:
         polled_ms = max(period_ms, changes.get("wait_ms", 0.0) + changes.get("compute_ms", 0.0))
         values = {"period_ms": period_ms, "phase_ms": phase, "seed": number + 1, "step_ms": step_ms, **changes}
         start = tuple(goal(0.0) + np.array([8, -8, 4, 5]))
-        return Program(law_of(kind, goal, kp * gain, polled_ms / 1e3, damping), start=start, **values)  # type: ignore[arg-type]
+        return Program(law_of(kind, goal, kp * gain, polled_ms / 1e3, damping), start=start, **values)
 
     times = random.permutation(np.arange(2.0, 18.0, 2.0))
     match code:
@@ -422,13 +422,15 @@ def case_of(code: str, part: str, number: int) -> Case:
         case "simulation_stall":
             return Case(code, program(step_ms, 0.6, stalls={float(t): within("stall") for t in times[:4]}))
         case "cpu_steal":
-            stalls = {("stalls", "edge_stalls")[number % 2]: {float(t): within("stall") for t in times[:4]}}
-            return Case(code, program(step_ms, 0.6, starved_share=within("starved"), **stalls))
+            stalls = {float(t): within("stall") for t in times[:4]}
+            of_edge, of_simulation = (stalls, {}) if number % 2 else ({}, stalls)
+            starved = program(step_ms, 0.6, starved_share=within("starved"), stalls=of_simulation, edge_stalls=of_edge)
+            return Case(code, starved)
         case "injected_delay":
             share = float(random.uniform(0, 1))
             delay_ms = within("injected")
-            delays = {"injected_state_ms": share * delay_ms, "injected_command_ms": (1 - share) * delay_ms}
-            return Case(code, program(fast, 0.5, **delays))
+            state_ms, command_ms = share * delay_ms, (1 - share) * delay_ms
+            return Case(code, program(fast, 0.5, injected_state_ms=state_ms, injected_command_ms=command_ms))
         case "beating":
             return Case(code, program(step_ms * within("beating"), compute_ms=2.0))
         case "watchdog_gaps":
@@ -578,7 +580,7 @@ def table(results: Sequence[Result]) -> str:
 
 
 if __name__ == "__main__":
-    selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [RUNS])[0])
+    selected, count = sys.argv[1:2] or ["judged"], int((sys.argv[2:] or [str(RUNS)])[0])
     judged = list(diagnosed(corpus(selected[0], count)))
     print(table(judged))
     for one in judged:

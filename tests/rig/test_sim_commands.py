@@ -55,7 +55,7 @@ def test_verify_reports_the_first_diverging_step(made: list[TimedMessage], tmp_p
 
 
 def test_example_of_the_paper_prints_and_plots_its_numbers(tmp_path: Path) -> None:
-    command = [sys.executable, ROOT / "examples/paper_figures.py", "--out", tmp_path / "figures"]
+    command = [sys.executable, str(ROOT / "examples/paper_figures.py"), "--out", str(tmp_path / "figures")]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     plots = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]

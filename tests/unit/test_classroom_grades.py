@@ -98,7 +98,9 @@ def test_many_similar_students_are_one_group_and_a_short_cell() -> None:
             "same_recording": False,
         }
 
-    rows = [{"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names]
+    rows: list[dict[str, Any]] = [
+        {"id": name, "similar": [run(other, 0.6) for other in names if other != name]} for name in names
+    ]
     rows[0]["similar"][6]["share"] = 0.91
     pair = [{"id": "x", "similar": [run("y", 0.7)]}, {"id": "y", "similar": [run("x", 0.7)]}]
     document = {"students": [*rows, *pair, {"id": "alone", "similar": []}]}

@@ -35,9 +35,9 @@ def test_unreachable_pose_has_its_reason_and_exit_code_1() -> None:
     done = CliRunner().invoke(app, ["ik", "700", "0", "0", "0"])
     assert done.exit_code == 1
     assert "no solution: pose x 700.0 mm, y 0.0 mm, z 0.0 mm is too far" in done.stdout
-    done = hilrig_in_process("ik", "-590", "0", "0", "0", "--json")
-    assert done.returncode == 1
-    assert "is in reach, but" in json.loads(done.stdout)["reason"]
+    as_json = hilrig_in_process("ik", "-590", "0", "0", "0", "--json")
+    assert as_json.returncode == 1
+    assert "is in reach, but" in json.loads(as_json.stdout)["reason"]
 
 
 def test_unknown_rig_is_reported() -> None:

@@ -87,7 +87,7 @@ def test_median_over_runs_has_a_distribution_free_interval() -> None:
     assert median_over_runs(range(10)) == (4.5, (1.0, 8.0))
     random, covered = np.random.default_rng(4), 0
     for _ in range(400):
-        _, interval = median_over_runs(random.exponential(size=12))
+        _, interval = median_over_runs(random.exponential(size=12).tolist())
         assert interval is not None
         covered += interval[0] <= math.log(2) <= interval[1]
     assert 0.93 * 400 <= covered <= 0.99 * 400
