@@ -129,7 +129,7 @@ def test_missing_package_is_named(tmp_path: Path, package: str, command: str, ex
         ("demo --duration -5", "--duration: must be ≥ 1, got '-5'; see hilrig demo --help"),
         ("up --edges x", "--edges: must be an integer, got 'x'; see hilrig up --help"),
         ("rig list --jsn", "no such option: --jsn (Possible options: --json); see hilrig rig list --help"),
-        ("impair rig1 --loss 2", "--loss: must be ≤ 1, got '2'"),
+        ("impair rig1 --loss 2", "--loss: rate: must be ≤ 1, got '2'"),
         ("registers --csv --json", "--csv, --markdown and --json can't be combined: use one of them"),
         ("check nowhere.toml", "nowhere.toml: no such file"),
         ("recover nowhere.mcap", "nowhere.mcap: no such file"),

@@ -125,8 +125,10 @@ def _with_options(error: "InputError") -> "InputError":
     lines = []
     for line in str(error).splitlines():
         place, _, text = line.partition(": ")
-        option = next((option for key, option in _OPTIONS.items() if place.startswith(key)), place)
-        lines.append(f"{option}: {text}")
+        key = next((key for key in _OPTIONS if place.startswith(key)), "")
+        # The name of a parameter of the delay or loss, such as rate.
+        parameter = place.removeprefix(key).rpartition(".")[2]
+        lines.append(": ".join(filter(None, (_OPTIONS.get(key, ""), parameter, text))))
     return InputError("\n".join(dict.fromkeys(lines)))
 
 
